@@ -87,22 +87,16 @@ class Record:
 
 @dataclass(frozen=True, kw_only=True)
 class Intervention:
-    """A stretch of a record, `start` to `end` in s, in which a force that was not measured acts.
+    """A stretch of a record, `start` to `end` in s, in which an unmeasured force moves a cart.
 
-    A hand, most likely. `held` : it keeps the cart at rest, away from where it would rest; else
-    it moves it.
+    A hand, most likely; or one holds the cart away from its rest until it lets go.
     """
 
     experiment: str
     cart: int
     start: float
     end: float
-    held: bool
-
-    @property
-    def what(self) -> str:
-        """What the force does, in words."""
-        return "held away from its rest" if self.held else "moved by a force that was not measured"
+    what: str = "held or moved by a force that was not measured"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,6 +14,7 @@ from pipeline.checks.loops import check_loops, design_margins, verify_design
 from pipeline.checks.recordings import (
     check_dwells,
     check_files,
+    check_held,
     check_left_out,
     check_scales,
     check_setup,
@@ -62,7 +63,7 @@ def analyse(
     log.warn(reading_remarks(data, unit=position))
 
     interventions = find_interventions(data.records)
-    log.warn(hand_remarks(interventions))
+    log.warn(hand_remarks(interventions, records=data.records))
     found, left_out = identify_from_sound(
         data, interventions=interventions, system=system, progress=progress
     )
@@ -92,6 +93,7 @@ def analyse(
         *check_scales(sound, system=system),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
+        *check_held(data.records),
         *check_dwells(data.records, found.sines),
         *check_channels(late),
         *found.repeats.checks,

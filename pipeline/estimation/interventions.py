@@ -1,18 +1,18 @@
 """Interventions: stretches in which a force that nobody measured, such as a hand, moves a cart.
 
-What the law of motion leaves bursts where a hand acts. An effect that the law does not have shows
-as well: but again and again, in proportion to the motion, wherever the cart, its springs, its
-speed and the input are the same. A knock of two bodies is over in an instant. So a burst is a
-hand where it lasts, where it moves the cart, and in a state in which elsewhere the law holds.
+The force that a law of motion does not explain bursts where a hand acts. An effect that the law
+lacks shows as well, but it shows again and again: in proportion to the motion, wherever position,
+stretch, speed and input are the same. A knock of two bodies is over in an instant. So a burst is
+a hand if it lasts, moves the cart, and acts in a state in which the law holds at other times.
 """
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
@@ -28,6 +28,7 @@ _GAP = 0.1  # s: nearer bursts are one
 _LASTS = 0.06  # s above half its peak; a knock has 0.04, the width of a window
 _KNOWN = 0.03  # s of a burst in a state that is known
 _SWINGS = 3  # times that the force of a hand changes sides: an effect's does so all the time
+_INSTANT = 0.03  # s: nobody pushes twice at the same time to within that
 _BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
 
 
@@ -77,7 +78,7 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
     for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
         left = np.abs(force.left)
         bulk = size
-        if force.follows.any():  # a record that does not follow the law tells of no hand
+        if force.follows.any():  # a record that does not follow the law cannot show a hand
             own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
             bulk = max(size, own)
         strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
@@ -93,10 +94,19 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                         cart=cart,
                         start=max(float(times[first]) - _REACH, float(times[0])),
                         end=min(float(times[last]) + _REACH, float(times[-1])),
-                        held=bool(np.mean(force.idle[inside]) > _MOST),
                     )
                 )
-    return found
+    driven = {record.id for record in records if record.u is not None and np.any(record.u)}
+    return [one for one in found if not (one.experiment in driven and _recurs(one, found, driven))]
+
+
+def _recurs(one: Intervention, found: Sequence[Intervention], driven: Set[str]) -> bool:
+    """Tell whether it happens at the same instant in another driven run: no hand is as exact."""
+    return any(
+        abs(one.start - other.start) < _INSTANT
+        for other in found
+        if other.experiment != one.experiment and other.experiment in driven
+    )
 
 
 def _share(force: ForceLeft, size: float) -> Array:
@@ -109,8 +119,8 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
     """Return for each window whether the law holds wherever the cart is in such a state.
 
     Position, stretches, velocity and input are looked at one by one: most windows at about the
-    same value must be quiet. A cart that rests without an input can be held by nothing but
-    friction, whatever the state.
+    same value must be quiet. A cart that rests without an input can be held by friction
+    only, whatever the state.
     """
     state = np.concatenate([force.state for force in forces], axis=1)
     follows = np.concatenate([force.follows for force in forces])
@@ -127,7 +137,10 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
-    parts = [known[first:stop] for first, stop in pairwise(bounds)]
+    # A window sees a little of its neighbours.
+    parts = [
+        minimum_filter1d(known[first:stop].astype(int), 3) > 0 for first, stop in pairwise(bounds)
+    ]
     return [part | force.idle for part, force in zip(parts, forces, strict=True)]
 
 

@@ -135,7 +135,7 @@ def _intervention(entry: Mapping[str, Any]) -> Intervention:
         cart=entry["cart"],
         start=entry["from"],
         end=entry["to"],
-        held=entry["held"],
+        what=entry["what"],
     )
 
 

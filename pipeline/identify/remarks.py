@@ -29,8 +29,9 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
     ]
 
 
-def hand_remarks(interventions: Sequence[Intervention]) -> list[str]:
-    """Return in which records a hand acts on a cart, and when."""
+def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
+    """Return in which records a hand acts on a cart, and when; but not that a decay is let go."""
+    released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
     return by_note(
         (
             one.experiment,
@@ -38,6 +39,7 @@ def hand_remarks(interventions: Sequence[Intervention]) -> list[str]:
             "what follows counts as a release of its own",
         )
         for one in interventions
+        if (one.experiment, one.start) not in released
     )
 
 

@@ -174,8 +174,7 @@ class Intervention(Document):
     cart: int
     from_: Annotated[float, Field(alias="from", description="s")]
     to: Annotated[float, Field(description="s")]
-    what: Annotated[str, Field(description="what the force does")]
-    held: Annotated[bool, Field(description="it keeps the cart at rest; else it moves it")]
+    what: str
 
 
 class GapSubmission(Document):

@@ -95,46 +95,34 @@ def test_what_is_nothing_within_its_error_is_told(value, nothing):
     assert sureness(known) == [np.inf]  # without an error nothing is said
 
 
-def judged(*keys: tuple[str, int], chi: float, held: float, bic: float) -> Hypothesis:
-    """Return a hypothesis with what it leaves of training and held-out runs."""
+def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0) -> Hypothesis:
+    """Return a hypothesis with what it leaves of 1000 training and 1000 held-out points."""
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
-    structure: Any = SimpleNamespace(effects=effects, has_contact=("backlash", 0) in keys)
-    fit: Any = SimpleNamespace(chi=chi, structure=structure)
-    left: Any = SimpleNamespace(chi=held, run_chi=np.full(3, held))
-    return Hypothesis(fit=fit, held=left, error=held**0.5, bic=bic, at_floor=max(chi, held) < 1.15)
+    fit: Any = SimpleNamespace(chi=chi, structure=SimpleNamespace(effects=effects), n_points=1000.0)
+    left: Any = SimpleNamespace(chi=held)
+    return Hypothesis(
+        fit=fit,
+        held=left,
+        error=held**0.5,
+        bic=100.0 * float(np.log(chi)),
+        news=news,
+        held_news=news,
+        at_floor=max(chi, held) < 1.15,
+    )
 
 
 @pytest.mark.parametrize(
-    ("parent", "child", "worth"),
+    ("child", "worth"),
     [
-        ((6.0, 11.0), (1.0, 1.9), True),  # noise alone is left with it
-        ((6.0, 11.0), (1.0, 3.0), False),  # of the runs fitted only
-        ((6.0, 11.0), (2.0, 2.0), False),  # less than there was: the rest of the bounce
-        ((40.0, 60.0), (15.0, 14.0), True),  # half the error, where much is left
-        ((40.0, 60.0), (15.0, 20.0), False),
-        ((5.0, 1.0), (1.0, 0.9), True),  # the runs held out cannot tell
-        ((5.0, 1.0), (2.0, 0.9), False),
+        ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 on either side
+        ({"chi": 2.0, "held": 2.0, "news": 5.0}, False),  # what is left swings: little is news
+        ({"chi": 1.0, "held": 7.0}, False),  # of the runs fitted only
+        ({"chi": 5.2, "held": 5.5}, False),  # too little for the criterion
     ],
 )
-def test_what_acts_beside_a_contact(parent, child, worth):
-    """Its own law is known to a factor, so that others would mop up what it leaves."""
-    alone = judged(("backlash", 0), chi=parent[0], held=parent[1], bic=0.0)
-    both = judged(("backlash", 0), DELAY, chi=child[0], held=child[1], bic=-1000.0)
-    study: Any = SimpleNamespace(explains=lambda h: h.error < 1.5)
-    assert worth_it(both, alone, study) == worth
-
-
-@pytest.mark.parametrize(
-    ("first", "bic", "worth"),
-    [
-        (CUBIC, -110.0, True),
-        (CUBIC, -90.0, False),  # too little for the criterion alone
-        (("backlash", 0), -1000.0, False),  # the rest of the bounce
-    ],
-)
-def test_what_acts_beside_what_may_be_all(first, bic, worth):
-    """Runs held out that are at the noise cannot tell; the criterion must, the more clearly."""
-    alone = judged(first, chi=1.1, held=1.05, bic=0.0)
-    both = judged(first, DELAY, chi=1.0, held=1.04, bic=bic)
+def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
+    """Of the runs fitted and of those held out; of what the fuller model leaves."""
+    parent = judged(CUBIC, chi=6.0, held=6.0)
+    both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
-    assert worth_it(both, alone, study) == worth
+    assert worth_it(both, parent, study) == worth

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from codegen.__main__ import MADE, ROOM
-from codegen.laws import columns_source, laws_source, terms_source
+from docs.codegen.__main__ import MADE, ROOM
+from docs.codegen.laws import columns_source, laws_source, terms_source
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
 from pipeline.plant.nonlinear.effects.law import (
     Contact,
@@ -32,9 +32,9 @@ STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0
 
 @pytest.mark.parametrize("name", MADE)
 def test_what_stands_there_is_made_from_the_laws(name):
-    """Nobody changed a law without `python -m codegen`, or what it makes by hand."""
+    """Nobody changed a law without `python -m docs.codegen`, or what it makes by hand."""
     stored, made = (ROOM / name).read_text(encoding="utf-8"), MADE[name](CATALOGUE)
-    assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m codegen"
+    assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m docs.codegen"
 
 
 def coordinates_of(effect: Effect) -> np.ndarray:

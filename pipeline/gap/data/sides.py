@@ -44,7 +44,7 @@ def prepare(
     records: Sequence[Record],
     *,
     springs: tuple[bool, ...],
-    interventions: Sequence[Intervention],
+    interventions: Sequence[Intervention] = (),
     notes: list[str],
 ) -> list[Run]:
     """Return the runs worth fitting; what is left out is noted.
@@ -170,6 +170,7 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
         pieces.append(
             replace(
                 part,
+                guided=run.guided[:, piece],
                 zero=run.zero,
                 zero_std=run.zero_std,
                 rest=run.rest,

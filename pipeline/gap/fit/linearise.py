@@ -88,6 +88,7 @@ def _simulate_variants(
         np.array(run.shots),
         1.0,  # the simulator chooses its steps
         np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
+        guided=run.guided,
     )
     if len(run.rows) == structure.n:
         return y, by

@@ -37,7 +37,7 @@ _BLOWN_UP = 1e6  # times the record's span
 
 @jit
 def follow_run(
-    p, n, kinds, places, first, free, seen, t, y, knots, held, command, gain, zero, factor,
+    p, n, kinds, places, first, free, seen, guided, t, y, knots, held, command, gain, zero, factor,
     longest, derive, E, J, x, v, aux, DX, DV, DF, DR, DA, work,
 ):  # fmt: skip
     """Fill the errors E (samples, n) and, where `derive`, J (lanes, samples, n); False: diverged.
@@ -45,7 +45,8 @@ def follow_run(
     `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; behind
     them the lanes of the run's own: zeros, starts, velocities, factors on dry friction (n each).
     `held` (3, 2, knots) is the shaped input and its derivatives by dead zone and limit, with
-    their integrals. `x`, `v` (n,) start and are used up; `aux` (laws, ROOM) starts at zero.
+    their integrals. `guided` (samples, n) is how held carts move. `x`, `v` (n,) start and are
+    used up; `aux` (laws, ROOM) starts at zero.
     """
     own = p.size  # where the lanes of the run begin
     lanes = DX.shape[1]
@@ -106,6 +107,10 @@ def follow_run(
                 return False
         if sample == t.size - 1:
             break
+        for i in range(n):
+            if not free[i]:
+                x[i] = guided[sample, i]
+                v[i] = (guided[sample + 1, i] - guided[sample, i]) / step
         count = ceil(step / longest - 1e-9)
         h = step / count
         for sub in range(count):
@@ -183,6 +188,7 @@ def follow_run(
             # ------------------------------------------------ the velocities, dry friction last
             for i in range(n):
                 if not free[i]:
+                    x[i] = xm[i] + 0.5 * h * v[i]
                     continue
                 half_c = 0.5 * h * p[n + i]
                 mass = p[i]

@@ -33,13 +33,14 @@ class Own:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """One run, thinned: y and weight over noise (samples, n)."""
+    """One run, thinned: y, weight over noise, and `guided` motion of held carts (samples, n)."""
 
     t: Array
     y: Array
     weight: Array
     free: np.ndarray
     seen: np.ndarray
+    guided: Array
     knots: Array
     command: Array
     start: Array
@@ -105,6 +106,7 @@ def make_track(run: Run, *, rate: float = _RATE) -> Track:
         weight=weight,
         free=free,
         seen=seen & free,
+        guided=np.ascontiguousarray(thin.guided.T),
         knots=np.array(run.knots, dtype=np.float64),
         command=np.array(run.command, dtype=np.float64),
         start=np.where(free, run.start, 0.0),
@@ -145,9 +147,9 @@ def errors_of(
     if forces.BACKLASH in laws.kinds:
         longest = min(longest, _KNOCK * track.longest)
     fine = kernel.follow_run(
-        p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.t, track.y,
-        track.knots, held, track.command, float(gain), own.zero, own.factor, longest, derive,
-        E, J, x, own.v0.copy(), aux, DX, DV, *room,
+        p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.guided, track.t,
+        track.y, track.knots, held, track.command, float(gain), own.zero, own.factor, longest,
+        derive, E, J, x, own.v0.copy(), aux, DX, DV, *room,
     )  # fmt: skip
     return (E, J) if fine and np.all(np.isfinite(E)) else None
 
@@ -173,8 +175,9 @@ def compile_follower() -> None:
     one, two = np.ones(1), np.array([0.0, 0.01])
     track = Track(
         t=two, y=np.zeros((2, 1)), weight=np.ones((2, 1)), free=one > 0.0, seen=one > 0.0,
-        knots=two, command=np.zeros(2), start=np.zeros(1), slope=np.zeros(1), zero=np.zeros(1),
-        zero_std=one, at_rest=True, start_std=(one, one), longest=_LONGEST, swing=1.0,
+        guided=np.zeros((2, 1)), knots=two, command=np.zeros(2), start=np.zeros(1),
+        slope=np.zeros(1), zero=np.zeros(1), zero_std=one, at_rest=True, start_std=(one, one),
+        longest=_LONGEST, swing=1.0,
     )  # fmt: skip
     chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
     bench = Bench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))

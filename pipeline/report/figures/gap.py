@@ -41,17 +41,26 @@ _ROOM = 1.06
 
 
 def before_after_figure(
-    trace: Trace, *, noise: float, position_unit: str, added: str = ADDED
+    trace: Trace,
+    *,
+    noise: float,
+    position_unit: str,
+    added: str = ADDED,
+    touched: Sequence[tuple[Array, Array]] = (),
 ) -> Figure:
     """Return one cart in one run: measured, both models, and what each leaves below.
 
-    `added` names the model with what was added to the linear one; "" where nothing was.
+    `added` names the model with what was added to the linear one; "" where nothing was. `touched`
+    are times and readings of the stretches beside the run in which a hand moved a cart.
     """
     models = {"linear model": trace.baseline}
     if added:
         models = {added: trace.final} | models
     figure, (above, below) = panels(1.5, 1.0)
     plot_measured(above, trace.t, trace.measured)
+    for t, y in touched:
+        above.axvspan(float(t[0]), float(t[-1]), color=SHADE, lw=0)
+        plot_measured(above, t, y, in_legend=False)
     (name, model), *others = models.items()
     for other, y in others:
         plot_second(above, trace.t, y, label=other)

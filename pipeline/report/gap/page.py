@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
+from pipeline.arrays import Array
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
@@ -26,6 +27,7 @@ from pipeline.report.figures.gap import (
 from pipeline.report.gap.tables import (
     effect_parameter_table,
     error_table,
+    intervention_table,
     rival_table,
     window_table,
 )
@@ -99,6 +101,7 @@ def build_gap_document(
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
         ("force-left", "What force is left", lambda page: _force_left(page, gap)),
+        ("hands", WORDS.text("hands"), lambda page: _hands(page, gap)),
         ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
@@ -160,7 +163,13 @@ def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
     added, model = added_name(gap), whole_model(gap)
     return page.picture(
         f"before-after-{number}",
-        before_after_figure(trace, noise=noise, position_unit=page.position, added=added),
+        before_after_figure(
+            trace,
+            noise=noise,
+            position_unit=page.position,
+            added=added,
+            touched=_touched(page, gap, trace),
+        ),
         caption=WORDS.text(f"before_after{alone}", **said),
         alt=WORDS.text(f"before_after_alt{alone}", model=model, **said),
     )
@@ -259,6 +268,25 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
         blocks.append(page.picture(f"force-left-{cart}", figure, caption=caption, alt=alt))
         blocks.append(paragraph(said))
     return blocks
+
+
+def _hands(page: Page, gap: Gap) -> list[Block]:
+    return [intervention_table(page, gap.interventions)] if gap.interventions else []
+
+
+def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
+    """Return the stretches right before and after a run in which a hand moved a cart."""
+    record = page.records.get(trace.experiment)
+    if record is None:
+        return []
+    near = 2.0 * record.sample_time
+    found = []
+    for one in gap.interventions:
+        before, after = trace.t[0] - one.end, one.start - trace.t[-1]
+        if one.experiment == record.id and (0.0 <= before < near or 0.0 <= after < near):
+            shown = (record.t >= one.start) & (record.t <= one.end)
+            found.append((record.t[shown], record.position(trace.cart)[shown]))
+    return found
 
 
 def _apart(page: Page, gap: Gap) -> list[Block]:

@@ -1,6 +1,6 @@
 """The catalogue of effects: what a bench may do beyond the linear chain.
 
-To add one: write an `Effect` in a file here, list it below, and run `python -m codegen`.
+To add one: write an `Effect` in a file here, list it below, and run `python -m docs.codegen`.
 """
 
 import re

@@ -5,7 +5,7 @@ stiffness `k`. Everywhere: `u`, the force that arrives from the drive; `on`, 1 w
 powered and 0 else; `z`, a state of the law's own. All other names are symbols of parameters. The
 functions are abs, sign, exp, sin, cos, min, max, clip.
 
-`python -m codegen` makes compiled code, with all derivatives.
+`python -m docs.codegen` makes compiled code, with all derivatives.
 """
 
 import ast

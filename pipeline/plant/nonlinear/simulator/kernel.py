@@ -117,8 +117,8 @@ def _edge(now, end, delay, knots, held, at):
 
 @jit
 def _simulate(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, y, dy, N, motor,
-    parent, s, K, C, switches, active, held, lanes, T, phi, work,
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, guided, y, dy,
+    N, motor, parent, s, K, C, switches, active, held, lanes, T, phi, work,
 ):  # fmt: skip
     """Fill y (n, samples) with the readings of one run; False where the model diverged.
 
@@ -204,12 +204,17 @@ def _simulate(
                         bend_presliding(lanes, T, s, K, most, scatter, i, n, N)
         for sample in range(first, end):
             for i in range(n):
+                if not free[i]:
+                    s[X, i] = guided[i, sample]
                 y[i, sample] = cart[i, Cart.SENSOR_GAIN_GAIN] * s[X, i]
                 for lane in range(dy.shape[0]):
                     dy[lane, i, sample] = cart[i, Cart.SENSOR_GAIN_GAIN] * T[i, lane // 4, lane % 4]
             if sample == end - 1:
                 break
             interval = t[sample + 1] - t[sample]
+            for i in range(n):
+                if not free[i]:
+                    s[V, i] = (guided[i, sample + 1] - guided[i, sample]) / interval
             count = ceil(interval / longest - 1e-9)
             whole, now, sub = interval / count, t[sample], 0
             while sub < count:
@@ -278,7 +283,9 @@ def assemble(cart: Array, spring: Array, drive: Array, free: NDArray[np.bool_]) 
 NO_LANES = np.zeros((2, 0), dtype=np.int64)
 
 
-def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine):
+def simulate_batch(
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, *, guided=None
+):
     """Simulate many variants of one run.
 
     Parameters
@@ -292,19 +299,22 @@ def simulate_batch(cart, spring, drive, x0, v0, scatter, free, t, knots, command
     t : (samples,) times; knots (k,), command (k,): the input, held from knot to knot.
     starts : (shots + 1,) first sample of each shot, and the number of samples.
     refine : divides the step.
+    guided : (n, samples) how the carts that are not free move; without, they stand still at zero.
 
     Returns
     -------
     (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged.
     """
     return simulate_with_derivatives(
-        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, NO_LANES
-    )[0]
+        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, NO_LANES,
+        guided=guided,
+    )[0]  # fmt: skip
 
 
 def simulate_with_derivatives(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of
-):
+    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of, *,
+    guided=None,
+):  # fmt: skip
     """Simulate many variants of one run, as `simulate_batch` does, the first with derivatives.
 
     Parameters
@@ -316,14 +326,15 @@ def simulate_with_derivatives(
     (b, n, samples) readings, and (lanes, n, samples) derivatives of the first variant's.
     """
     # numba compiles anew, for ten seconds, for arrays that may not be written to, or for strides.
-    floats = (cart, spring, drive, x0, v0, scatter, t, knots, command)
-    cart, spring, drive, x0, v0, scatter, t, knots, command = (
+    guided = np.zeros((cart.shape[1], t.size)) if guided is None else guided
+    floats = (cart, spring, drive, x0, v0, scatter, t, knots, command, guided)
+    cart, spring, drive, x0, v0, scatter, t, knots, command, guided = (
         _plain(array, np.float64) for array in floats
     )
     free, starts, of = _plain(free, np.bool_), _plain(starts, np.int64), _plain(of, np.int64)
     y = np.empty((len(cart), cart.shape[1], t.size))
     dy = derivatives = np.empty((of.shape[1], *y.shape[1:]))
-    run = free, t, knots, command, starts, float(refine)
+    run = free, t, knots, command, starts, float(refine), guided
     for b in range(len(cart)):
         bench, start = (cart[b], spring[b], drive[b]), (x0[b], v0[b], scatter[b])
         bodies = assemble(*bench, free)

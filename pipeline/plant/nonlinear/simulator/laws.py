@@ -1,6 +1,6 @@
 """The laws of the effects: what the compiled simulators know of them.
 
-Made by `python -m codegen` from the laws of the effects.
+Made by `python -m docs.codegen` from the laws of the effects.
 """
 
 from math import cos, exp, inf, pi, sin

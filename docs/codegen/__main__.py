@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from codegen.laws import columns_source, laws_source, terms_source
+from docs.codegen.laws import columns_source, laws_source, terms_source
 from pipeline.output import write_file
 from pipeline.plant import nonlinear
 from pipeline.plant.nonlinear.effects import CATALOGUE

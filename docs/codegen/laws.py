@@ -16,7 +16,7 @@ from pipeline.plant.nonlinear.effects.law import Contact, Force, Friction, Hyste
 
 Expr = Any  # sympy's own annotations are partial
 
-_HEAD = '"""{}\n\nMade by `python -m codegen` from the laws of the effects.\n"""\n\n'
+_HEAD = '"""{}\n\nMade by `python -m docs.codegen` from the laws of the effects.\n"""\n\n'
 _MASKS = {"cart": "ON_CARTS", "spring": "ON_SPRINGS", "input": "ON_DRIVE"}
 _TABLES = {"cart": "Cart", "spring": "Spring", "input": "Drive"}
 _AT = {"cart": "cart[i, {}]", "spring": "spring[j, {}]", "input": "drive[{}]"}
