@@ -197,7 +197,7 @@ class Structure:
         """Return how far each parameter may go in one step."""
         reach = [np.full(self.base_size, 0.3)]
         for c in self.effects:
-            reach.append(np.array([1.0 if p.signed else 0.4 for p in c.effect.parameters]))
+            reach.append(np.array([1.0 if p.signed else p.reach for p in c.effect.parameters]))
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.arrays import Array
+from pipeline.gap.data.independent import independent
 from pipeline.gap.fit.levenberg_marquardt import Mapper
 from pipeline.gap.follow.laws import Laws
 from pipeline.gap.follow.track import Own, Track, errors_of
-from pipeline.gap.independent import independent
 
 _DAMP, _CHANGE, _LEAST_DAMP = 1e-4, 8.0, 1e-9
 _ATTEMPTS, _RELEASES = 6, 12

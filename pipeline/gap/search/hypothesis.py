@@ -7,11 +7,11 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap import limits
+from pipeline.gap.data.independent import independent
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.independent import independent
 from pipeline.plant.nonlinear.effects.base import Effect
 
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales

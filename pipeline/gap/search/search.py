@@ -87,7 +87,8 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
                     found.append(without)
-                if without.sound and (_as_good(without, best, study) or sure[index] < SURE):
+                nothing = sure[index] < SURE  # it goes, wherever that leads the others
+                if nothing or (without.sound and _as_good(without, best, study)):
                     needless.append(without)
             if needless:
                 chosen = min(needless, key=lambda h: h.bic)

@@ -19,13 +19,15 @@ _LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: behind a contact the misfit of 
 # Times a contact's size and its damping: what follows is rigid, a bench is not quite.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
 _KEPT = 2  # of them
-_NEAR: dict[str, Any] = {"iterations": 8}  # of a fit that begins near its end
+_NEAR = 8  # iterations of a fit that begins near its end
 # On no spring the misfit of a whole run is rugged throughout: small gains add up.
 _FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
 
 
 def fit_on(fit: Fit, model: Model, study: Study) -> Fit:
     """Fit a model a little different from a fitted one: from where that left every run."""
+    if not any(study.springs):
+        return fit_whole(model, study)
     return fit_model(
         model,
         study.training,
@@ -33,7 +35,7 @@ def fit_on(fit: Fit, model: Model, study: Study) -> Fit:
         spread=fit.spread,
         scatter_free=any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance),
         mapper=study.mapper,
-        **(_NEAR if any(study.springs) else _FINISHED),
+        iterations=_NEAR,
     )
 
 

@@ -61,6 +61,7 @@ class Parameter:
     signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
     neutral : the value that gives the base model (where one exists).
     lower, upper : bounds of the magnitude, in multiples of `scale`.
+    reach : how far its logarithm goes in one step of a fit.
     reported : False for a detail of the contact that the data need but nobody asks for.
     """
 
@@ -75,6 +76,7 @@ class Parameter:
     neutral: float | None = None
     lower: float = 0.0
     upper: float = np.inf
+    reach: float = 0.4
     reported: bool = True
 
     def unit_text(self, *, position: str, input: str) -> str:

@@ -27,6 +27,7 @@ EFFECT = Effect(
             trials=(0.1, 0.2, 0.4),
             lower=0.02,
             upper=1.0,  # a longer one is a spring that is not straight
+            reach=0.03,  # a quarter of a tooth, where the travel has eight
         ),
         Parameter(
             "phase",
