@@ -34,6 +34,7 @@ BENCHMARKS = (
     "bode",
     "gap_tools",
     "silverbox",
+    "emps",
     "grading",
     "report",
     "feedback",

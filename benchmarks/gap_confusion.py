@@ -24,7 +24,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 DEVELOPMENT, REPORT = 10_000, 900_000
-SUITES = ("singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt")
+SUITES = [
+    "singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt", "wide", "wide-pairs"
+]  # fmt: skip
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
 # Two of these on one cart would be one friction law: never a pair.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
@@ -39,13 +41,14 @@ def plan(suite: str, index: int) -> tuple[int, tuple[str, ...], float, bool]:
     pool = [e for e in EFFECTS if not (n == 1 and e in ("coupling_damper", "sensor_gain"))]
     if suite.startswith("clean"):
         return n, (), 1.0, suite == "clean-dirt"
-    if suite == "pairs":
+    dirty = suite.startswith("wide") and bool((index // 3) % 2)
+    if suite.endswith("pairs"):
         while True:
             first, second = rng.choice(pool, 2, replace=False)
             if not (first in DRY and second in DRY) and "backlash" not in (first, second):
-                return n, (str(first), str(second)), 1.0, False
+                return n, (str(first), str(second)), 1.0, dirty
     effect = pool[(index // 3) % len(pool)]
-    return n, (effect,), SEVERITY.get(suite, 1.0), suite == "dirt"
+    return n, (effect,), SEVERITY.get(suite, 1.0), suite == "dirt" or dirty
 
 
 def run_case(job: tuple[str, int, int]) -> dict:
@@ -55,7 +58,14 @@ def run_case(job: tuple[str, int, int]) -> dict:
     from tests.truth.cases import make_case
 
     n, effects, severity, dirt = plan(suite, index)
-    case = make_case(seed=base + index, n=n, effects=effects, severity=severity, dirt=dirt)
+    case = make_case(
+        seed=base + index,
+        n=n,
+        effects=effects,
+        severity=severity,
+        dirt=dirt,
+        wide=suite.startswith("wide"),
+    )
     wall, cpu = time.perf_counter(), time.process_time()
     gap = explain_gap(case.records, springs=case.springs, workers=1)
     truth = sorted((h.effect, h.place) for h in case.hidden)
@@ -68,6 +78,8 @@ def run_case(job: tuple[str, int, int]) -> dict:
         for f in gap.effects:
             if (f.effect.key, next(iter(f.where.values()), 0)) == (hidden.effect, hidden.place):
                 for name, true in hidden.parameters.items():
+                    if name not in f.parameters:  # a detail of the contact
+                        continue
                     value = f.parameters[name]
                     z.append((value.value - float(true)) / value.std if value.std else None)
     return {
@@ -118,9 +130,10 @@ def main() -> None:
     parser.add_argument("--start", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--report", action="store_true", help="the seeds results are quoted for")
+    parser.add_argument("--base", type=int, help="other seeds: the first of them")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
-    base = REPORT if options.report else DEVELOPMENT
+    base = options.base or (REPORT if options.report else DEVELOPMENT)
     rows = [json.loads(line) for line in options.out.open()] if options.out.exists() else []
     rows = [row for row in rows if row["suite"] == options.suite and row["base"] == base]
     done = {row["index"] for row in rows}

@@ -28,8 +28,8 @@ from benchmarks.free_runs import start_at
 from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline
-from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.whole import fit_whole
 from pipeline.gap.types import Gap, Trace
 from pipeline.gap.verdict.account import make_traces
 from pipeline.output import write_file

@@ -32,7 +32,7 @@ def effects_page() -> str:
     """Return the page in Markdown, all its words from the catalogue."""
     head = [
         "# The effects",
-        "<!-- written by docs/effects_page.py -->",
+        "<!-- written by python -m docs.codegen -->",
         phrases("report").text("effects"),
         "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
     ]

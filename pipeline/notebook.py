@@ -1,4 +1,4 @@
-"""An analysis for a notebook: one call, and everything in the types of pandas and control."""
+"""Analyses for a notebook: one call each, and everything in the types of pandas and control."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,12 +6,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.errors import ConfigError, DataError
-from pipeline.exchange import frames
+from pipeline.exchange import frames, gap_frames
+from pipeline.gap.types import Gap
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import closed_loop
+from pipeline.plant.nonlinear.motion import Motion
 from pipeline.report.document import Block, Document, Heading, spans
 from pipeline.report.draft.content import build_document
 from pipeline.report.gap.section import with_gap
+from pipeline.report.gap.words import terminal_verdict
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
@@ -179,6 +182,92 @@ class Lab:
 
     def __repr__(self) -> str:
         return terminal_summary(self.results)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Explained:
+    """What the linear carts leave out; at the end of a cell it shows its verdict.
+
+    Attributes
+    ----------
+    results : the same in the program's own types (`pipeline.gap.types`).
+    analysis : of the submission, what the tables take their units from.
+    """
+
+    results: Gap
+    analysis: Analysis
+
+    @property
+    def verdict(self) -> str:
+        """`named`, `partial`, `none`, `ambiguous` or `unexplained`."""
+        return self.results.verdict
+
+    @cached_property
+    def effects(self) -> "pd.DataFrame":
+        """The effects in the order found, a row each, its columns as in `gap.json`."""
+        return gap_frames.effects(self.results)
+
+    @cached_property
+    def parameters(self) -> "pd.DataFrame":
+        """The parameters of the effects, a row each, with their standard errors and units."""
+        return gap_frames.parameters(self.results)
+
+    @cached_property
+    def linear(self) -> "control.StateSpace":
+        """The linear carts that fit best: states `x1, v1, …`, input `u`, outputs `x1, …`."""
+        return self.results.linear.chain.to_control()
+
+    @cached_property
+    def system(self) -> "control.NonlinearIOSystem":
+        """The carts with their effects: states `x1, v1, …` and the effects' own.
+
+        Raises
+        ------
+        DataError : the drive leads its log, which no system of states can.
+        """
+        return Motion(self.results.model).to_control()
+
+    @property
+    def records(self) -> tuple[str, ...]:
+        """The recordings that were used: what `simulate` knows."""
+        return tuple(sorted({trace.experiment for trace in self.results.traces}))
+
+    def simulate(self, record: str) -> "pd.DataFrame":
+        """Return a recording by `time`: `measured`, `linear` and `with_effects`, a column a cart.
+
+        Raises
+        ------
+        ConfigError : this recording was not used.
+        """
+        if record not in self.records:
+            known = ", ".join(self.records)
+            raise ConfigError(f"no recording {record!r} was used; there are {known}")
+        return gap_frames.simulated(self.results, record)
+
+    @cached_property
+    def residual(self) -> "pd.DataFrame":
+        """The force that the model does not explain, a row for each cart and short window."""
+        return gap_frames.residual(self.results, analysis=self.analysis)
+
+    def __repr__(self) -> str:
+        return terminal_verdict(self.results)
+
+
+def explain(folder: Path | str, *, budget: float | None = None) -> Explained:
+    """Find what the linear model of a submission leaves out, as `cartlab gap` does.
+
+    `budget` in s; past it the best answer so far.
+
+    Raises
+    ------
+    SubmissionError : `submission.toml` is wrong or missing, or no data can be read.
+    DataError : no recording that a model could be held against.
+    """
+    from pipeline.gap.investigate import investigate  # compiles, which takes its time
+
+    analysis = run(load_submission(Path(folder)), design=False)
+    found = investigate(analysis, budget=budget, progress=lambda text: None)
+    return Explained(results=found, analysis=analysis)
 
 
 def analyse(folder: Path | str) -> Lab:

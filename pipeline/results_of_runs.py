@@ -85,6 +85,20 @@ class Record:
         return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
 
 
+@dataclass(frozen=True, kw_only=True)
+class Intervention:
+    """A stretch of a record, `start` to `end` in s, in which an unmeasured force moves a cart.
+
+    A hand, most likely; or one holds the cart away from its rest until it lets go.
+    """
+
+    experiment: str
+    cart: int
+    start: float
+    end: float
+    what: str = "held or moved by a force that was not measured"
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SinePoint:
     """Sinusoidal steady state of one cart in one dwell.
@@ -156,6 +170,7 @@ class LogDecrement:
 
     Attributes
     ----------
+    number : which of the record's decays, from 1; None where there is one only.
     release : s; where the free decay begins (a hold or a hand may come before it).
     peak_t, peak_y : (n_peaks,) the extrema used, maxima and minima in turn.
     amplitude : (n_peaks - 2,) half the swing about the moving rest point, at peak_t[1:-1].
@@ -168,6 +183,7 @@ class LogDecrement:
 
     experiment: str
     cart: int
+    number: int | None = None
     release: float
     peak_t: Array
     peak_y: Array
@@ -189,6 +205,11 @@ class LogDecrement:
     friction: FrictionTest | None
     zeta_at_amplitude: Array
     note: str = ""
+
+    @property
+    def name(self) -> str:
+        """The record's id, and which of its decays it is."""
+        return f"{self.experiment}, decay {self.number}" if self.number else self.experiment
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,6 +14,7 @@ from pipeline.checks.loops import check_loops, design_margins, verify_design
 from pipeline.checks.recordings import (
     check_dwells,
     check_files,
+    check_held,
     check_left_out,
     check_scales,
     check_setup,
@@ -21,10 +22,11 @@ from pipeline.checks.recordings import (
     check_units,
 )
 from pipeline.errors import DataError
+from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import UNTIED
 from pipeline.identify.log import Log, Progress
-from pipeline.identify.remarks import reading_remarks, turn_of_the_gains
+from pipeline.identify.remarks import hand_remarks, reading_remarks, turn_of_the_gains
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import read_data
 from pipeline.names import by_note, parameter_names
@@ -60,7 +62,11 @@ def analyse(
         log.skip(f"reading {name}", reason)
     log.warn(reading_remarks(data, unit=position))
 
-    found, left_out = identify_from_sound(data, system=system, progress=progress)
+    interventions = find_interventions(data.records)
+    log.warn(hand_remarks(interventions, records=data.records))
+    found, left_out = identify_from_sound(
+        data, interventions=interventions, system=system, progress=progress
+    )
     log.add(found.log)
     wrong = {one.experiment for one in left_out if one.is_wrong}
     sound = [record for record in data.records if record.id not in wrong]
@@ -87,6 +93,7 @@ def analyse(
         *check_scales(sound, system=system),
         *check_left_out(left_out, records=data.records),
         *check_setup(data.records),
+        *check_held(data.records),
         *check_dwells(data.records, found.sines),
         *check_channels(late),
         *found.repeats.checks,

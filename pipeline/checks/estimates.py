@@ -92,9 +92,10 @@ def check_decays(
             what = f"the ringing of cart {decay.cart} after the step"
         checks.append(
             Check.of(
-                f"decay.{decay.experiment}.cart_{decay.cart}",
+                f"decay.{decay.experiment}.cart_{decay.cart}"
+                + (f".{decay.number}" if decay.number else ""),
                 not test.present,
-                f"{decay.experiment}: {what} {found}",
+                f"{decay.name}: {what} {found}",
                 value=test.f_statistic,
                 limit=test.threshold,
             )

@@ -5,6 +5,7 @@
 LONGEST = 3.0  # m from end to end: no bench has so long a track
 LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
 LARGEST = 100.0  # V: no amplifier at a bench gives as much
+HELD_FIRMLY = 0.05  # of the free carts' swing: what a firm hold yields at most
 HELD_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
 OTHER_DWELL = 0.1  # relative: a dwell stated so far off is another one
 LATE, LATE_SURE = 2.0, 4.0  # samples, and standard errors, that a channel is late by at least

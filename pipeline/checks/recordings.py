@@ -232,6 +232,28 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
     return checks
 
 
+def check_held(records: Sequence[Record]) -> list[Check]:
+    """Fail for each record in which a cart that should be held moves much beside the free ones."""
+    checks = []
+    for record in records:
+        swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
+        free = max((swing[cart] for cart in record.carts if cart in record.free), default=0.0)
+        for cart in (cart for cart in record.carts if cart not in record.free):
+            if limits.HELD_FIRMLY * free < swing[cart] <= free:
+                share = swing[cart] / free
+                message = (
+                    f"{record.id}: cart {cart} is said to be held, but it moves by "
+                    f"{100 * share:.0f} % of what the free carts do: clamp it, for it drives its "
+                    "neighbours"
+                )
+                checks.append(
+                    Check.of(
+                        f"held.{record.id}", False, message, value=share, limit=limits.HELD_FIRMLY
+                    )
+                )
+    return checks
+
+
 def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list[Check]:
     """Check that the dwells swing at the frequencies stated of them, as a class or one by one."""
     stated = {record.id: record.omega for record in records if record.omega}

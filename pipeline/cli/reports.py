@@ -233,14 +233,14 @@ def gap(
     folder: Folder,
     out: Annotated[Path | None, typer.Option(help="Where to write; default: DIR/gap.")] = None,
     budget: Annotated[
-        float,
+        float | None,
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Of the search; past it, the best answer so far, said as such. The carts are "
-            "identified before and the report is written after it, in seconds.",
+            help="Of the search; past it, the best answer so far, said as such. Without it the "
+            "search ends by itself, and the answer is the same on every machine.",
         ),
-    ] = 60.0,
+    ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -257,7 +257,7 @@ def explain(
     folder: Path,
     *,
     out: Path | None,
-    budget: float,
+    budget: float | None = None,
     pdf: bool = True,
     progress: Callable[[str], None],
 ) -> tuple[str, list[str]]:

@@ -98,7 +98,7 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     return told
 
 
-def gap(folder: str, budget: float, *, progress: Progress) -> None:
+def gap(folder: str, *, progress: Progress) -> None:
     """Write what the linear model leaves out into the submission's own folder."""
     from pipeline.bench.design.discriminate import propose_for
     from pipeline.gap.investigate import investigate
@@ -110,7 +110,7 @@ def gap(folder: str, budget: float, *, progress: Progress) -> None:
     out = own_folder(submission.folder, "gap")
     with alone_in(out):
         analysis = analyse(submission, design=False, progress=progress)
-        found = investigate(analysis, budget=budget, progress=progress)
+        found = investigate(analysis, progress=progress)
         found = propose_for(found, submission)
         write_file(out / "gap.json", gap_text(found, analysis))
         render_gap(found, analysis, out, progress=progress)

@@ -21,3 +21,26 @@ def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
 def bump_integral(s: Array) -> Array:
     """Return the integral of the bump from 0 to s, for an input that is held between samples."""
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
+
+
+def window_weights(t: Array) -> tuple[Array, Array, Array]:
+    """Return the weights (windows, samples) that give mean, minus mean slope and mean curvature.
+
+    Few samples integrate the bump's derivatives badly: the weights are made exact for parabolas.
+
+    Parameters
+    ----------
+    t : (windows, samples) s, the times of the samples in each window.
+    """
+    span = t[:, -1:] - t[:, :1]
+    w, w1, w2 = bump((t - t[:, :1]) / span, span=span)
+    dt = np.gradient(t, axis=1)
+    size = (w * dt).sum(1, keepdims=True)
+    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
+    tau = t - (w * t).sum(1, keepdims=True)
+    spread = (w * tau**2).sum(1, keepdims=True)
+    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
+    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
+    w1 = w1 - w * w1.sum(1, keepdims=True)
+    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
+    return w, w1, w2

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.estimation.interventions import find_interventions
 from pipeline.gap import limits
 from pipeline.gap.data.runs import Run
 from pipeline.gap.data.sides import prepare, take_sides
@@ -15,11 +16,10 @@ from pipeline.gap.fit.baseline import fit_baseline, measure_noise
 from pipeline.gap.fit.levenberg_marquardt import Fit, fit_model
 from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
-from pipeline.gap.fit.uncertainty import covariance
-from pipeline.gap.search.beam import choose, prune, search, steps_to
 from pipeline.gap.search.deadline import Deadline, OutOfTime
-from pipeline.gap.search.grow import fit_whole
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.search import search, steps_to
+from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
     chain_covariance,
@@ -32,7 +32,10 @@ from pipeline.gap.verdict.account import (
     repeatability,
 )
 from pipeline.gap.verdict.decision import choose_experiment, reach_verdict
+from pipeline.gap.verdict.free_run import free_runs
+from pipeline.gap.verdict.left_force import left_forces
 from pipeline.gap.verdict.offset import find_offset
+from pipeline.gap.verdict.residual_map import map_residual
 from pipeline.gap.verdict.where import find_windows
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
@@ -75,8 +78,11 @@ def explain_gap(
     DataError : no usable record.
     """
     notes: list[str] = []
-    runs = prepare(records, springs=tuple(springs), notes=notes)
+    interventions = find_interventions(records)
+    runs = prepare(records, springs=tuple(springs), interventions=interventions, notes=notes)
     training, held_out = take_sides(runs, notes=notes)
+    # One run more than there were: the longest was cut in time.
+    whole = runs if len(training) + len(held_out) > len(runs) and not any(springs) else []
     # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=workers) as pool:
         deadline = Deadline(pool.map, seconds=budget)
@@ -92,6 +98,7 @@ def explain_gap(
             repeatability=repeatability([*training, *held_out]) or 0.0,
             mapper=pool.map,
             tell=tell,
+            whole=tuple(_with_noise(run, sigma) for run in whole),
         )
         chosen, found = _investigate(fit, study, deadline)
         for _ in range(_NOISE_ROUNDS):
@@ -122,9 +129,14 @@ def explain_gap(
         chosen = path[-1]
         with suppress(OutOfTime):
             chosen = _settled(chosen, replace(study, mapper=deadline.map))
-        final = covariance(chosen.fit, study.training, mapper=pool.map)
-        chosen = replace(chosen, fit=final)
-        path = (*path[:-1], chosen)
+        final = finish(chosen.fit, study)
+        if study.whole:
+            judged_runs, nuisance = study.whole, final.nuisance
+        else:
+            chosen = replace(chosen, fit=final)
+            path = (*path[:-1], chosen)
+            judged_runs = (*study.training, *study.held_out)
+            nuisance = (*final.nuisance, *chosen.held.nuisance)
     if verdict == "named" and not study.explains(chosen):
         verdict = "partial"
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -143,18 +155,21 @@ def explain_gap(
             "beside a contact (a backlash, a stop) the stated errors are the least they can be"
         )
     driven = any(np.any(run.command) for run in study.training)
+    force_unit = input_unit if driven else f"{position_unit}/s^2"  # the first mass is one
     effects = list_effects(
         path,
         final,
         found,
         position_unit=position_unit,
-        input_unit=input_unit if driven else f"{position_unit}/s^2",  # the first mass is one
+        input_unit=force_unit,
     )
     traces = make_traces(path[0], chosen, study)
-    model = chosen.fit.structure.model(chosen.fit.theta)
+    model = final.structure.model(final.theta)
     enough = verdict in ("none", "named")
     settled = enough and study.is_noise(chosen)
     left = () if enough else find_windows(chosen.fit, study.training)
+    told = enough or (verdict == "ambiguous" and study.explains(chosen))
+    forces = left_forces(final, judged_runs, nuisance)
     return Gap(
         verdict=verdict,
         effects=effects,
@@ -169,14 +184,20 @@ def explain_gap(
         ),
         linear=path[0].fit.structure.model(path[0].fit.theta),
         model=replace(model, terms=_in_order(model.terms, effects)),
-        training=tuple(run.id for run in study.training),
-        held_out=tuple(run.id for run in study.held_out),
+        training=tuple(dict.fromkeys(run.id for run in study.training)),
+        held_out=tuple(dict.fromkeys(run.id for run in study.held_out)),
+        interventions=interventions,
         traces=traces,
         chain_std=chain_std(final),
         chain_covariance=chain_covariance(final),
         spread=_learnt_spread(chosen.fit),
         suspects=list_suspects(found, effects) if verdict == "unexplained" else (),
         left=left,
+        residual=()
+        if told
+        else map_residual(forces, springs=springs, position=position_unit, drive=force_unit),
+        left_forces=forces,
+        free_run=free_runs(final, judged_runs, nuisance),
         complete=not deadline.cut,
         notes=tuple(notes),
         contenders=() if settled else list_contenders(chosen, close or found),
@@ -204,7 +225,7 @@ def _settled(hypothesis: Hypothesis, study: Study) -> Hypothesis:
         tolerance=_SETTLED / fit.n_points,
         mapper=study.mapper,
     )
-    return replace(judge(fit, study, added=hypothesis.added), bic=hypothesis.bic)
+    return replace(judge(fit, study), bic=hypothesis.bic)
 
 
 def _learnt_spread(fit: Fit) -> dict[int, float]:
@@ -228,7 +249,8 @@ def _quieter(study: Study, best: Hypothesis) -> Study:
     training = measure_noise(best.fit, study.training, study.training)
     sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
     held_out = tuple(_with_noise(run, sigma) for run in study.held_out)
-    return replace(study, training=tuple(training), held_out=held_out)
+    whole = tuple(_with_noise(run, sigma) for run in study.whole)
+    return replace(study, training=tuple(training), held_out=held_out, whole=whole)
 
 
 def _with_noise(run: Run, sigma: dict[int, float]) -> Run:
@@ -247,8 +269,7 @@ def _investigate(fit: Fit, study: Study, deadline: Deadline) -> tuple[Hypothesis
         return baseline, [baseline]
     study.tell(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
     timed = replace(study, mapper=deadline.map)
-    found = search(baseline, timed)
-    return prune(choose(found, baseline, study), timed), found
+    return search(baseline, timed)
 
 
 def _with_offset(
@@ -282,9 +303,9 @@ def _with_offset(
     candidate = Candidate(
         effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
     )
-    without = tuple(judge(fit_whole(h.fit, pinned), pinned, added=h.added) for h in path)
+    without = tuple(judge(fit_whole(h.fit, pinned), pinned) for h in path)
     fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
-    final = judge(fit, loose, added=(candidate,))
+    final = judge(fit, loose)
     if final.error > min(
         limits.OFFSET_GAIN * without[-1].error, limits.OFFSET_AS_FREE * chosen.error
     ):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from pipeline.gap.data.sides import drop_left_out
 from pipeline.gap.explain import explain_gap
+from pipeline.gap.follow.track import compile_follower
 from pipeline.gap.types import Gap
 from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.results import Analysis
@@ -25,6 +26,7 @@ def investigate(
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     progress("preparing the simulator; once on each machine it is compiled, which takes a while")
     compile_simulator()
+    compile_follower()
     gap = explain_gap(
         records,
         springs=analysis.springs,

@@ -26,6 +26,7 @@ ALONE = 5.0
 # whose own law is not the model's; nine of ten names leave at most 1.02 times the noise, and who
 # leaves more than FURTHER without a contact is often half of what acts, which is said.
 ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
+SURE = 3.0  # standard errors from nothing: whoever is nearer is not named
 HELD_OUT_GAIN = 0.95  # on held-out runs: of the root of chi-square, 10 % in squares …
 RUN_GAIN, RUN_SHARE = 0.97, 0.6  # … and 6 % in more than half of the runs, whichever they are
 PARTIAL_GAIN = 0.9  # of the error, where too much for a name is left: a tenth is worth telling

@@ -8,11 +8,25 @@ from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
 from pipeline.gap.document import gap_json
-from pipeline.gap.types import Contender, FoundEffect, Gap, GapWindow, NamedValue, RecordGap, Rival
+from pipeline.gap.types import (
+    Contender,
+    ForceAgainst,
+    ForceFormula,
+    FormulaTerm,
+    FoundEffect,
+    FreeRun,
+    Gap,
+    GapWindow,
+    NamedValue,
+    RecordGap,
+    Residual,
+    Rival,
+)
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
 from pipeline.results import Analysis, LeftOut
 from pipeline.results_json import chain_entry, provenance
+from pipeline.results_of_runs import Intervention
 from pipeline.schemas.base import fields_of, json_text
 from pipeline.schemas.gap import Gap as GapDocument
 from pipeline.schemas.gap import GapSubmission
@@ -62,12 +76,15 @@ def _gap(document: Mapping[str, Any]) -> Gap:
         repeatability=_or_none(document["repeatability"]),
         by_record=tuple(RecordGap(**entry) for entry in document["by_record"]),
         where=tuple(_window(entry) for entry in document["where"]),
+        free_run=tuple(FreeRun(**entry) for entry in document["free_run"]),
+        residual=tuple(_residual(entry) for entry in document["residual"]),
         next_experiment=str(document["next_experiment"]),
         linear=AugmentedChain(chain=_chain(document["linear"])),
         model=_model(document["model"]),
         training=tuple(document["training"]),
         held_out=tuple(document["held_out"]),
         left_out=tuple(LeftOut(**entry) for entry in document["left_out"]),
+        interventions=tuple(_intervention(entry) for entry in document["interventions"]),
         traces=(),
         chain_std=dict(document["chain_std"]),
         spread={int(cart): value for cart, value in document["friction_spread"].items()},
@@ -109,6 +126,31 @@ def _window(entry: Mapping[str, Any]) -> GapWindow:
         end=entry["to"],
         what=entry["what"],
         share=entry["share"],
+    )
+
+
+def _intervention(entry: Mapping[str, Any]) -> Intervention:
+    return Intervention(
+        experiment=entry["experiment"],
+        cart=entry["cart"],
+        start=entry["from"],
+        end=entry["to"],
+        what=entry["what"],
+    )
+
+
+def _residual(entry: Mapping[str, Any]) -> Residual:
+    formula = entry["formula"]
+    return Residual(
+        cart=entry["cart"],
+        unit=entry["unit"],
+        against=tuple(ForceAgainst(**one) for one in entry["against"]),
+        formula=None
+        if formula is None
+        else ForceFormula(
+            terms=tuple(FormulaTerm(**term) for term in formula["terms"]),
+            explains=formula["explains"],
+        ),
     )
 
 

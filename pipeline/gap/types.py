@@ -6,6 +6,7 @@ from typing import Any, Literal
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
 from pipeline.results import LeftOut
+from pipeline.results_of_runs import Intervention
 
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
 
@@ -74,6 +75,17 @@ class GapWindow:
     share: float
 
 
+@dataclass(frozen=True, kw_only=True)
+class FreeRun:
+    """Root-mean-square error (position unit) of one simulation of a whole record.
+
+    None where the carts run away.
+    """
+
+    experiment: str
+    error: float | None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
     """One cart in one run, for figures: measured, the linear model, the final model (n,).
@@ -90,6 +102,88 @@ class Trace:
     baseline: Array
     final: Array
     zero: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LeftForce:
+    """The force that the model does not explain, on one cart in one run: a mean over each window.
+
+    Attributes
+    ----------
+    t, x, v, u (windows, samples) : times, position, velocity, input (0 on other carts than 1).
+    weight (windows, samples) : of each sample in the mean; they add up to one.
+    acceleration, force (windows,) : means.
+    """
+
+    experiment: str
+    cart: int
+    weight: Array
+    t: Array
+    x: Array
+    v: Array
+    u: Array
+    acceleration: Array
+    force: Array
+
+    def mean(self, values: Array) -> Array:
+        """Return the mean of (windows, samples) values over each window, (windows,)."""
+        return (self.weight * values).sum(axis=1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FormulaTerm:
+    """One term of a formula, "v|v|" say, with its coefficient."""
+
+    term: str
+    coefficient: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceFormula:
+    """The shortest formula for the force left; `explains` is the share that it takes of it."""
+
+    terms: tuple[FormulaTerm, ...]
+    explains: float
+
+    @property
+    def text(self) -> str:
+        """The sum of the terms in words, "-0.0021 sqrt|v| sign v"."""
+        signed = " ".join(
+            f"{'-' if one.coefficient < 0 else '+'} {abs(one.coefficient):.3g} {one.term}"
+            for one in self.terms
+        )
+        return f"-{signed[2:]}" if signed[0] == "-" else signed[2:]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ForceAgainst:
+    """The force left against one quantity, bin by bin.
+
+    Attributes
+    ----------
+    quantity : "position", "velocity" or "input", with its `unit`.
+    at, force : means of each bin; `formula` the mean of what the formula says there.
+    spread : standard deviation between runs of a bin's mean, None where one run alone has it.
+    """
+
+    quantity: str
+    unit: str
+    at: tuple[float, ...]
+    force: tuple[float, ...]
+    spread: tuple[float | None, ...]
+    formula: tuple[float, ...] | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Residual:
+    """What is left on one cart: the force (in `unit`), and a formula where one fits."""
+
+    cart: int
+    unit: str
+    against: tuple[ForceAgainst, ...]
+    formula: ForceFormula | None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -136,6 +230,9 @@ class Gap:
     baseline, final, noise_floor : relative errors pooled over the held-out runs.
     repeatability : the same between runs with the same input, or None without repeats.
     suspects : under `unexplained`, the single effects that help most, the best first.
+    left_forces : the force that the model does not explain, run by run; residual : what it is on
+        each cart, where more is left than a name may leave.
+    free_run : of each run, the error of one simulation from its first readings to its end.
     where, left : where the linear model departs most; and the final one, unless it is enough.
     complete : False where the time allowed ended the search: the best answer so far.
     linear, model : the linear chain that fits best, and the chain with the effects.
@@ -143,6 +240,7 @@ class Gap:
         n_p) of the same, None where it could not be had or was read from a file.
     training, held_out : ids of the runs.
     left_out : recordings that the identification did not use, and why: no part of any figure here.
+    interventions : where a force that was not measured acts: no part of any fit or error.
     spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
     notes : what a reader must know.
     contenders : unless one leaves no more than noise: the models that may be true, the chosen
@@ -169,8 +267,12 @@ class Gap:
     spread: dict[int, float] = field(default_factory=dict)
     suspects: tuple[Rival, ...] = ()
     left: tuple[GapWindow, ...] = ()
+    free_run: tuple[FreeRun, ...] = ()
+    residual: tuple[Residual, ...] = ()
+    left_forces: tuple[LeftForce, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
+    interventions: tuple[Intervention, ...] = ()
     contenders: tuple[Contender, ...] = ()
     proposal: Proposal | None = None

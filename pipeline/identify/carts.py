@@ -1,12 +1,14 @@
 """Every number that records give of the carts, and the fit of them all."""
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
+from pipeline.errors import DataError
+from pipeline.estimation.interventions import between
 from pipeline.identify.fit import Fitted, fit_carts
 from pipeline.identify.log import Log, Progress
 from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
@@ -21,6 +23,7 @@ from pipeline.results import (
     SinePoint,
     StepGain,
 )
+from pipeline.results_of_runs import Intervention
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -58,6 +61,7 @@ class Identified:
 def identify(
     data: Ingested,
     *,
+    interventions: Sequence[Intervention],
     without: Set[str],
     system: System,
     progress: Progress,
@@ -73,7 +77,9 @@ def identify(
     driven = _driven(records, n=n, log=log)
 
     progress("free decays: logarithmic decrement")
-    decays = _log_decrements(records, out=out, springs=springs, log=log)
+    decays = _log_decrements(
+        records, out=out, springs=springs, interventions=interventions, log=log
+    )
     progress("steps: static gains")
     gains = _step_gains(driven, out=out, system=system, log=log)
     progress("sine dwells: steady state")
@@ -82,7 +88,7 @@ def identify(
     log.warn(
         by_note(
             [
-                *((f"{d.experiment}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
+                *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
                 *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
                 *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
             ]
@@ -156,10 +162,15 @@ def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[Frequency
 
 
 def _log_decrements(
-    records: Sequence[Record], *, out: Sequence[Record], springs: Sequence[bool], log: Log
+    records: Sequence[Record],
+    *,
+    out: Sequence[Record],
+    springs: Sequence[bool],
+    interventions: Sequence[Intervention],
+    log: Log,
 ) -> list[LogDecrement]:
     """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
-    decays = []
+    decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(springs), start=1):
         if not (before or after):
             log.skip(f"log decrement, cart {cart}", f"no spring holds cart {cart}: it cannot swing")
@@ -174,12 +185,37 @@ def _log_decrements(
                 out=[r for r in out if r.free == (cart,) and r.kind in ("decay", "step")],
             )
         for run in runs:
-            decay = log.attempt_once(
-                f"log decrement, {run.id}, cart {cart}", fit_log_decrement, run, cart=cart
+            decays += (
+                log.attempt_once(
+                    f"log decrement, {run.id}, cart {cart}",
+                    _decays_between,
+                    between(run, interventions),
+                    cart=cart,
+                )
+                or ()
             )
-            if decay:
-                decays.append(decay)
     return decays
+
+
+def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement]:
+    """Return the decay of each piece of a record that shows one.
+
+    Raises
+    ------
+    DataError : none of them does.
+    """
+    decays: list[LogDecrement] = []
+    fault: DataError | None = None
+    for piece in pieces:
+        try:
+            decays.append(fit_log_decrement(piece, cart=cart))
+        except DataError as error:
+            fault = error
+    if fault and not decays:
+        raise fault
+    if len(decays) == 1:
+        return decays
+    return [replace(decay, number=i) for i, decay in enumerate(decays, start=1)]
 
 
 def _sticks(decay: LogDecrement) -> bool:

@@ -11,6 +11,7 @@ from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import Ingested
 from pipeline.names import by_note
 from pipeline.results import Record
+from pipeline.results_of_runs import Intervention
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
@@ -26,6 +27,20 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
         *by_note((record.id, note) for record in data.records for note in record.notes),
         *by_note((name, f"{one.reason}; {harmless}") for name, one in units.items()),
     ]
+
+
+def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
+    """Return in which records a hand acts on a cart, and when; but not that a decay is let go."""
+    released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
+    return by_note(
+        (
+            one.experiment,
+            f"cart {one.cart} is {one.what} from {one.start:.2f} to {one.end:.2f} s (a hand?); "
+            "what follows counts as a release of its own",
+        )
+        for one in interventions
+        if (one.experiment, one.start) not in released
+    )
 
 
 def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:

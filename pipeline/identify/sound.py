@@ -1,6 +1,6 @@
 """Which records the carts are identified from: those that hold what happened."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -16,6 +16,7 @@ from pipeline.identify.soundness.repeats import find_outlier_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import LeftOut
+from pipeline.results_of_runs import Intervention
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.submission import System
 
@@ -23,7 +24,11 @@ _ROUNDS = 4  # of leaving out what the carts found without it show to be wrong
 
 
 def identify_from_sound(
-    data: Ingested, *, system: System, progress: Progress
+    data: Ingested,
+    *,
+    interventions: Sequence[Intervention],
+    system: System,
+    progress: Progress,
 ) -> tuple[Identified, list[LeftOut]]:
     """Identify the carts without the records that they, or their repeats, show to be wrong.
 
@@ -43,7 +48,14 @@ def identify_from_sound(
     fits: Mapping[str, Followed] = {}
     left_out = find_outlier_repeats(driven, unit=unit) | shown
     without = left_out.keys() | standing_still(data.records)
-    again = partial(identify, data, system=system, progress=progress, measured={})
+    again = partial(
+        identify,
+        data,
+        interventions=interventions,
+        system=system,
+        progress=progress,
+        measured={},
+    )
     found = again(without=without)
     for _ in range(_ROUNDS):
         # Where nothing is left to identify the carts from, the verdict before stands.

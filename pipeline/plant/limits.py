@@ -7,8 +7,6 @@ SETTLING_BAND = 0.02  # of the change in level: the 2 % criterion
 # a real cart's damping differs by a quarter between driven and free, its spring by some percent.
 MASS_SPRING_ERROR, DAMPING_ERROR = 0.03, 0.30
 
-# Times the springs' stiffness: a contact as soft is a spring that changes, and one as hard a stop.
-HARD = 4.0
 # Sample times: a delay and a lag of one size T are late by the same mean time, and differ first by
 # T²/2 in the second moment, an eighth of a sample squared.
 MUCH_SHORTER = 0.5

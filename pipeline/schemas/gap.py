@@ -4,7 +4,15 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from pipeline.schemas.base import Chain, ChainWithUnits, Document, Number, Provenance, Units
+from pipeline.schemas.base import (
+    Chain,
+    ChainWithUnits,
+    Document,
+    Number,
+    Numbers,
+    Provenance,
+    Units,
+)
 
 Place = Annotated[
     dict[str, int], Field(description='{"cart": 1} or {"spring": 2}; empty: the input')
@@ -62,6 +70,60 @@ class RecordErrors(Document):
     noise_floor: Number
 
 
+class FreeRun(Document):
+    """One simulation of a whole record, started from its first readings."""
+
+    experiment: str
+    error: Annotated[
+        Number, Field(description="root mean square, position unit; null: the carts run away")
+    ]
+
+
+class ForceAgainst(Document):
+    """The force that the model does not explain against one quantity, bin by bin."""
+
+    quantity: Literal["position", "velocity", "input"]
+    unit: str
+    at: Annotated[Numbers, Field(description="mean of the quantity in each bin")]
+    force: Annotated[Numbers, Field(description="mean force")]
+    spread: Annotated[
+        tuple[Number, ...],
+        Field(description="standard deviation between runs; null where one run alone has the bin"),
+    ]
+    formula: Annotated[Numbers | None, Field(description="mean of what the formula says")]
+
+
+class FormulaTerm(Document):
+    """One term of a formula."""
+
+    term: Annotated[str, Field(description="in x, v and u of the cart, v|v| say")]
+    coefficient: float
+    std: float
+    unit: str
+
+
+class ForceFormula(Document):
+    """The shortest formula for the force that is left, by regression over a library of terms."""
+
+    text: Annotated[str, Field(description="the sum of the terms, for people")]
+    terms: tuple[FormulaTerm, ...]
+    explains: Annotated[float, Field(description="share of the squared force")]
+    in_catalogue: Annotated[
+        Literal[False], Field(description="a description of the data, not an effect of it")
+    ] = False
+
+
+class Residual(Document):
+    """What is left on one cart."""
+
+    cart: int
+    unit: Annotated[str, Field(description="of the force")]
+    against: tuple[ForceAgainst, ...]
+    formula: Annotated[
+        ForceFormula | None, Field(description="null where no term is better than none")
+    ]
+
+
 class Window(Document):
     """Where a run departs from a model most."""
 
@@ -105,6 +167,16 @@ class LeftOut(Document):
     ] = False
 
 
+class Intervention(Document):
+    """A stretch in which a force that was not measured, such as a hand, acts on a cart."""
+
+    experiment: str
+    cart: int
+    from_: Annotated[float, Field(alias="from", description="s")]
+    to: Annotated[float, Field(description="s")]
+    what: str
+
+
 class GapSubmission(Document):
     """Which submission it is about."""
 
@@ -132,10 +204,17 @@ class Gap(Document):
     gap: Errors
     repeatability: Annotated[Number, Field(description="between runs of the same input")]
     by_record: tuple[RecordErrors, ...]
+    free_run: Annotated[
+        tuple[FreeRun, ...], Field(description="of each run, how far one simulation strays")
+    ] = ()
     where: Annotated[tuple[Window, ...], Field(description="where the linear model fails most")]
     left: Annotated[
         tuple[Window, ...],
         Field(description="where the final model does, under `partial` and `unexplained`"),
+    ] = ()
+    residual: Annotated[
+        tuple[Residual, ...],
+        Field(description="where more is left than a name may leave, the force left by cart"),
     ] = ()
     next_experiment: str
     next_recording: Annotated[
@@ -152,6 +231,9 @@ class Gap(Document):
     training: tuple[str, ...]
     held_out: tuple[str, ...]
     left_out: tuple[LeftOut, ...] = ()
+    interventions: Annotated[
+        tuple[Intervention, ...], Field(description="no part of any fit or error")
+    ] = ()
     friction_spread: Annotated[
         dict[str, float], Field(description="run-to-run spread of the dry friction, by cart")
     ]

@@ -89,6 +89,10 @@ class LogDecrement(Document):
 
     experiment: str
     cart: int
+    number: Annotated[
+        int | None, Field(description="which of the recording's decays, from 1; null: the only one")
+    ] = None
+    release: Annotated[float, Field(description="s, where the free decay begins")] = 0.0
     delta: Annotated[Number, Field(description="logarithmic decrement per full cycle")]
     delta_std: Number
     omega_n: Annotated[Number, Field(description="rad/s, of the exponential-sinusoid fit")]

@@ -229,7 +229,7 @@ def _release_with_effects(model: AugmentedChain, run: Run, hand: Hand) -> Array:
 def before_stop(hand: Hand, model: AugmentedChain) -> Hand:
     """Return a hand that holds its cart on the near side of the end stop, if there is one."""
     row = model.tables()[0][hand.cart - 1]
-    stiff = row[Cart.STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]
-    furthest = _BEFORE_STOP * float(row[Cart.STOP])
+    stiff = row[Cart.END_STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]
+    furthest = _BEFORE_STOP * float(row[Cart.END_STOP_POSITION])
     beyond = hand.position * furthest > furthest**2
     return replace(hand, position=furthest) if stiff and beyond else hand

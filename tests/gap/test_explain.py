@@ -12,10 +12,9 @@ from pipeline.errors import DataError
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.document import gap_json
 from pipeline.gap.explain import _may_be_half, explain_gap
-from pipeline.gap.fit.levenberg_marquardt import fit_model, project
+from pipeline.gap.fit.levenberg_marquardt import fit_model
 from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
-from pipeline.gap.search.screen import candidates_at, find_teams
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
 from pipeline.plant.linear.chain import Chain
@@ -153,77 +152,6 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
     assert repeatability([runs[0], replace(runs[1], id=runs[0].id)]) is None  # of one record
 
 
-def test_effects_that_only_together_explain_are_found_together():
-    """Of three directions two, each of which explains little alone, add up to the residual."""
-    case = make_case(seed=44, n=2, rate=113.1)
-    structure = Structure(springs=case.springs)
-    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    chain = structure.chain(structure.start(true).theta)
-    runs = [make_run(record, n=2) for record in case.records]
-    trials = [
-        candidates_at(find_effect(key), 1, runs=runs, chain=chain)[0]
-        for key in ("quadratic_drag", "cubic_spring", "load_friction")
-    ]
-    directions = np.array([[1.0, 0.0, 0.0], [-0.9, 0.3, 0.0], [0.3, 0.1, 1.0]]).T
-    residual = directions[:, 0] + directions[:, 1]
-
-    (team,) = find_teams(trials, directions, residual)
-
-    assert [c.effect.key for c in team.candidates] == ["quadratic_drag", "cubic_spring"]
-    assert team.share == pytest.approx(1.0)
-
-
-def test_friction_on_all_carts_is_tried_beside_another_effect():
-    """Two frictions and a braking motor add up to the residual, and no two of them do."""
-    case = make_case(seed=44, n=2, rate=113.1)
-    structure = Structure(springs=case.springs)
-    true = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
-    chain = structure.chain(structure.start(true).theta)
-    runs = [make_run(record, n=2) for record in case.records]
-    trials = [
-        candidates_at(find_effect(key), place, runs=runs, chain=chain)[0]
-        for key, place in (("coulomb_friction", 1), ("drive_damping", 0), ("coulomb_friction", 2))
-    ]
-    residual = np.ones(3)
-
-    family, pair, three = find_teams(trials, np.eye(3), residual)
-
-    assert family.family
-    assert family.share == pytest.approx(pair.share) == pytest.approx(2 / 3)
-    assert {c.key for c in three.candidates} == {candidate.key for candidate, _ in trials}
-    assert three.share == pytest.approx(1.0)
-
-
-def test_what_no_run_shows_absorbs_nothing():
-    """A held cart's mass and the share of two springs that act as one project nothing off."""
-    m, c, k = np.array([3e-4]), np.array([6e-4]), 0.08
-    t = np.asarray(np.arange(400) / 113.1, dtype=np.float64)
-    u = np.where(t > 0.05, 0.1, 0.0)
-    y = simulate_truth(m=m, c=c, k=[k, 0.0], hidden=[], t=t, u=u, free=(1,))
-    one = Record(
-        id="a", kind="step", t=t, u=u, y=y, carts=(1,), free=(1,), resolution=np.array([COUNT])
-    )
-    two = replace(one, y=np.vstack([y, 0 * t]), carts=(1, 2), resolution=np.full(2, COUNT))
-    chains = (
-        (one, Chain(m=1.1 * m, c=c, k=np.array([k, 0.0])), (True, False)),
-        (
-            two,
-            Chain(m=np.append(1.1 * m, m), c=np.append(c, c), k=np.array([k - 0.03, 0.03, 0.01])),
-            (True,) * 3,
-        ),
-    )
-    left = []
-    for record, chain, springs in chains:
-        structure = Structure(springs=springs)
-        run = make_run(record, n=len(springs) - 1)
-        fit = fit_model(structure.start(chain), [run], iterations=0)
-        wave = np.sign(np.sin(7.0 * t))[None, None]
-        directions, residual = project(fit, [run], [wave])
-        left.append((float((directions**2).sum()), float((residual**2).sum())))
-
-    assert left[1] == pytest.approx(left[0], rel=1e-3)
-
-
 @pytest.mark.parametrize("said", [(1,), (1, 2)])
 def test_a_cart_held_in_all_runs_is_a_wall(said):
     """Runs of cart 1 alone in a folder of two carts give what one cart would, in its own words."""
@@ -324,8 +252,10 @@ def test_no_motion_is_one_clear_error():
         explain_gap([still], springs=(True, False))
 
 
-def positioning_stage(*, friction: float, seed: int, reference) -> Record:
+def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
     """Return one run of a cart on no spring under PD feedback, stepped at 80 µs.
+
+    `push` is a constant force, V.
 
     u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c = 5e-4 in V, s, cm.
     """
@@ -340,7 +270,7 @@ def positioning_stage(*, friction: float, seed: int, reference) -> Record:
         u[k] = 0.05 * error + 0.004 * (error - last) * 250.0 * (k > 0)
         last = error
         for _ in range(50):
-            target = v + h / m * (u[k] - c * v)
+            target = v + h / m * (u[k] + push - c * v)
             most = friction * h / m
             v = 0.0 if abs(target) <= most else target - np.sign(target) * most
             x += h * v
@@ -356,27 +286,51 @@ def positioning_stage(*, friction: float, seed: int, reference) -> Record:
     )
 
 
+REFERENCES = (
+    lambda t: 1.0 * (t > 0.2) - 1.5 * (t > 2.0) + 1.0 * (t > 4.0),
+    lambda t: 0.8 * np.sin(2 * np.pi * 0.7 * t),
+    lambda t: -0.7 * (t > 0.2) + 1.2 * (t > 2.5),
+    lambda t: 0.6 * np.sin(2 * np.pi * (0.3 + 0.15 * t) * t),
+)
+
+
 @pytest.mark.parametrize("friction", [0.0, 0.003])
 def test_a_rigid_body_under_feedback(friction):
-    """Without any spring friction is found (or not) from feedback runs, judged over windows."""
-    references = (
-        lambda t: 1.0 * (t > 0.2) - 1.5 * (t > 2.0) + 1.0 * (t > 4.0),
-        lambda t: 0.8 * np.sin(2 * np.pi * 0.7 * t),
-        lambda t: -0.7 * (t > 0.2) + 1.2 * (t > 2.5),
-        lambda t: 0.6 * np.sin(2 * np.pi * (0.3 + 0.15 * t) * t),
-    )
+    """Without any spring friction is found (or not) from feedback runs, each judged as a whole.
+
+    One simulation of a whole run, nothing of it fitted, then ends within two encoder counts: the
+    start is read to half a count, and errors of the numbers add up.
+    """
     records = [
-        positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(references)
+        positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
     ]
 
     gap = explain_gap(records, springs=(False, False))
 
-    assert any("windows" in note for note in gap.notes)
+    assert any("as a whole" in note for note in gap.notes)
+    assert [run.experiment for run in gap.free_run] == [record.id for record in records]
+    assert all(run.error is not None and run.error < 2 * 0.00227 for run in gap.free_run)
     if friction:
         assert names(gap) == [("coulomb_friction", 1)]
         assert gap.effects[0].parameters["force"].value == pytest.approx(friction, rel=0.03)
     else:
         assert gap.verdict == "none"
+
+
+def test_a_constant_force_without_springs():
+    """A tilted track shows as a drift, which only whole runs have: friction and force are named."""
+    records = [
+        positioning_stage(friction=0.003, push=0.0008, seed=i, reference=r)
+        for i, r in enumerate(REFERENCES)
+    ]
+
+    gap = explain_gap(records, springs=(False, False))
+
+    assert gap.verdict == "named"
+    assert sorted(names(gap)) == [("coulomb_friction", 1), ("force_offset", 1)]
+    sizes = {f.effect.key: f.parameters["force"].value for f in gap.effects}
+    assert sizes["coulomb_friction"] == pytest.approx(0.003, rel=0.03)
+    assert sizes["force_offset"] == pytest.approx(0.0008, rel=0.03)
 
 
 def test_a_single_decay_is_cut_where_it_still_moves():

@@ -12,7 +12,7 @@ from pipeline.gap.fit.baseline import measure_noise
 from pipeline.gap.fit.levenberg_marquardt import evaluate, fit_model
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.fit.uncertainty import covariance
-from pipeline.gap.search.screen import candidates_at
+from pipeline.gap.search.translate import make_candidate
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.submission import load_submission
@@ -35,8 +35,7 @@ def standardised(folder, *, preset, hide, seed):
     runs = prepare(records, springs=springs, notes=[])
     start = Structure(springs=springs).start(hidden.chain)
     for term in hidden.effects:
-        trials = candidates_at(term.effect, term.place, runs=runs, chain=hidden.chain)
-        here = next(one for one, _ in trials if one.has_signs_of(term.values))
+        here = make_candidate(term.effect, term.place, term.values, runs=runs, chain=hidden.chain)
         start = start.with_effect(here, term.values)
     fit = fit_model(start, runs, scatter_free=False)
     runs = measure_noise(fit, runs, runs)
@@ -84,10 +83,8 @@ def fitted(case):
 def test_a_model_that_runs_away_has_no_errors():
     """A spring that softens without end: its readings and derivatives are no numbers."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
-    (stiff, _), *_ = candidates_at(
-        find_effect("cubic_spring"), 1, runs=runs, chain=fit.structure.chain(fit.theta)
-    )
-    soft = replace(stiff, signs=(-1.0,))
+    chain = fit.structure.chain(fit.theta)
+    soft = make_candidate(find_effect("cubic_spring"), 1, (-1.0,), runs=runs, chain=chain)
     away = evaluate(fit.with_effect(soft, (-1.0,)), runs, fit.nuisance, spread=fit.spread)
     assert not np.isfinite(away.cost)
     assert covariance(away, runs).covariance is None

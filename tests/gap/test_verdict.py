@@ -29,6 +29,8 @@ def hypothesis(*keys: tuple[str, int], error: float, bic: float, held: float = 1
         at_floor=False,
         fit=SimpleNamespace(chi=1.0, n_points=100_000, structure=structure),
         held=SimpleNamespace(chi=held, n_points=10_000),
+        news=10_000.0,
+        held_news=1_000.0,
     )
 
 
@@ -36,6 +38,9 @@ STUDY: Any = SimpleNamespace(
     floor=FLOOR, repeatability=0.0, training=(), explains=lambda h: h.error <= 2 * FLOOR
 )
 LINEAR = hypothesis(error=0.3, bic=0.0)
+
+
+OTHER_CART = hypothesis(SECOND, error=0.25, bic=-50)
 
 
 def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any], list[Any]]:
@@ -52,7 +57,8 @@ def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
     both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
     three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
     alone = hypothesis(COULOMB, error=0.2, bic=-505)
-    assert verdict_on(delay, both, three)[:2] == ("partial", {DELAY, COULOMB})
+    poor = hypothesis(COULOMB, error=0.28, bic=-5)
+    assert verdict_on(delay, both, three, others=(poor,))[:2] == ("partial", {DELAY, COULOMB})
     assert verdict_on(delay, both, three, others=(alone,))[:2] == ("partial", {COULOMB})
 
 
@@ -69,7 +75,7 @@ def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     same = hypothesis(*rival, error=0.015, bic=-999.5)
-    said, stand, close = verdict_on(one, both, others=(same,))
+    said, stand, close = verdict_on(one, both, others=(same, OTHER_CART))
     assert (said, stand) == (verdict, {COULOMB, SECOND})
     assert close == ([same] if verdict == "ambiguous" else [])
 
@@ -79,7 +85,7 @@ def test_a_rival_far_less_likely_is_none():
     one = hypothesis(COULOMB, error=0.2, bic=-100)
     both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
     other = hypothesis(DRAG, DEAD, error=0.0151, bic=-950)
-    assert verdict_on(one, both, others=(other,))[0] == "named"
+    assert verdict_on(one, both, others=(other, OTHER_CART))[0] == "named"
 
 
 @pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])

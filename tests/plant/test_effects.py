@@ -18,34 +18,13 @@ from pipeline.plant.nonlinear.effects import (
     make_term,
 )
 from pipeline.plant.nonlinear.effects.base import chain_scales
-
-KEYS = {
-    "coulomb_friction": ("cart", {"force"}),
-    "stiction": ("cart", {"force", "static_force", "velocity"}),
-    "presliding_friction": ("cart", {"force", "distance"}),
-    "load_friction": ("cart", {"coefficient"}),
-    "drive_damping": ("input", {"coefficient"}),
-    "quadratic_drag": ("cart", {"coefficient"}),
-    "cubic_spring": ("spring", {"coefficient"}),
-    "slack_spring": ("spring", {"stiffness_change", "stretch"}),
-    "coupling_damper": ("spring", {"coefficient"}),
-    "force_offset": ("cart", {"force"}),
-    "dead_zone": ("input", {"width"}),
-    "saturation": ("input", {"limit"}),
-    "input_delay": ("input", {"delay"}),
-    "actuator_lag": ("input", {"time_constant"}),
-    "backlash": ("input", {"gap"}),
-    "cogging": ("input", {"force", "pitch", "phase"}),
-    "end_stop": ("cart", {"position", "stiffness"}),
-    "sensor_gain": ("cart", {"gain"}),
-    "extra_mode": ("cart", {"mass", "stiffness", "damping"}),
-}
+from tests.helpers.effects import SIZES
 
 
 def test_catalogue_has_the_agreed_names():
-    """Keys, places and reported parameters are those that files and users rely on."""
-    found = {e.key: (e.place, {p.name for p in e.parameters if p.reported}) for e in CATALOGUE}
-    assert found == KEYS
+    """Keys and reported parameters are those that files and users rely on."""
+    found = {e.key: {p.name for p in e.parameters if p.reported} for e in CATALOGUE}
+    assert found == {key: set(sizes) for key, sizes in SIZES.items()}
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
@@ -97,7 +76,7 @@ def test_an_effect_of_no_size_is_the_linear_bench(effect):
     assert departs(1e-4) < 0.02 * plain
 
 
-def test_what_an_effect_is_follows_from_what_it_writes():
+def test_what_an_effect_is_follows_from_its_law():
     """Friction that differs from run to run, hidden masses, contacts, several rests."""
 
     def those(is_so: Callable[[Effect], bool]) -> set[str]:
@@ -108,6 +87,8 @@ def test_what_an_effect_is_follows_from_what_it_writes():
     assert those(lambda e: e.many_rests) == dry | {"cogging"}
     assert those(lambda e: e.hides_mass) == {"extra_mode"}
     assert those(lambda e: e.contact) == {"end_stop", "backlash"}
+    idle = {"drive_damping", "dead_zone", "saturation", "input_delay", "actuator_lag"}
+    assert those(lambda e: e.needs_input) == idle
 
 
 def test_single_cart_has_one_spring_place():

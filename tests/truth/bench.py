@@ -32,6 +32,24 @@ class Hidden:
     parameters: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Hand:
+    """What a hand does to one cart from `start` to `end` (s), unmeasured.
+
+    It grips the cart with a spring and a damper of its own, moves it by `pull` (position units)
+    until `there` of its time, keeps it and lets go over the last tenth. Or it pushes with a force
+    that swells to `push` (input units) and fades. A soft hold is a grip that never pulls.
+    """
+
+    cart: int
+    start: float
+    end: float
+    pull: float = 0.0
+    push: float = 0.0
+    there: float = 0.8
+    grip: float = 8.0  # times the stiffness of the springs beside the cart
+
+
 @njit(cache=True)
 def _limited(u, dead, limit):
     past = abs(u) - dead
@@ -39,7 +57,27 @@ def _limited(u, dead, limit):
 
 
 @njit(cache=True)
-def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
+def _handled(hands, grabbed, i, now, x, v):
+    """Return the force of all hands on cart i."""
+    force = 0.0
+    for j in range(hands.shape[0]):
+        at, start, end, pull, push, there, k, c = hands[j]
+        if at != i or now < start or now > end:
+            continue
+        if np.isnan(grabbed[j]):
+            grabbed[j] = x
+        s = (now - start) / (end - start)
+        force += push * np.sin(np.pi * s) ** 2
+        way = min(s / there, 1.0)
+        path = way**3 * (10.0 - 15.0 * way + 6.0 * way**2)
+        pace = 30.0 * way**2 * (1.0 - way) ** 2 / (there * (end - start))
+        closed = min(10.0 * (1.0 - s), 1.0)
+        force += closed * (k * (grabbed[j] + pull * path - x) + c * (pull * pace - v))
+    return force
+
+
+@njit(cache=True)
+def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter, h):
     n = cart.shape[0]
     x, v, z = x0.copy(), v0.copy(), np.zeros(n)
     xh, vh = x0.copy(), v0.copy()
@@ -52,6 +90,7 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
     m1 = cart[0, 0] - (drive[6] if has_gap else 0.0)
     out = np.zeros((n, t.size))
     f = np.zeros(n)
+    grabbed = np.full(hands.shape[0], np.nan)
     now = t[0]
     sample = 0
     at = 0
@@ -133,6 +172,7 @@ def _motion(cart, spring, drive, free, t, times, command, x0, v0, scatter, h):
                 vh[i] -= h / cart[i, 14] * pull
             if not free[i]:
                 continue
+            f[i] += _handled(hands, grabbed, i, mid, x[i], v[i])
             m = m1 if i == 0 else cart[i, 0]
             if cart[i, 5] > 0.0:
                 if first and v[i] == 0.0:
@@ -168,6 +208,7 @@ def simulate_truth(
     c: Sequence[float] | np.ndarray,
     k: Sequence[float] | np.ndarray,
     hidden: Sequence[Hidden] = (),
+    hands: Sequence[Hand] = (),
     t: np.ndarray,
     u: np.ndarray,
     free: Sequence[int],
@@ -196,6 +237,7 @@ def simulate_truth(
         cart,
         spring,
         drive,
+        _hands(hands, m, k),
         np.array([i + 1 in free for i in range(n)]),
         t,
         t,
@@ -205,6 +247,17 @@ def simulate_truth(
         np.ones(n) if scatter is None else scatter,
         step,
     )
+
+
+def _hands(hands: Sequence[Hand], m, k) -> np.ndarray:
+    """Return (hands, 8): cart, start, end, pull, push, there, stiffness and damping of the grip."""
+    rows = []
+    for h in hands:
+        i = h.cart - 1
+        stiffness = h.grip * (k[i] + k[i + 1]) if h.push == 0.0 else 0.0
+        damping = 1.4 * np.sqrt(stiffness * m[i])
+        rows.append([i, h.start, h.end, h.pull, h.push, h.there, stiffness, damping])
+    return np.array(rows, dtype=float).reshape(-1, 8)
 
 
 def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarray) -> None:
@@ -224,7 +277,7 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
             cart[i, 9] = p["force"]
         case "end_stop":
             # Its own contact law: a fifth of critical damping on the contact spring.
-            damping = 0.4 * np.sqrt(p["stiffness"] * cart[i, 0])
+            damping = p.get("damping", 0.4 * np.sqrt(p["stiffness"] * cart[i, 0]))
             cart[i, 10:13] = p["position"], p["stiffness"], damping
         case "sensor_gain":
             cart[i, 13] = p["gain"]
@@ -249,8 +302,8 @@ def _hide(effect: Hidden, cart: np.ndarray, spring: np.ndarray, drive: np.ndarra
         case "cogging":
             drive[9:12] = p["force"], p["pitch"], p["phase"]
         case "backlash":
-            motor = 0.15 * cart[0, 0]
-            contact = 60.0 * float(spring[:2, 0].sum())
+            motor = p.get("motor", 0.15) * cart[0, 0]
+            contact = p.get("contact", 60.0) * float(spring[:2, 0].sum())
             drive[5:9] = p["gap"], motor, contact, 0.3 * np.sqrt(contact * motor)
         case other:
             raise ValueError(f"the truth knows no {other}")

@@ -1,12 +1,12 @@
 """Random benches with hidden effects, and what a class would record of them."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from pipeline.results import Record
-from tests.truth.bench import Hidden, simulate_truth
+from tests.truth.bench import Hand, Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, the encoder step
 _SMALLER = (0.7, 0.95)  # of a case's largest input: that of its further records
@@ -45,7 +45,7 @@ EFFECTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A bench, what is hidden in it, and its records."""
+    """A bench, what is hidden in it, its records, and the hands in them by record."""
 
     n: int
     springs: tuple[bool, ...]
@@ -54,6 +54,7 @@ class Case:
     m: tuple[float, ...]
     c: tuple[float, ...]
     k: tuple[float, ...]
+    hands: Mapping[str, tuple[Hand, ...]] = field(default_factory=dict)
 
 
 def make_case(
@@ -63,12 +64,20 @@ def make_case(
     effects: Sequence[str | Hidden] = (),
     severity: float = 1.0,
     dirt: bool = False,
+    wide: bool = False,
+    handled: bool = False,
     rate: float | None = None,
 ) -> Case:
     """Make a bench with the named effects at random places and sizes, or with those given.
 
+    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any
+    mass: what makes an effect hard to tell, or to fit, is then among the cases.
+
     `dirt` adds what real benches do: friction that varies by 4 % from run to run, encoders
     zeroed where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
+
+    `handled` has carts plucked by hand, once and twice a record, nudged, pushed at the end, and
+    held by a hand that gives way.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -88,11 +97,16 @@ def make_case(
     hidden = tuple(
         effect
         if isinstance(effect, Hidden)
-        else _draw(effect, n, m, c, k, stiffness, large, rate, linear, severity, rng)
+        else _draw(effect, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide)
         for effect in effects
     )
+    hands = _lay_hands(n, large, rng) if handled else {}
     records = []
     for name, kind, t, u, free, x0 in plan:
+        laid = hands.get(name, ())
+        if any(hand.pull for hand in laid):
+            x0 = np.zeros(n)
+        moving = {*free, *(hand.cart for hand in laid)}
         scatter = 1.0 + (0.04 * rng.standard_normal(n) if dirt else np.zeros(n))
         lead = 0.0
         if dirt and kind != "decay":
@@ -100,15 +114,16 @@ def make_case(
             x0 = np.array([_rest_band(h, stiffness, i, rng) for i, h in _by_cart(hidden, n)])
             x0 = np.where([i + 1 in free for i in range(n)], x0, 0.0)
         y = simulate_truth(
-            m=m, c=c, k=k, hidden=hidden, t=t, u=u, free=free, x0=x0, scatter=scatter
-        )
+            m=m, c=c, k=k, hidden=hidden, hands=laid, t=t, u=u, free=tuple(moving), x0=x0,
+            scatter=scatter,
+        )  # fmt: skip
         y = y + 0.3 * COUNT * rng.standard_normal(y.shape) + lead
         if dirt:
             y -= y[:, :1] if kind != "decay" else y[:, -1:]
         y = np.round(y / COUNT) * COUNT
         stamps = np.round(t, 4) if dirt else t
         records.append(_record(name, kind, stamps, u, y, free=free, count=COUNT))
-    return _case(m, c, k, hidden, records)
+    return _case(m, c, k, hidden, records, hands)
 
 
 def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
@@ -193,8 +208,9 @@ def _record(name, kind, t, u, y, *, free, count):
     )
 
 
-def _case(m, c, k, hidden, records):
+def _case(m, c, k, hidden, records, hands=None):
     return Case(
+        hands=hands or {},
         n=len(m),
         springs=tuple(bool(s > 0) for s in k),
         hidden=hidden,
@@ -243,9 +259,37 @@ def _plan(n, large, rng, rate):
     return plan
 
 
-def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hidden:
+def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
+    """Draw what hands do to the runs of `_plan`: every decay is plucked, one step is nudged."""
+    hands = {}
+    for cart in range(1, n + 1):
+        soft = [
+            Hand(cart=other, start=-1.0, end=1e9, grip=rng.uniform(15.0, 40.0))
+            for other in (cart - 1, cart + 1)
+            if 0 < other <= n
+        ]
+        for trial, starts in enumerate(((0.4, 2.6), (0.6,))):
+            laid = []
+            for start in starts:
+                begin, seconds = start + rng.uniform(0.0, 0.3), rng.uniform(0.15, 0.7)
+                pull = rng.uniform(1.2, 2.2) * rng.choice([-1.0, 1.0])
+                laid.append(Hand(cart=cart, start=begin, end=begin + seconds, pull=pull,
+                                 there=rng.uniform(0.5, 0.85)))  # fmt: skip
+            if trial == 1:
+                begin = rng.uniform(3.6, 4.2)
+                push = rng.uniform(0.3, 0.8) * large * rng.choice([-1.0, 1.0])
+                seconds = rng.uniform(0.15, 0.4)
+                laid.append(Hand(cart=cart, start=begin, end=begin + seconds, push=push))
+            hands[f"decay-{cart}{'ab'[trial]}"] = (*laid, *soft)
+    begin, cart = rng.uniform(1.2, 2.4), int(rng.integers(1, n + 1))
+    push = rng.uniform(0.3, 0.8) * large * rng.choice([-1.0, 1.0])
+    hands["step-d"] = (Hand(cart=cart, start=begin, end=begin + rng.uniform(0.15, 0.4), push=push),)
+    return hands
+
+
+def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
     """Draw a place and sizes; `severity` scales how far the effect departs from the linear."""
-    s = severity
+    s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]
     j = int(rng.choice(present))
@@ -283,7 +327,7 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
                 parameters={"force": s * sign * draw(0.05, 0.2) * stiffness[i, i]},
             )
         case "cubic_spring":
-            size = draw(0.08, 0.3) if sign > 0 else draw(0.04, 0.12)
+            size = draw(0.08, 0.9 if wide else 0.3) if sign > 0 else draw(0.04, 0.12)
             a = s * sign * size * k[j] / stretch**2
             return Hidden(effect=name, place=j + 1, parameters={"coefficient": a})
         case "slack_spring":
@@ -310,6 +354,15 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
             return Hidden(effect=name, parameters={"delay": s * draw(0.006, 0.03)})
         case "actuator_lag":
             return Hidden(effect=name, parameters={"time_constant": s * draw(0.01, 0.04)})
+        case "backlash" if wide:
+            return Hidden(
+                effect=name,
+                parameters={
+                    "gap": draw(0.05, 0.3),
+                    "motor": draw(0.08, 0.4),
+                    "contact": draw(20.0, 100.0),
+                },
+            )
         case "backlash":
             return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
         case "cogging":
@@ -324,6 +377,10 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng) -> Hi
                 "position": side * (1 - s * draw(0.1, 0.35)) * steps,
                 "stiffness": draw(10.0, 40.0) * stiffness[i, i],
             }
+            if wide:
+                hard = float(np.exp(draw(np.log(1.5), np.log(30.0)))) * stiffness[i, i]
+                damping = draw(0.05, 0.8) * np.sqrt(hard * m[i])
+                parameters |= {"stiffness": hard, "damping": damping}
             return Hidden(effect=name, place=i + 1, parameters=parameters)
         case "sensor_gain":
             return Hidden(

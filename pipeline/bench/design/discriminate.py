@@ -37,7 +37,6 @@ from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmente
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
 from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
-from pipeline.plant.nonlinear.tables import WITH_INPUT
 from pipeline.submission import Submission
 
 Kind = Literal["step", "sweep"]
@@ -281,11 +280,7 @@ def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
     """
     mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
     lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
-    return all(
-        term.effect.place == "input"
-        and term.effect.columns(term.effect.named(term.values)).keys() <= WITH_INPUT
-        for term in lone
-    )
+    return all(term.effect.needs_input for term in lone)
 
 
 def _left(difference: Array, by: Array, pinned: Array) -> float:

@@ -14,8 +14,6 @@ from pipeline.report.sections.answers import with_answer, written_answer
 from pipeline.submission.edit import text_digest
 from pipeline.submission.load import MAX_NOTES_BYTES, outside
 
-_GAP_BUDGET = 60.0  # s, as `cartlab gap` has by default
-
 
 def start_report(ask: Ask) -> Response:
     """Have the report made."""
@@ -27,9 +25,7 @@ def start_report(ask: Ask) -> Response:
 def start_gap(ask: Ask) -> Response:
     """Have the data asked what the linear model leaves out."""
     folder = ask.folder()
-    ask.desk.jobs.start(
-        "gap", title="The gap", place=folder, folder=str(folder), budget=_GAP_BUDGET
-    )
+    ask.desk.jobs.start("gap", title="The gap", place=folder, folder=str(folder))
     return ask.back(ask.here + "#report")
 
 

@@ -5,9 +5,11 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from scipy.signal import savgol_filter
 
 from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
+from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
@@ -20,6 +22,7 @@ _USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # fewer samples at the top are no hold …
 _HELD_TIME = 2.0  # … nor is a stay there within this many times what free motion takes
+_HAND_TIME = 0.02  # s, half width of a local cubic: what a hand holds moves no faster
 _RESTING = 1.5  # encoder steps within which a cart at rest reads …
 _ONE_READING = 0.07  # … and the time (s, at the usual pace) of which counts as independent
 
@@ -33,8 +36,10 @@ class Run:
     t (samples,), y (rows, samples) : times from the first sample used, and readings.
     rows : (rows,) cart index (from 0) of each row; held carts are left out.
     free : (n,) which carts move.
+    guided : (n, samples) how held carts move that are not held firmly; 0 for all others.
     knots, command : the input, held from knot to knot.
     at_rest : the carts do not move at the first sample.
+    start_known : the first readings tell the start; else it is fitted, as springs forget it.
     start, slope : (n,) first reading and velocity of each cart.
     rest : (n,) where the carts rest, as read.
     zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
@@ -52,6 +57,7 @@ class Run:
     y: Array
     rows: tuple[int, ...]
     free: tuple[bool, ...]
+    guided: Array
     knots: Array
     command: Array
     at_rest: bool
@@ -67,6 +73,15 @@ class Run:
     shots: tuple[int, ...]
     shot_x: Array
     shot_v: Array
+    start_known: bool = False
+
+    @property
+    def start_std(self) -> tuple[Array, Array]:
+        """(n,) how well the first readings tell `start` and `slope`; infinite where fitted."""
+        known = np.full(self.zero.size, np.inf)
+        if self.start_known:
+            known[list(self.rows)] = self.sigma
+        return known, 2.0 * known / (_SMOOTHING * self.pace)
 
     @property
     def swing(self) -> Array:
@@ -82,11 +97,13 @@ class Run:
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
-    A decay starts after the hand has let go; a slow or held beginning is cut.
+    A decay starts after the hand has let go; a slow or held beginning is cut. One that begins in
+    motion starts at its first turning point: no hand follows that far.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
     resolution = np.array([record.encoder_step(row + 1) for row in rows])
+    guided = _guided(record, n=n)
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
     tail = y[:, -max(3, int(_TAIL * t.size)) :]
@@ -97,8 +114,13 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     if record.kind == "decay":
         rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
         radians = 2 * np.pi * frequency * record.sample_time
-        first = min(_release(y - rest[:, None], still, radians=radians), t.size // 2)
-        t, u, y = t[first:], u[first:], y[:, first:]
+        offset = y - rest[:, None]
+        if in_motion:
+            first = _first_turn(offset, still)
+        else:
+            first = _release(offset, still, radians=radians)
+        first = min(first, t.size // 2)
+        t, u, y, guided = t[first:], u[first:], y[:, first:], guided[:, first:]
     # The input may already act between the samples: the first two are before its effect.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
     look = max(2, min(quiet, round(_REST_TIME / record.sample_time)))
@@ -133,6 +155,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
         y=y,
         rows=rows,
         free=tuple(i + 1 in record.free for i in range(n)),
+        guided=guided - np.median(guided, axis=1, keepdims=True),
         knots=np.ascontiguousarray(knots),
         command=np.ascontiguousarray(command),
         at_rest=at_rest,
@@ -154,6 +177,17 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
         shot_x=start[None],
         shot_v=slope[None],
     )
+
+
+def _guided(record: Record, *, n: int) -> Array:
+    """Return (n, samples) the smoothed motion of held carts, where it is more than a reading's."""
+    guided = np.zeros((n, record.t.size))
+    half = max(2, round(_HAND_TIME / record.sample_time))
+    for cart in record.carts:
+        y = record.position(cart)
+        if cart not in record.free and np.ptp(y) > _STILL * record.encoder_step(cart):
+            guided[cart - 1] = savgol_filter(y, 2 * half + 1, polyorder=3)
+    return guided
 
 
 def _thin(run: Run) -> Run:
@@ -184,6 +218,7 @@ def _thin(run: Run) -> Run:
         run,
         t=np.concatenate(t),
         y=np.concatenate(y, axis=1),
+        guided=np.array([np.interp(np.concatenate(t), run.t, x) for x in run.guided]),
         weight=np.concatenate(weight, axis=1),
         sigma=run.sigma * np.sqrt(((1.0 + 2.0 * side) ** 2 + 2.0 * side**2) / q),
         block=1,
@@ -239,6 +274,13 @@ def _dominant_frequency(t: Array, y: Array) -> float:
         if power[at] > peak:
             best, peak = at / (uniform[-1] - uniform[0]), float(power[at])
     return best
+
+
+def _first_turn(offset: Array, still: Array) -> int:
+    """Return the first sample at which the cart that moves most turns."""
+    leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
+    turning = extrema(offset[leader], prominence=float(still[leader]))
+    return turning[1] if len(turning) > 1 else 0
 
 
 def _release(offset: Array, still: Array, *, radians: float) -> int:

@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.errors import DataError
-from pipeline.gap.data.runs import Run, cut_shots, make_run
+from pipeline.estimation.interventions import between
+from pipeline.gap.data.runs import Run, make_run
 from pipeline.names import by_note
 from pipeline.results import LeftOut, Record
+from pipeline.results_of_runs import Intervention
 
 _LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
 _STILL = 3.0  # encoder steps within which a cart stands still
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
+_PINNED = 1e-3  # noises that a known zero may be off
 _SAME_SIZE = 0.06  # relative; sizes closer than this are repeats
-_WINDOW = 0.5  # s; a chain without springs drifts, so it is judged over windows
 
 
 def drop_left_out(
@@ -38,8 +40,16 @@ def drop_left_out(
     return kept, notes
 
 
-def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list[str]) -> list[Run]:
+def prepare(
+    records: Sequence[Record],
+    *,
+    springs: tuple[bool, ...],
+    interventions: Sequence[Intervention] = (),
+    notes: list[str],
+) -> list[Run]:
     """Return the runs worth fitting; what is left out is noted.
+
+    What a record shows behind an intervention is a run of its own.
 
     Raises
     ------
@@ -69,16 +79,40 @@ def prepare(records: Sequence[Record], *, springs: tuple[bool, ...], notes: list
         left_out = {r.id for i, r in enumerate(dwells) if i not in picked}
         usable = [r for r in usable if r.id not in left_out]
         notes.append(f"of {len(dwells)} sine dwells {_MOST_DWELLS} are used")
-    runs = [make_run(record, n=n) for record in usable]
+    runs = [run for record in usable for run in _free_runs(record, interventions, n=n)]
+    if not runs:
+        raise DataError("gap: no record shows half a second of motion without a hand in it")
     if not any(np.any(run.command) for run in runs):
         notes.append("no run has an input: forces are per unit of the first mass")
     kept = without_twins(runs)
     if len(kept) < len(runs):
         notes.append(f"duplicate files left out: {len(runs) - len(kept)}")
     if not any(springs):
-        notes.append("no springs: judged over windows of half a second, not by the drift")
-        kept = [cut_shots(run, length=_WINDOW) for run in kept]
+        notes.append("no springs: each run is judged as a whole, from its first readings")
+        kept = [_on_no_spring(run) for run in kept]
     return kept
+
+
+def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int) -> list[Run]:
+    """Return the record between interventions, each stretch that shows motion as a run."""
+    runs = []
+    for piece in between(record, interventions):
+        if _is_usable(piece):
+            later = piece.t[0] > record.t[0]
+            if later:
+                let_go = piece.u is None or not np.any(piece.u)
+                piece = replace(piece, kind="decay" if let_go else "sweep")
+            runs.append(make_run(piece, n=n, in_motion=later))
+    return runs
+
+
+def _on_no_spring(run: Run) -> Run:
+    """Return a run whose readings are positions, as no rest tells a zero, and tell the start.
+
+    No spring forgets a start: a free one would take up what a model lacks.
+    """
+    known = np.full(run.zero.size, _PINNED * float(run.sigma.min()))
+    return replace(run, start_known=True, zero=np.zeros(run.zero.size), zero_std=known)
 
 
 def _is_usable(record: Record) -> bool:
@@ -133,8 +167,16 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
         )
         starts = piece.start == 0 and run.record.kind != "decay"
         part = make_run(record, n=run.zero.size, in_motion=not starts)
-        moving = replace(part, zero=run.zero, zero_std=run.zero_std, rest=run.rest)
-        pieces.append(moving if len(run.shots) == 2 else cut_shots(moving, length=_WINDOW))
+        pieces.append(
+            replace(
+                part,
+                guided=run.guided[:, piece],
+                zero=run.zero,
+                zero_std=run.zero_std,
+                rest=run.rest,
+                start_known=run.start_known,
+            )
+        )
     others = [r for i, r in enumerate(runs) if i != longest]
     return [*others, pieces[0]], [pieces[1]]
 
@@ -193,7 +235,12 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
 
 
 def _size(run: Run) -> float:
-    """How hard a run was driven: its extreme input, or where a free decay starts."""
+    """How hard a run was driven: its extreme input, or where a free decay starts.
+
+    Of a run under feedback its reference: the input is the controller's answer.
+    """
+    if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
+        return float(np.ptp(run.record.reference))
     if np.any(run.command):
         return float(run.command[np.argmax(np.abs(run.command))])
     offset = run.start - run.zero

@@ -18,7 +18,6 @@ from pipeline.gap.fit.linearise import (
     move_nuisance,
     residual_points,
     run_cost,
-    triangle,
 )
 from pipeline.gap.fit.structure import Model
 
@@ -28,7 +27,6 @@ _SCATTER_START = 0.05  # spread of friction from run to run, before anything is 
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
 _SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
 _NUISANCE_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
-_SHOWN = 3e-4  # of a column: two that differ by less differ by their difference steps
 _HUGE = 1e100  # a slope, where a parameter lets the simulation run away; its square is no number
 _DEAD = 1e-9  # of the strongest column: a weaker one is rounding
 _ANCHOR = 1e6  # standard errors per unit of log mass
@@ -179,13 +177,12 @@ def _linearise_all(
     inflate: float,
     scatter_free: bool = True,
     shared: bool = True,
-    extras: Sequence[Array | None] | None = None,
     mapper: Mapper,
 ) -> list[Linear]:
     """Return every run's share of a step from a fit."""
 
-    def share(job: tuple[Run, Nuisance, Array | None]) -> Linear:
-        run, nuisance, extra = job
+    def share(job: tuple[Run, Nuisance]) -> Linear:
+        run, nuisance = job
         return linearise(
             fit,
             run,
@@ -194,11 +191,9 @@ def _linearise_all(
             spread=fit.spread,
             scatter_free=scatter_free,
             shared=shared,
-            extras=extra,
         )
 
-    extras = [None] * len(runs) if extras is None else extras
-    return list(mapper(share, zip(runs, fit.nuisance, extras, strict=True)))
+    return list(mapper(share, zip(runs, fit.nuisance, strict=True)))
 
 
 def _step(
@@ -304,31 +299,3 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fi
             total += (factors[r, i] - 1.0) ** 2 + variance
         spread[i] = np.clip(np.sqrt(total / (len(there) + weight)), _SCATTER_FLOOR, _SCATTER_TOP)
     return replace(fit, spread=spread)
-
-
-def project(
-    fit: Fit, runs: Sequence[Run], extras: Sequence[Array], *, mapper: Mapper = map
-) -> tuple[Array, Array]:
-    """Project changes of the readings off everything the fit can absorb.
-
-    Parameters
-    ----------
-    extras : per run (k, rows, samples of `thin`): what k further effects would add to its readings.
-
-    Returns
-    -------
-    (rows, k) what is left of them, and (rows,) what is left of the residual.
-    """
-    linear = _linearise_all(fit, runs, inflate=inflation(fit), extras=extras, mapper=mapper)
-    stacked = np.concatenate([part.reduced for part in linear])
-    shared, wide = stacked[:, : fit.theta.size], stacked[:, fit.theta.size :]
-    if not np.all(np.isfinite(shared)):
-        return np.full_like(wide[:, :-1], np.nan), wide[:, -1]  # no direction leads on from here
-    # What no run shows, a held cart's mass or the share of two springs that act as one, absorbs
-    # nothing.
-    scale = np.linalg.norm(shared, axis=0)
-    shared = shared / np.maximum(scale, _DEAD * scale.max())
-    basis, power, _ = np.linalg.svd(shared, full_matrices=False)
-    basis = basis[:, power > _SHOWN]
-    projected = triangle(wide - basis @ (basis.T @ wide))
-    return projected[:, :-1], projected[:, -1]

@@ -88,6 +88,7 @@ def _simulate_variants(
         np.array(run.shots),
         1.0,  # the simulator chooses its steps
         np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
+        guided=run.guided,
     )
     if len(run.rows) == structure.n:
         return y, by
@@ -182,17 +183,15 @@ def linearise(
     spread: Array,
     scatter_free: bool,
     shared: bool = True,
-    extras: Array | None = None,
 ) -> Linear:
     """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; without `shared` only the nuisance parameters move; `extras` (k, rows, samples of
-    `run.thin`) are further columns to project.
+    concerned; without `shared` only the nuisance parameters move.
     """
     run = run.thin
     layout = layout_of(model.structure, run, scatter_free=scatter_free)
-    columns = columns_of(model, run, nuisance, layout, shared=shared, extras=extras)
+    columns = columns_of(model, run, nuisance, layout, shared=shared)
     prior = start_prior(layout, run, usual_sizes(model, run), inflate=inflate)
     starts = prior.shape[1]
     shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
@@ -211,19 +210,17 @@ def columns_of(
     layout: Layout,
     *,
     shared: bool,
-    extras: Array | None,
 ) -> Array:
     """Return (., rows, samples) Jacobian by the starts, friction factors, zeros and shared …
 
-    … parameters, the further columns, and the residual last.
+    … parameters, and the residual last.
     """
     derive = _differences if model.structure.has_contact else _derivatives
     y, by_nuisance, by_shared = derive(model, run, nuisance, layout, shared=shared)
     residual = run.y - y - nuisance.zero[list(run.rows)][:, None]
     by_zero = np.zeros((len(layout.zero), *residual.shape))
     by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
-    further = [] if extras is None else [extras]
-    return np.concatenate([by_nuisance, by_zero, by_shared, *further, residual[None]])
+    return np.concatenate([by_nuisance, by_zero, by_shared, residual[None]])
 
 
 def _eliminate_starts(points: Array, prior: Array) -> Array:
@@ -332,6 +329,10 @@ def start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate
     position, velocity = sizes
     weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
     prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
+    # What hides on a cart no reading tells.
+    known = [np.append(1.0 / std, np.zeros(std.size)) for std in run.start_std]
+    known_start = np.concatenate([known[0][list(layout.x0)], known[1][list(layout.v0)]])
+    prior[0] += np.diag(inflate * known_start)
     if not layout.first_v0:
         for j in range(len(layout.x0), weight.size):
             prior[0, j, j] = _HELD * weight[j]

@@ -8,7 +8,8 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Nuisance, residual_points
-from pipeline.plant.nonlinear.tables import Cart, Drive, Tables
+from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
+from pipeline.plant.nonlinear.tables import Drive, Tables
 
 _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
@@ -68,6 +69,7 @@ def _rest_band(fit: Fit) -> Array:
 def holding_force(tables: Tables) -> Array:
     """Return (n,) the largest force against which friction or cogging still holds each cart."""
     cart, _, drive = tables
-    force = cart[:, Cart.COULOMB] + cart[:, Cart.STATIC] + cart[:, Cart.DAHL]
-    force[0] += drive[Drive.COGGING]
+    dry = [sliding(cart, i, 0.0) + dropping(cart, i, 0.0, 0.0) for i in range(len(cart))]
+    force = np.array(dry) + [settling(cart, i, 0.0)[0] for i in range(len(cart))]
+    force[0] += drive[Drive.COGGING_FORCE]
     return force

@@ -27,11 +27,6 @@ class Candidate:
     scales: tuple[float, ...]
 
     @property
-    def label(self) -> str:
-        """Effect and place, for messages."""
-        return self.effect.key + (f"@{self.place}" if self.place else "")
-
-    @property
     def key(self) -> tuple[str, int]:
         """Effect and place."""
         return self.effect.key, self.place
@@ -53,11 +48,6 @@ class Candidate:
                 for p, v, scale in zip(self.effect.parameters, values, self.scales, strict=True)
             ]
         )
-
-    def has_signs_of(self, values: Sequence[float]) -> bool:
-        """Whether values are on the sides that the candidate keeps."""
-        sided = zip(self.effect.parameters, self.signs, values, strict=True)
-        return all(sign * value > 0.0 for p, sign, value in sided if p.side)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,11 +159,11 @@ class Structure:
     def visible(self, theta: Array) -> bool:
         """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
         cart, _, _ = self.model(theta).tables()
-        hidden = cart[:, Cart.HIDDEN_MASS] > 0.0
+        hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():
             return True
         of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
-        rate = cart[hidden, Cart.HIDDEN_STIFFNESS] / cart[hidden, Cart.HIDDEN_MASS]
+        rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
         return bool(
             np.all((of_cart[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * of_cart[hidden]))
         )
@@ -207,7 +197,7 @@ class Structure:
         """Return how far each parameter may go in one step."""
         reach = [np.full(self.base_size, 0.3)]
         for c in self.effects:
-            reach.append(np.array([1.0 if p.signed else 0.4 for p in c.effect.parameters]))
+            reach.append(np.array([1.0 if p.signed else p.reach for p in c.effect.parameters]))
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:

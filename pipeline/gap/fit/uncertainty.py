@@ -75,7 +75,7 @@ def _weigh(
     """
     thin, inflate = run.thin, inflation(fit)
     layout = layout_of(fit.structure, thin, scatter_free=scatter_free)
-    columns = columns_of(fit, thin, nuisance, layout, shared=True, extras=None)
+    columns = columns_of(fit, thin, nuisance, layout, shared=True)
     if not np.all(np.isfinite(columns)):
         return np.full((3, fit.theta.size, fit.theta.size), np.nan)
     columns = columns * thin.weight / thin.sigma[:, None]

@@ -5,13 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.arrays import Array
 from pipeline.gap import limits
+from pipeline.gap.data.independent import independent
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.baseline import fit_nuisance
 from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.fit.structure import Candidate
-from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import Effect
 
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
@@ -21,16 +21,23 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit on training runs and what it leaves on held-out ones.
 
-    `at_floor`: nothing is left but noise, on training and on held-out runs. `added` are
-    the effects added last.
+    `at_floor`: nothing is left but noise, on training and on held-out runs. `news` and
+    `held_news` are how many of the residuals are independent.
     """
 
     fit: Fit
     held: Fit
     error: float
     bic: float
+    news: float
+    held_news: float
     at_floor: bool
-    added: tuple[Candidate, ...] = ()
+
+    @property
+    def bic_of_all(self) -> float:
+        """The criterion with the likelihood of the held-out runs, to which nothing is fitted."""
+        points = self.held.n_points / limits.THINNING
+        return self.bic + points * float(np.log(max(self.held.chi, 1e-300)))
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
@@ -76,7 +83,9 @@ class Hypothesis:
 class Study:
     """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
 
-    `repeatability` is the relative error between runs with the same input, 0 without any.
+    `repeatability` is the relative error between runs with the same input, 0 without any. `whole`
+    are the training runs with the end of the one whose end is held out, where what adds up over a
+    whole run must show in the numbers: on no spring.
     """
 
     training: tuple[Run, ...]
@@ -86,6 +95,7 @@ class Study:
     repeatability: float
     mapper: Mapper
     tell: Callable[[str], None]
+    whole: tuple[Run, ...] = ()
 
     @property
     def floor(self) -> float:
@@ -107,53 +117,64 @@ class Study:
         return hypothesis.at_floor or quiet or as_repeats
 
 
-def judge(fit: Fit, study: Study, *, added: Sequence[Candidate] = ()) -> Hypothesis:
+def judge(fit: Fit, study: Study) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
     held = fit_nuisance(fit, study.held_out, mapper=study.mapper)
     errors, sizes = [], []
-    for run, nuisance in zip(study.held_out, held.nuisance, strict=True):
-        model = simulate_run(fit, run, nuisance)
-        errors.append(float(((run.y - model) ** 2).sum()))
+    for run, left in zip(study.held_out, _residuals(held, study.held_out), strict=True):
+        errors.append(float((left**2).sum()))
         sizes.append(float((run.swing**2).sum() * run.t.size))
-    effective = fit.n_points / limits.THINNING
-    bic = effective * np.log(fit.cost / fit.n_points) + fit.theta.size * np.log(effective)
-    error = float(np.sqrt(sum(errors) / sum(sizes)))
+    size = float(np.log(fit.n_points / limits.THINNING)) * fit.theta.size
     return Hypothesis(
         fit=fit,
         held=held,
-        error=error,
-        bic=float(bic),
+        error=float(np.sqrt(sum(errors) / sum(sizes))),
+        bic=fit.n_points / limits.THINNING * float(np.log(fit.cost / fit.n_points)) + size,
+        news=_news(fit, study.training),
+        held_news=_news(held, study.held_out),
         at_floor=fit.chi < limits.AT_FLOOR and held.chi < limits.AT_FLOOR,
-        added=tuple(added),
     )
 
 
+def _residuals(fit: Fit, runs: Sequence[Run]) -> list[Array]:
+    """Return measured minus simulated positions (rows, samples) of each run."""
+    return [
+        run.y - simulate_run(fit, run, nuisance)
+        for run, nuisance in zip(runs, fit.nuisance, strict=True)
+    ]
+
+
+def _news(fit: Fit, runs: Sequence[Run]) -> float:
+    """Return how many residuals tell as much as independent ones.
+
+    What a model leaves that is not noise swings with the carts: few of its points are news.
+    """
+    most = fit.n_points / limits.THINNING
+    # The correlation of a drift says nothing of its news; nor does what ran away.
+    if not any(fit.structure.springs) or not np.isfinite(fit.cost):
+        return most
+    alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
+    return min(alone, most)
+
+
+def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
+    """Return by how much a hypothesis is the likelier, in units of the criterion.
+
+    Only what the fuller one leaves counts as chance; runs held out, to which neither is fitted,
+    count alike.
+    """
+    share = fuller.news / (fuller.fit.n_points / limits.THINNING)
+    taught = (other.bic - fuller.bic) * share
+    return taught + fuller.held_news * float(np.log(other.held.chi / fuller.held.chi))
+
+
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Is the held-out error lower, and by enough where too much for a name is left?"""
-    added = child.key - parent.key
-    contact = any(find_effect(key).contact for key, _ in added)
-    gain = limits.PARTIAL_CONTACT if contact else limits.PARTIAL_GAIN
-    return child.error < (1.0 if study.explains(child) else gain) * parent.error
+    """Is the held-out error lower, and by a tenth where too much for a name is left?"""
+    gain = 1.0 if study.explains(child) else limits.PARTIAL_GAIN
+    return child.error < gain * parent.error
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Does a further effect help on runs the model has not seen?"""
-    if not lowers_error(child, parent, study):
-        return False
-    drop = limits.BIC_DROP if child.size != parent.size else limits.SAME_LAW
-    if parent.held.chi < limits.AT_FLOOR:
-        # Held-out runs in which the effect does not show cannot speak for it; they must not speak
-        # against it, and the others tell the more clearly. Beside a contact it may mop up.
-        clear = child.bic < parent.bic - limits.ALONE * drop
-        return clear and not (child.has_contact and (parent.at_floor or not child.leaves_noise))
-    gain = limits.HELD_OUT_GAIN
-    if parent.has_contact and not child.leaves_noise:
-        if parent.fit.chi < limits.CONTACT_LAW:
-            return False
-        gain = limits.CONTACT_GAIN
-    if child.bic > parent.bic - drop or child.held.chi > gain**2 * parent.held.chi:
-        return False
-    better = child.held.run_chi < limits.RUN_GAIN**2 * parent.held.run_chi
-    # A run with nothing but noise left cannot become better.
-    open_runs = parent.held.run_chi > limits.AT_FLOOR
-    return bool(np.mean(better[open_runs] if open_runs.any() else better) >= limits.RUN_SHARE)
+    """Do further effects help, on runs the model has not seen too?"""
+    drop = limits.BIC_DROP * (child.size - parent.size) or limits.SAME_LAW
+    return lowers_error(child, parent, study) and evidence(child, parent) > drop

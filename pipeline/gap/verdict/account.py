@@ -187,24 +187,34 @@ def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Tr
 
 
 def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
-    """Return the relative error of every cart in every run, before and after, as traced."""
-    out = []
+    """Return the relative error of every cart in every record, before and after, as traced.
+
+    What was held out of a record stands apart; its runs between interventions are pooled.
+    """
     order = (*study.training, *study.held_out)
     rows = [(run, j) for run in order for j in range(len(run.rows))]
+    pooled: dict[tuple[str, int, bool], list[Array]] = {}
     for trace, (run, j) in zip(traces, rows, strict=True):
-        size = max(float(run.swing[j]), 1e-12)
-
-        def error(model: np.ndarray, trace: Trace = trace, size: float = size) -> float:
-            return float(np.sqrt(np.mean((trace.measured - model) ** 2))) / size
-
+        squares = [
+            np.sum((trace.measured - trace.baseline) ** 2),
+            np.sum((trace.measured - trace.final) ** 2),
+            trace.t.size * run.sigma[j] ** 2,
+            trace.t.size * max(float(run.swing[j]), 1e-12) ** 2,
+        ]
+        of = trace.experiment, trace.cart, trace.held_out
+        pooled.setdefault(of, []).append(np.array(squares))
+    out = []
+    for (experiment, cart, held_out), parts in pooled.items():
+        *errors, size = np.sum(parts, axis=0)
+        baseline, final, noise = np.sqrt(np.array(errors) / size).tolist()
         out.append(
             RecordGap(
-                experiment=trace.experiment,
-                cart=trace.cart,
-                held_out=trace.held_out,
-                baseline=error(trace.baseline),
-                final=error(trace.final),
-                noise_floor=float(run.sigma[j]) / size,
+                experiment=experiment,
+                cart=cart,
+                held_out=held_out,
+                baseline=baseline,
+                final=final,
+                noise_floor=noise,
             )
         )
     return tuple(out)

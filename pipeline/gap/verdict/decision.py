@@ -2,12 +2,9 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from pipeline.gap import limits
-from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.search.beam import steps_to
-from pipeline.gap.search.hypothesis import Hypothesis, Study, lowers_error
+from pipeline.gap.search.hypothesis import Hypothesis, Study, evidence, lowers_error
+from pipeline.gap.search.search import steps_to
 from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 
@@ -49,7 +46,7 @@ def reach_verdict(
         if len(rival.key) == len(chosen.key)
         and rival.key != chosen.key
         and rival.error < limits.CLOSE_ERROR * chosen.error
-        and _evidence(chosen, rival, study) < min(limits.CLOSE_GAIN * gain, limits.CLOSE_BIC)
+        and evidence(chosen, rival) < min(limits.CLOSE_GAIN * gain, limits.CLOSE_BIC)
         and not _same_thing(rival, chosen, sample_time=sample_time)
         and (explained or not _same_kind(rival, chosen))
     ]
@@ -69,41 +66,6 @@ def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> 
     smaller = [h for h in found if h.key < chosen.key and len(h.key) == len(chosen.key) - 1]
     as_good = [h for h in smaller if not lowers_error(chosen, h, study)]
     return min(as_good, key=lambda h: h.error, default=None)
-
-
-def _evidence(chosen: Hypothesis, rival: Hypothesis, study: Study) -> float:
-    """Return by how much the chosen is the likelier, in units of the criterion.
-
-    The runs held out, to which neither is fitted, count alike where little but noise is left. What
-    a model leaves that is not noise swings with the carts: far fewer of its points are independent
-    than the criterion counts, and much of the difference may be chance.
-    """
-    difference = rival.bic - chosen.bic
-    if chosen.fit.chi < limits.NEAR_FLOOR**2:
-        if chosen.held.chi < limits.NEAR_FLOOR**2:
-            points = chosen.held.n_points / limits.THINNING
-            difference += points * float(np.log(rival.held.chi / chosen.held.chi))
-        return difference
-    counted = chosen.fit.n_points / limits.THINNING
-    return difference * min(1.0, _independent_points(chosen, study) / counted)
-
-
-def _independent_points(hypothesis: Hypothesis, study: Study) -> float:
-    """Return how many residuals would tell as much, were they independent.
-
-    Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a
-    mean square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²).
-    """
-    total = 0.0
-    fit = hypothesis.fit
-    for run, nuisance in zip(study.training, fit.nuisance, strict=True):
-        model = simulate_run(fit, run, nuisance)
-        for row in run.y - model:
-            power = np.abs(np.fft.rfft(row - row.mean(), 2 * row.size)) ** 2
-            covariance = np.fft.irfft(power)[: row.size]
-            correlation = covariance / max(covariance[0], 1e-300)
-            total += row.size / (1.0 + 2.0 * float((correlation[1:] ** 2).sum()))
-    return total
 
 
 def _stand_ins(

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.estimation.modulating import bump, bump_integral
+from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
-from pipeline.plant.nonlinear.tables import Drive
+from pipeline.plant.nonlinear.simulator.laws import arriving
 
 _WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)  # s; half of one weighs anything
 _FEWEST = 9  # samples in a window
@@ -59,11 +59,12 @@ def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[Res
 
     `free` tells which carts move in each run.
     """
-    runs: dict[tuple[str, bool], dict[int, Trace]] = {}
+    runs: dict[tuple[str, bool, float], dict[int, Trace]] = {}
     for trace in gap.traces:
-        runs.setdefault((trace.experiment, trace.held_out), {})[trace.cart] = trace
+        run = trace.experiment, trace.held_out, float(trace.t[0])
+        runs.setdefault(run, {})[trace.cart] = trace
     found: list[ResidualForce | None] = []
-    for (experiment, _), carts in runs.items():
+    for (experiment, *_), carts in runs.items():
         moving = set(free[experiment])
         for cart in carts:
             if moving & {cart - 1, cart + 1} <= set(carts):
@@ -122,8 +123,7 @@ class _Means:
 def _arriving(u: Array, model: AugmentedChain) -> Array:
     """Return what the drive passes on of the input, delays and lags apart."""
     _, _, drive = model.tables()
-    past = np.maximum(np.abs(u) - drive[Drive.DEAD_ZONE], 0.0)
-    return np.sign(u) * np.minimum(past, drive[Drive.LIMIT])
+    return np.array([arriving(drive, float(one)) for one in u])
 
 
 def _cut(t: Array, *, length: float) -> np.ndarray | None:
@@ -148,21 +148,10 @@ def _average(
     noise: float,
 ) -> _Means:
     local = t[windows]
-    span = local[:, -1:] - local[:, :1]
-    s = (local - local[:, :1]) / span
-    # The weight, its first and second derivative by time, and the share of time of each sample.
-    w, w1, w2 = bump(s, span=span)
-    dt = np.gradient(local, axis=1)
-    size = (w * dt).sum(1, keepdims=True)
-    w, w1, w2 = (weight * dt / size for weight in (w, w1, w2))
-    # Few samples integrate w'' badly: made exact for parabolas, whatever their place and slope.
-    tau = local - (w * local).sum(1, keepdims=True)
-    spread = (w * tau**2).sum(1, keepdims=True)
-    w2 = w2 - w * w2.sum(1, keepdims=True) - w * tau * (w2 * tau).sum(1, keepdims=True) / spread
-    w2 = 2 * w2 / (w2 * tau**2).sum(1, keepdims=True)
-    w1 = w1 - w * w1.sum(1, keepdims=True)
-    w1 = -w1 / (w1 * tau).sum(1, keepdims=True)
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
+    w, w1, w2 = window_weights(local)
     # An input is held over the interval that follows its sample: the weight's exact share of it.
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
     held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
     pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
     i = cart - 1

@@ -16,6 +16,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.plant.nonlinear.simulator import kernel
 from pipeline.plant.nonlinear.simulator.contacts import guard, switch
+from pipeline.plant.nonlinear.simulator.laws import arriving, reach_of, settling
 from pipeline.plant.nonlinear.simulator.sensitivity import make_sensitivities
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Spring, Tables
@@ -66,11 +67,11 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     """
     cart, spring, drive = model.tables()
     n = model.chain.n
-    pulled = np.any(cart[:, Cart.OFFSET]) or drive[Drive.COGGING] != 0.0
+    pulled = np.any(cart[:, Cart.FORCE_OFFSET_FORCE]) or drive[Drive.COGGING_FORCE] != 0.0
     if not (pulled and model.chain.is_tied):
         return np.zeros(n)
     cart[:, DRY] = 0.0
-    cart[:, Cart.GAIN] = 1.0
+    cart[:, Cart.SENSOR_GAIN_GAIN] = 1.0
     stiffness, m = model.chain.stiffness, model.chain.m
     cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
     slowest = np.sqrt(np.linalg.eigvals(stiffness / m[:, None]).real.min())
@@ -153,12 +154,12 @@ class SteppedBench:
     @property
     def readings(self) -> Array:
         """What the sensors of all carts read, (n_carts,)."""
-        return self._cart[:, Cart.GAIN] * self._state[kernel.X, : self._n]
+        return self._cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[kernel.X, : self._n]
 
     @property
     def state(self) -> Array:
         """State of the free carts as sensors would read it: (x1, v1, x2, v2, …), (2f,)."""
-        return (self._cart[:, Cart.GAIN] * self._state[: kernel.V + 1, : self._n])[
+        return (self._cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[: kernel.V + 1, : self._n])[
             :, self._rows
         ].T.ravel()
 
@@ -178,18 +179,19 @@ class SteppedBench:
         ------
         DataError : the carts run away, or the drive leads by more than the interval.
         """
-        if -self._drive[Drive.DELAY] > interval * (1 + 1e-9):
+        if -self._drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
             raise DataError("in a closed loop the input cannot lead its log by over one sample")
-        self._inputs.append((self._now, self._shaped(u)))
-        upcoming = (self._now + interval, self._shaped(following))
-        braking = float(self._drive[Drive.DAMPING]) if u != 0.0 else 0.0
+        self._inputs.append((self._now, arriving(self._drive, u)))
+        upcoming = (self._now + interval, arriving(self._drive, following))
+        on = 1.0 if u != 0.0 else 0.0
         count = max(1, int(np.ceil(interval / self._step - 1e-9)))
         h = interval / count
         for sub in range(count):
             start = self._now + sub * h
-            self._advance(self._force(start, start + h, upcoming), braking=braking, h=h)
+            self._advance(self._force(start, start + h, upcoming), on=on, h=h)
         self._now += interval
-        while len(self._inputs) > 1 and self._inputs[1][0] <= self._now - self._drive[Drive.DELAY]:
+        begin = self._now - self._drive[Drive.INPUT_DELAY_DELAY]
+        while len(self._inputs) > 1 and self._inputs[1][0] <= begin:
             self._inputs.popleft()
         if not np.all(np.abs(self._state[kernel.X]) < kernel._BLOWN_UP):
             raise DataError(_RUN_AWAY)
@@ -214,31 +216,26 @@ class SteppedBench:
 
     # ------------------------------------------------------------------ inside
 
-    def _advance(self, force: float, *, braking: float, h: float) -> None:
+    def _advance(self, force: float, *, on: float, h: float) -> None:
         tables = self._cart, self._spring, self._drive
         bodies = self._n, self._N, self._motor, self._state, self._K, self._C
         dry = bool(np.any(self._cart[:, DRY]))
-        smooth = False  # smooth forces are looked for: a few more additions
+        _, smooth = reach_of(*tables)
         switches = self._switches, self._active, self._contact_step
-        step = np.ones(self._n), force, braking, h, dry, smooth
+        step = np.ones(self._n), force, on, h, dry, smooth
         advance(*tables, *bodies, *step, *switches, *self._no_sensitivities)
-
-    def _shaped(self, command: float) -> float:
-        """Return the input behind the dead zone and the saturation."""
-        past = max(abs(command) - self._drive[Drive.DEAD_ZONE], 0.0)
-        return float(np.sign(command) * min(past, self._drive[Drive.LIMIT]))
 
     def _force(self, start: float, end: float, upcoming: tuple[float, float]) -> float:
         """Return the mean of the delayed and lagged input from start to end, exactly."""
         if self._lagged == 0.0 and upcoming[1] == 0.0 and not any(u for _, u in self._inputs):
             return 0.0
-        delay = float(self._drive[Drive.DELAY])
+        delay = float(self._drive[Drive.INPUT_DELAY_DELAY])
         inputs = [*self._inputs, upcoming, (np.inf, 0.0)]
         mean = 0.0
         for (since, value), (until, _) in pairwise(inputs):
             overlap = min(end - delay, until) - max(start - delay, since)
             mean += value * max(overlap, 0.0) / (end - start)
-        lag = float(self._drive[Drive.LAG])
+        lag = float(self._drive[Drive.ACTUATOR_LAG_TIME_CONSTANT])
         if lag > 0.0:
             decay = float(np.exp(-(end - start) / lag))
             target, off = mean, self._lagged - mean
@@ -251,7 +248,8 @@ class SteppedBench:
         s = self._state
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
         driven = max(self._motor, 0)
-        smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s)
+        _, smooth = reach_of(self._cart, self._spring, self._drive)
+        smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s, 0.0, 0.0, smooth)
         return s[kernel.FORCE] - self._K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
@@ -265,19 +263,20 @@ class SteppedBench:
     def _bend_presliding(self) -> None:
         """Bend the presliding friction as far as it holds what acts on the carts at rest."""
         net = self._static_forces()
-        for i in np.flatnonzero(self._cart[:, Cart.DAHL]):
-            self._state[kernel.Z, i] = np.clip(net[i] / self._cart[i, Cart.DAHL], -1.0, 1.0)
+        most = np.array([settling(self._cart, i, 0.0)[0] for i in range(self._n)])
+        for i in np.flatnonzero(most):
+            self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
 
     def _step_lengths(self) -> tuple[float, float]:
         """Return the longest substep, and the longest inside a contact, s."""
         inverse, N = self._inverse_mass[: self._N], self._N
-        change = 1.0 + max(float(self._spring[:, Spring.CHANGE].max()), 0.0)
+        change = 1.0 + max(float(self._spring[:, Spring.SLACK_SPRING_STIFFNESS_CHANGE].max()), 0.0)
         fastest = float(np.max(np.abs(self._K[:N, :N]).sum(1) * inverse)) * change
         damped = float(np.max(np.abs(self._C[:N, :N]).sum(1) * inverse))
         step = min(_LONGEST_STEP, kernel._SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
         step = min(step, _DAMPED_REACH / max(damped, 1e-12))
-        contact = float(np.max(self._cart[:, Cart.STOP_STIFFNESS] * inverse[: self._n]))
+        contact = float(np.max(self._cart[:, Cart.END_STOP_STIFFNESS] * inverse[: self._n]))
         if self._motor >= 0:
             both = float(inverse[0] + inverse[self._motor])
-            contact = max(contact, self._drive[Drive.CONTACT_STIFFNESS] * both)
+            contact = max(contact, self._drive[Drive.BACKLASH_CONTACT_STIFFNESS] * both)
         return step, kernel._CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step

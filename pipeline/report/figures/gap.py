@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
-from pipeline.gap.types import FoundEffect, Proposal, RecordGap, Trace
+from pipeline.gap.types import FoundEffect, Proposal, RecordGap, Residual, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce
 from pipeline.report.figures.style import (
     MEASURED,
@@ -41,17 +41,26 @@ _ROOM = 1.06
 
 
 def before_after_figure(
-    trace: Trace, *, noise: float, position_unit: str, added: str = ADDED
+    trace: Trace,
+    *,
+    noise: float,
+    position_unit: str,
+    added: str = ADDED,
+    touched: Sequence[tuple[Array, Array]] = (),
 ) -> Figure:
     """Return one cart in one run: measured, both models, and what each leaves below.
 
-    `added` names the model with what was added to the linear one; "" where nothing was.
+    `added` names the model with what was added to the linear one; "" where nothing was. `touched`
+    are times and readings of the stretches beside the run in which a hand moved a cart.
     """
     models = {"linear model": trace.baseline}
     if added:
         models = {added: trace.final} | models
     figure, (above, below) = panels(1.5, 1.0)
     plot_measured(above, trace.t, trace.measured)
+    for t, y in touched:
+        above.axvspan(float(t[0]), float(t[-1]), color=SHADE, lw=0)
+        plot_measured(above, t, y, in_legend=False)
     (name, model), *others = models.items()
     for other, y in others:
         plot_second(above, trace.t, y, label=other)
@@ -193,6 +202,22 @@ def plot_force(
     ax.plot(x[order], model[order], ".", color=MODEL, ms=3.0, mew=0)
     ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label=added)  # for the legend
     ax.set_xlim(*(_ROOM * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
+
+
+def force_left_figure(residual: Residual) -> Figure:
+    """Return the force left on a cart against each quantity, with what the formula says of it."""
+    figure, axes = panels(*(1.6 for _ in residual.against), share_x=False)
+    for ax, shown in zip(axes, residual.against, strict=True):
+        bars = [0.0 if spread is None else spread for spread in shown.spread]
+        ax.axhline(0.0, color=QUIET, lw=0.6)
+        ax.errorbar(shown.at, shown.force, yerr=bars, fmt="o", ms=3.4, mfc="none", mec=MEASURED,
+                    mew=0.6, ecolor=QUIET, elinewidth=0.8, label="force left")  # fmt: skip
+        if shown.formula is not None:
+            ax.plot(shown.at, shown.formula, color=MODEL, lw=1.1, label="formula")
+        ax.set_xlabel(f"{shown.quantity} [{shown.unit}]")
+        ax.set_ylabel(f"force [{residual.unit}]")
+    legend_above(axes[0])
+    return figure
 
 
 def timing_figure(

@@ -63,7 +63,7 @@ def decay_figure(
     """Return the decays of one cart as small multiples, repeats side by side."""
     swings = [float(np.ptp(decay.peak_y)) for decay in decays]
     figure, axes = small_multiples(
-        [decay.experiment for decay in decays], height=_SMALL, share_y=_alike(swings)
+        [decay.name for decay in decays], height=_SMALL, share_y=_alike(swings)
     )
     for ax, decay, record in zip(axes, decays, records, strict=True):
         plot_decay(ax, decay, record=record)
@@ -112,7 +112,7 @@ def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
     amplitude, zeta = decay.zeta_at_amplitude
     (line,) = ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-",
                       lw=0.6, color=QUIET)  # fmt: skip
-    tell(line, amplitude, zeta, name=clean(decay.experiment))
+    tell(line, amplitude, zeta, name=clean(decay.name))
 
 
 # ---------------------------------------------------------------------- steps

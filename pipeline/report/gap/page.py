@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pipeline import __version__
+from pipeline.arrays import Array
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
@@ -18,6 +19,7 @@ from pipeline.report.figures.gap import (
     before_after_figure,
     by_record_figure,
     force_figure,
+    force_left_figure,
     predicted_figure,
     spectrum_figure,
     timing_figure,
@@ -25,6 +27,7 @@ from pipeline.report.figures.gap import (
 from pipeline.report.gap.tables import (
     effect_parameter_table,
     error_table,
+    intervention_table,
     rival_table,
     window_table,
 )
@@ -97,6 +100,8 @@ def build_gap_document(
     made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
+        ("force-left", "What force is left", lambda page: _force_left(page, gap)),
+        ("hands", WORDS.text("hands"), lambda page: _hands(page, gap)),
         ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
@@ -158,7 +163,13 @@ def _before_after(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
     added, model = added_name(gap), whole_model(gap)
     return page.picture(
         f"before-after-{number}",
-        before_after_figure(trace, noise=noise, position_unit=page.position, added=added),
+        before_after_figure(
+            trace,
+            noise=noise,
+            position_unit=page.position,
+            added=added,
+            touched=_touched(page, gap, trace),
+        ),
         caption=WORDS.text(f"before_after{alone}", **said),
         alt=WORDS.text(f"before_after_alt{alone}", model=model, **said),
     )
@@ -227,6 +238,55 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
     if gap.left and gap.effects:
         blocks.append(window_table(page, gap.left, model=whole_model(gap)))
     return blocks
+
+
+def _force_left(page: Page, gap: Gap) -> list[Block]:
+    """Show what no law of the model explains, cart by cart, and the formula for it."""
+    if not gap.residual:
+        return []
+    model = whole_model(gap) if gap.effects else WORDS.text("linear_model")
+    blocks: list[Block] = [paragraph(WORDS.spans("force_left", model=model))]
+    for residual in gap.residual:
+        cart = str(residual.cart)
+        if residual.formula is None:
+            said = WORDS.spans("force_left_no_formula", cart=cart)
+        else:
+            said = WORDS.spans(
+                "force_left_formula",
+                formula=residual.formula.text,
+                unit=residual.unit,
+                position=page.position,
+                drive=page.drive,
+                share=percent(100 * residual.formula.explains),
+            )
+        line = WORDS.text("force_left_formula_line") if residual.formula else ""
+        caption = WORDS.text("force_left_caption", cart=cart, formula=line)
+        quantities = listing([shown.quantity for shown in residual.against])
+        text = "".join(span.text for span in said)
+        alt = WORDS.text("force_left_alt", cart=cart, quantities=quantities, formula=text)
+        figure = force_left_figure(residual)
+        blocks.append(page.picture(f"force-left-{cart}", figure, caption=caption, alt=alt))
+        blocks.append(paragraph(said))
+    return blocks
+
+
+def _hands(page: Page, gap: Gap) -> list[Block]:
+    return [intervention_table(page, gap.interventions)] if gap.interventions else []
+
+
+def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
+    """Return the stretches right before and after a run in which a hand moved a cart."""
+    record = page.records.get(trace.experiment)
+    if record is None:
+        return []
+    near = 2.0 * record.sample_time
+    found = []
+    for one in gap.interventions:
+        before, after = trace.t[0] - one.end, one.start - trace.t[-1]
+        if one.experiment == record.id and (0.0 <= before < near or 0.0 <= after < near):
+            shown = (record.t >= one.start) & (record.t <= one.end)
+            found.append((record.t[shown], record.position(trace.cart)[shown]))
+    return found
 
 
 def _apart(page: Page, gap: Gap) -> list[Block]:

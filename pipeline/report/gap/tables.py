@@ -8,6 +8,7 @@ from pipeline.report.gap.words import WORDS, effect_name, phase, share
 from pipeline.report.numbers import percent, unit_text, with_error
 from pipeline.report.sections.page import Page
 from pipeline.report.words import clean
+from pipeline.results_of_runs import Intervention
 
 
 def error_table(page: Page, gap: Gap) -> Table:
@@ -39,6 +40,19 @@ def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Tab
             for w in windows
         ],
         "lcddld",
+    )
+
+
+def intervention_table(page: Page, interventions: Sequence[Intervention]) -> Table:
+    """Return where a hand moved a cart."""
+    return page.table(
+        WORDS.text("intervention_table"),
+        ("Record", "Cart", "From [s]", "To [s]", "The cart is"),
+        [
+            (clean(one.experiment), str(one.cart), f"{one.start:.2f}", f"{one.end:.2f}", one.what)
+            for one in interventions
+        ],
+        "lcddl",
     )
 
 

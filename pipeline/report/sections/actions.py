@@ -24,6 +24,7 @@ _WORST_FIRST = (
     "position_scale",
     "input_scale",
     "setup",
+    "held",
     "dwells",
     "late_channel",
     "fit.identified",

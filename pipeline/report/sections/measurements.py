@@ -125,11 +125,11 @@ def decay_blocks(page: Page) -> list[Block]:
         records = [page.records[decay.experiment] for decay in drawn]
         figure = decay_figure(drawn, records=records, position_unit=page.position)
         first = drawn[0]
-        sticks = [clean(d.experiment) for d in drawn if d.friction and d.friction.present]
+        sticks = [clean(d.name) for d in drawn if d.friction and d.friction.present]
         said = {"cart": str(cart), "zeta": with_error(first.zeta, first.zeta_std)}
         caption = _WORDS.text(
             "decay",
-            run=clean(first.experiment),
+            run=clean(first.name),
             freed=_WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
             sticking=_WORDS.text("decay_sticking", sticking=listing(sticks)) if sticks else "",
             more=left_out(len(of_cart) - len(drawn)),
@@ -146,7 +146,7 @@ def decay_blocks(page: Page) -> list[Block]:
     rubbing = [d for d in decays if d.friction and d.friction.present]
     if rubbing := [d for d in rubbing if d.zeta_at_amplitude.shape[1] > 1]:  # one is no rise
         figure = damping_figure(rubbing, position_unit=page.position)
-        runs = listing(list(dict.fromkeys(clean(d.experiment) for d in rubbing)))
+        runs = listing(list(dict.fromkeys(clean(d.name) for d in rubbing)))
         caption, alt = _WORDS.text("damping", runs=runs), _WORDS.text("damping_alt")
         blocks.append(page.picture("damping", figure, caption=caption, alt=alt))
     return blocks
@@ -165,7 +165,7 @@ def _decay_table(page: Page) -> Table:
             verdict = cell("none seen", "good")
         rows.append(
             (
-                clean(decay.experiment),
+                clean(decay.name),
                 str(decay.cart),
                 with_error(decay.omega_n, decay.omega_n_std),
                 with_error(decay.zeta, decay.zeta_std),

@@ -1,6 +1,6 @@
 """The catalogue of effects: what a bench may do beyond the linear chain.
 
-To add one: write an `Effect` in a file here and list it below.
+To add one: write an `Effect` in a file here, list it below, and run `python -m docs.codegen`.
 """
 
 import re
@@ -8,29 +8,49 @@ from difflib import get_close_matches
 from operator import attrgetter
 
 from pipeline.errors import ConfigError
-from pipeline.plant.nonlinear.effects import actuator, cogging, friction, springs, structure
+from pipeline.plant.nonlinear.effects import (
+    actuator_lag,
+    backlash,
+    cogging,
+    coulomb_friction,
+    coupling_damper,
+    cubic_spring,
+    dead_zone,
+    drive_damping,
+    end_stop,
+    extra_mode,
+    force_offset,
+    input_delay,
+    load_friction,
+    presliding_friction,
+    quadratic_drag,
+    saturation,
+    sensor_gain,
+    slack_spring,
+    stiction,
+)
 from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
 
 CATALOGUE: tuple[Effect, ...] = (
-    friction.COULOMB,
-    friction.STICTION,
-    friction.PRESLIDING,
-    friction.LOAD,
-    friction.DRAG,
-    friction.OFFSET,
-    springs.CUBIC,
-    springs.SLACK,
-    springs.COUPLING,
-    actuator.DRIVE_DAMPING,
-    actuator.DEAD_ZONE,
-    actuator.SATURATION,
-    actuator.DELAY,
-    actuator.LAG,
-    actuator.BACKLASH,
-    cogging.COGGING,
-    structure.END_STOP,
-    structure.SENSOR_GAIN,
-    structure.EXTRA_MODE,
+    coulomb_friction.EFFECT,
+    stiction.EFFECT,
+    presliding_friction.EFFECT,
+    load_friction.EFFECT,
+    quadratic_drag.EFFECT,
+    force_offset.EFFECT,
+    cubic_spring.EFFECT,
+    slack_spring.EFFECT,
+    coupling_damper.EFFECT,
+    drive_damping.EFFECT,
+    dead_zone.EFFECT,
+    saturation.EFFECT,
+    input_delay.EFFECT,
+    actuator_lag.EFFECT,
+    backlash.EFFECT,
+    cogging.EFFECT,
+    end_stop.EFFECT,
+    sensor_gain.EFFECT,
+    extra_mode.EFFECT,
 )
 
 _WORD = re.compile(r"[a-z]+")

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from enum import IntEnum
-from functools import cached_property
 from itertools import product
 from typing import Literal
 
@@ -12,7 +11,19 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import ConfigError
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Tables, linear_tables
+from pipeline.plant.nonlinear.effects.law import (
+    Built,
+    Force,
+    Friction,
+    Growth,
+    Hysteresis,
+    Input,
+    Law,
+    equation_of,
+    evaluate,
+    names_in,
+)
+from pipeline.plant.nonlinear.tables import TABLES, Cart, Drive, Tables, linear_tables
 
 Place = Literal["cart", "spring", "input"]
 Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
@@ -50,6 +61,7 @@ class Parameter:
     signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
     neutral : the value that gives the base model (where one exists).
     lower, upper : bounds of the magnitude, in multiples of `scale`.
+    reach : how far its logarithm goes in one step of a fit.
     reported : False for a detail of the contact that the data need but nobody asks for.
     """
 
@@ -64,6 +76,7 @@ class Parameter:
     neutral: float | None = None
     lower: float = 0.0
     upper: float = np.inf
+    reach: float = 0.4
     reported: bool = True
 
     def unit_text(self, *, position: str, input: str) -> str:
@@ -78,8 +91,8 @@ class Effect:
     Attributes
     ----------
     key : its name in files; `sentence` tells a student what it is.
-    equation : TeX of the law, in the symbols of the parameters.
-    columns : the table columns the parameter values stand for.
+    law : in the symbols of the parameters; growth : its coordinates in a fit from nothing, where
+        they are others.
     trials : multiples of all scales to try first, where not all combinations make sense.
     fingerprint : what it does to the data; deciding_run: the experiment that settles it.
     axis : what to plot the force (or reading) against, to see it.
@@ -87,13 +100,10 @@ class Effect:
     fewest_carts : with fewer it is part of the linear chain.
     family : effects of one family exclude each other at one place; on several carts they are one.
     grows_from : the simpler effect whose fit is the start of this one's.
-    grown : the values that the simpler effect's tell of this one's; the others are tried.
-    rugged : its misfit has many valleys, so that a fit needs several starts.
     only_rest : shows in nothing but where the carts rest, like an encoder's zero; found from those.
     equivalent : what the data cannot tell from it, and why.
     same_as, same_below : the key of an effect that provably cannot be told from it while its first
         parameter is below this many sample times.
-    lookalike : another effect that the values at a place of a chain hint at, to be fitted beside.
     genuine : False where the values have degenerated into another law.
     """
 
@@ -101,27 +111,22 @@ class Effect:
     title: str
     sentence: str
     place: Place
-    equation: str
+    law: Law
     parameters: tuple[Parameter, ...]
-    columns: Callable[[Mapping[str, float]], Mapping[IntEnum, float]]
     fingerprint: str
     deciding_run: str
     reference: str
     axis: Axis
+    growth: Growth | None = None
     trials: tuple[tuple[float, ...], ...] = ()
     family: str = ""
     between_carts: bool = False
     fewest_carts: int = 1
     grows_from: str | None = None
-    grown: Callable[[Mapping[str, float]], dict[str, float]] = lambda p: {}
-    rugged: bool = False
     only_rest: bool = False
     equivalent: str = ""
     same_as: str = ""
     same_below: float = np.inf
-    lookalike: "Callable[[Mapping[str, float], int, Chain], Lookalike | None]" = (
-        lambda p, place, chain: None
-    )
     genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
 
     @property
@@ -146,25 +151,85 @@ class Effect:
         """Whether bodies meet: it then has details of the contact that nobody asks for."""
         return not all(p.reported for p in self.parameters)
 
-    @cached_property
+    @property
+    def equation(self) -> str:
+        """TeX of the law, without details of the contact."""
+        unseen = {p.symbol for p in self.parameters if not p.reported}
+        return equation_of(self.law, place=self.place, unseen=unseen)
+
+    @property
     def dry(self) -> bool:
         """Whether it is friction whose size differs from run to run."""
-        return self._fills(*DRY)
+        return isinstance(self.law, Friction | Hysteresis)
 
-    @cached_property
+    @property
     def many_rests(self) -> bool:
         """Whether carts may lie still elsewhere than where their springs alone would let them."""
-        return self._fills(*DRY, Drive.COGGING)
+        repeats = isinstance(self.law, Force) and {"x", "sin"} <= names_in(self.law.force)
+        return self.dry or repeats
 
-    @cached_property
+    @property
+    def has_play(self) -> bool:
+        """Whether the motor may leave cart 1."""
+        return self.is_built("play")
+
+    @property
     def hides_mass(self) -> bool:
         """Whether something moves that no sensor reads."""
-        return self._fills(Cart.HIDDEN_MASS)
+        return self.is_built("hidden mass")
 
-    def _fills(self, *columns: IntEnum) -> bool:
-        filled = self.columns(dict.fromkeys(self.names, 1.0))
-        # Columns of different tables are equal as numbers.
-        return any(column is mine for column in columns for mine in filled)
+    @property
+    def needs_input(self) -> bool:
+        """Whether it changes nothing in a motion without an input."""
+        powered = isinstance(self.law, Force) and "on" in names_in(self.law.force)
+        return powered or isinstance(self.law, Input) or self.is_built("delay", "lag")
+
+    @property
+    def needs_drive(self) -> bool:
+        """Whether its law asks for the input."""
+        law = self.law
+        text = (
+            law.force if isinstance(law, Force) else law.size if isinstance(law, Friction) else ""
+        )
+        return bool({"u", "on"} & names_in(text)) or self.place == "input"
+
+    def is_built(self, *kinds: str) -> bool:
+        """Whether its law is one of those that the simulators have built in."""
+        return isinstance(self.law, Built) and self.law.kind in kinds
+
+    @property
+    def own(self) -> tuple[Parameter, ...]:
+        """The parameters but those that it shares with the friction within it."""
+        if not (isinstance(self.law, Friction) and self.law.beyond):
+            return self.parameters
+        mine = {*self.grown.coordinates, *self.grown.parameters}
+        return tuple(p for p in self.parameters if p.symbol in mine)
+
+    @property
+    def grown(self) -> Growth:
+        """The coordinates in which the law grows from nothing: its parameters, if no others."""
+        symbols = tuple(p.symbol for p in self.parameters)
+        return self.growth or Growth(symbols, signed=self.parameters[0].signed)
+
+    def column_name(self, parameter: Parameter) -> str:
+        """Return the name of the column that holds a parameter."""
+        shared = isinstance(self.law, Friction) and parameter not in self.own
+        owner = self.law.beyond if isinstance(self.law, Friction) and shared else self.key
+        return f"{owner}_{parameter.name}".upper()
+
+    def columns(self, values: Mapping[str, float]) -> dict[IntEnum, float]:
+        """Return what parameter values fill of the simulator's tables."""
+        table = TABLES[self.place]
+        by_name = {p.name: table[self.column_name(p)] for p in self.parameters}
+        return {by_name[name]: value for name, value in values.items()}
+
+    def grown_values(self, coordinates: Mapping[str, float]) -> dict[str, float]:
+        """Return the parameters that go with coordinates (and shared parameters), by symbol."""
+        values = {p.name: coordinates[p.symbol] for p in self.own if p.symbol in coordinates}
+        for p in self.own:
+            if p.symbol in self.grown.parameters:
+                values[p.name] = evaluate(self.grown.parameters[p.symbol], coordinates)
+        return values
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Return parameter values by their names."""
@@ -205,15 +270,6 @@ class Effect:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lookalike:
-    """An effect at a place, with those of its values that are known."""
-
-    effect: Effect
-    place: int
-    values: dict[str, float]
-
-
-@dataclass(frozen=True, kw_only=True)
 class Term:
     """An effect at a place, with its parameter values in the effect's order."""
 
@@ -245,6 +301,11 @@ class AugmentedChain:
         for term in self.terms:
             term.effect.fill(tables, term.place, term.values)
         return tables
+
+
+def spring_force(scales: Scales) -> float:
+    """Return the usual size of a force: that of the springs."""
+    return scales.stiffness * scales.position
 
 
 def make_term(effect: Effect, *, place: int, values: Mapping[str, float], chain: Chain) -> Term:

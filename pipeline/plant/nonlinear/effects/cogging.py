@@ -1,14 +1,15 @@
-"""A motor whose force repeats with its position: teeth of its rotor, or of pinion and rack."""
+"""Cogging of the motor."""
 
 from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.tables import Drive
+from pipeline.plant.nonlinear.effects.law import Force, Growth
 
-COGGING = Effect(
+EFFECT = Effect(
     key="cogging",
     title="Cogging of the motor",
     sentence="The teeth of the motor (or of pinion and rack) pull cart 1 to and fro as it travels.",
     place="input",
-    equation=r"f = F \sin(2\pi x_1/\lambda + \varphi)",
+    law=Force("F * sin(2 * π * x / λ + φ)", on_motor=True, step=1e-3),
+    growth=Growth(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
     parameters=(
         Parameter(
             "force",
@@ -26,6 +27,7 @@ COGGING = Effect(
             trials=(0.1, 0.2, 0.4),
             lower=0.02,
             upper=1.0,  # a longer one is a spring that is not straight
+            reach=0.03,  # a quarter of a tooth, where the travel has eight
         ),
         Parameter(
             "phase",
@@ -36,8 +38,6 @@ COGGING = Effect(
             signed=True,
         ),
     ),
-    columns=lambda p: {Drive.COGGING: p["force"], Drive.PITCH: p["pitch"], Drive.PHASE: p["phase"]},
-    rugged=True,
     fingerprint="The cart rests at some positions rather than at others, evenly apart; the "
     "residual force is a wave over the position, alike in both directions.",
     deciding_run="A slow ramp of the input, up and down: the cart moves in even steps, at the same "

@@ -1,9 +1,11 @@
 """What switches inside a step: end stops, springs past a stretch, both sides of a backlash."""
 
+from pipeline.plant.nonlinear.columns import Drive
+from pipeline.plant.nonlinear.simulator.laws import slack_of, stop_of
+
 # isort: off
 from pipeline.plant.nonlinear.simulator.state import (
-    BACKLASH, CHANGE, CONTACT_D, CONTACT_K, D2, D3, D4, D5, D6, FIX, PAST, STIFF, STOP, STOP_D,
-    STOP_K, STRETCH, V, X, jit, pair, tie,
+    D2, D3, D4, D5, D6, FIX, PAST, V, X, jit, pair, tie,
 )  # fmt: skip
 
 
@@ -39,10 +41,11 @@ def contact(which, cart, drive, n, motor):
     Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap.
     """
     if which < n:
-        side = 1.0 if cart[which, STOP] > 0.0 else -1.0
-        return which, -1, side, cart[which, STOP_K], cart[which, STOP_D], abs(cart[which, STOP])
+        k, c, at = stop_of(cart, which)
+        return which, -1, 1.0 if at > 0.0 else -1.0, k, c, abs(at)
     side = 1.0 if which == 2 * n + 1 else -1.0
-    return motor, 0, side, drive[CONTACT_K], drive[CONTACT_D], 0.5 * drive[BACKLASH]
+    k, c = drive[Drive.BACKLASH_CONTACT_STIFFNESS], drive[Drive.BACKLASH_CONTACT_DAMPING]
+    return motor, 0, side, k, c, 0.5 * drive[Drive.BACKLASH_GAP]
 
 
 @jit
@@ -55,8 +58,8 @@ def guard(which, active, cart, spring, drive, n, motor, s, h):
     if n <= which <= 2 * n:
         j = which - n
         reach = (position(s, j, h) if j < n else 0.0) - (position(s, j - 1, h) if j > 0 else 0.0)
-        side = 1.0 if spring[j, STRETCH] >= 0.0 else -1.0
-        beyond = side * (reach - spring[j, STRETCH])
+        _, at, _ = slack_of(spring, j)
+        beyond = reach - at if at >= 0.0 else at - reach
         return -beyond if active else beyond
     body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
     x, v = position(s, body, h), velocity(s, body, h)
@@ -73,13 +76,14 @@ def switch(which, sign, cart, spring, drive, n, motor, s, K, C):
     """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
     if n <= which <= 2 * n:
         j = which - n
-        k = sign * spring[j, CHANGE] * spring[j, STIFF]
+        more, at, _ = slack_of(spring, j)
+        k = sign * more
         tie(K, j, n, k)
         s[PAST, j] += sign
         if j < n:
-            s[FIX, j] += k * spring[j, STRETCH]
+            s[FIX, j] += k * at
         if j > 0:
-            s[FIX, j - 1] -= k * spring[j, STRETCH]
+            s[FIX, j - 1] -= k * at
     else:
         body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
         pair(K, body, other, sign * k)

@@ -12,14 +12,17 @@ Impulses are right to second order in the step: 1e-3 of a derivative, which only
 Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000), 204-220.
 """
 
-from math import cos, exp, pi
+from math import exp
 
 import numpy as np
 
 # isort: off
+from pipeline.plant.nonlinear.simulator.laws import (
+    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, drop_slope, motor_slopes,
+    settling, settling_slopes, slack_of, spring_slopes,
+)  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, BEFORE, CHANGE, COGGING, CUBIC, D2, D3, DAHL, DECAY, DISTANCE, DRAG, GRIP, HALF_A,
-    HALF_V, HALF_X, MID_V, MID_X, PAST, PHASE, PITCH, RUB, SIDE, STATIC, STRETCH, STRIBECK,
+    ACC, BEFORE, D2, D3, DECAY, GRIP, HALF_A, HALF_V, HALF_X, MID_V, MID_X, PAST, RUB, SIDE,
     TURNED, V, X, Z, jit, stretch,
 )  # fmt: skip
 
@@ -59,8 +62,9 @@ def _add(T, row, factor, other):
 def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step):
     """Move the sensitivities on by `step`, before the state moves.
 
-    Forces were taken in the middle of the `whole` step; `push` is the braking of the motor now,
-    which body it drives, and the table of the drive.
+    Forces were taken in the middle of the `whole` step; `push` is which body the motor
+    drives, the table of the drive, the input that arrives, and whether it is on, and where
+    there are smooth forces.
     """
     moved = 3 * N + 2
     changed = abs(step - phi[2 * N, 0]) > _SAME * step
@@ -96,10 +100,10 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole
             T[moved + row, block, 2] = c
             T[moved + row, block, 3] = d
     for i in range(n):
-        if cart[i, DAHL] > 0.0:
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
-            slope = (1.0 - sign * s[Z, i]) * decay * step / cart[i, DISTANCE]
+        most, target, pace = settling(cart, i, s[MID_V, i])
+        if most > 0.0:
+            decay = exp(-pace * step)
+            slope = _settled(cart, i, s, target, decay, step)
             _add(T, 2 * N + i, decay - 1.0, 2 * N + i)
             _add(T, 2 * N + i, 0.5 * slope, N + i)
             _add(T, 2 * N + i, 0.5 * slope, moved + N + i)
@@ -149,7 +153,8 @@ def _force(kind, at, s, n, spring):
         return s[RUB, at]
     reach = stretch(s, HALF_X, at, n)
     if s[PAST, at] != 0.0:
-        reach += spring[at, CHANGE] * (reach - spring[at, STRETCH])
+        _, past, share = slack_of(spring, at)
+        reach += share * (reach - past)
     return -reach
 
 
@@ -165,32 +170,47 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
             T[N + at, block, q] += s[GRIP, at] * pull
         if kind == BY_STIFFNESS and at > 0:
             T[N + at - 1, block, q] -= s[GRIP, at - 1] * pull
-    braking, driven, drive = push
-    if drive[COGGING] != 0.0:
-        per = 2.0 * pi / drive[PITCH]
-        k = span * drive[COGGING] * per * cos(per * s[MID_X, driven] + drive[PHASE])
-        _add(T, N + driven, s[GRIP, driven] * k, driven)
-    for j in range(n + 1):
-        if spring[j, CUBIC] != 0.0:
-            k = 3.0 * span * spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 2
-            for body, near in ((j, j - 1), (j - 1, j)):
-                if 0 <= body < n:
-                    _add(T, N + body, -s[GRIP, body] * k, body)
-                    if 0 <= near < n:
-                        _add(T, N + body, s[GRIP, body] * k, near)
+    driven, drive, u, on, smooth = push
+    if smooth & ON_DRIVE:
+        by_x, by_v = motor_slopes(drive, s[MID_X, driven], s[MID_V, driven], u, on)
+        _bend(T, s, N, driven, driven, span, by_x, by_v)
+        by_x, by_v = drive_slopes(drive, s[MID_X, 0], s[MID_V, 0], u, on)
+        _bend(T, s, N, 0, 0, span, by_x, by_v)
+    for j in range(n + 1 if smooth & ON_SPRINGS else 0):
+        d, rate = stretch(s, MID_X, j, n), stretch(s, MID_V, j, n)
+        by_d, by_rate = spring_slopes(spring, j, d, rate)
+        for body, near in ((j, j - 1), (j - 1, j)):
+            if 0 <= body < n:
+                _bend(T, s, N, body, body, span, -by_d, -by_rate)
+                if 0 <= near < n:
+                    _bend(T, s, N, body, near, span, by_d, by_rate)
     for i in range(n):
-        c = 2.0 * cart[i, DRAG] * abs(s[MID_V, i]) + (braking if i == 0 else 0.0)
-        if cart[i, STATIC] != 0.0 and s[SIDE, i] != 0.0 and s[V, i] != 0.0:
-            ratio = abs(s[MID_V, i]) / cart[i, STRIBECK]
-            fall = 2.0 * ratio / cart[i, STRIBECK] * exp(-ratio * ratio)
-            c -= scatter[i] * cart[i, STATIC] * fall
-        if cart[i, DAHL] > 0.0:
-            force = scatter[i] * cart[i, DAHL] * s[DECAY, i]
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            c += force * (1.0 - sign * s[Z, i]) * 0.5 * whole / cart[i, DISTANCE]
-            _add(T, N + i, -s[GRIP, i] * span * force, 2 * N + i)
-        if c != 0.0:
-            _add(T, N + i, -s[GRIP, i] * span * c, N + i)
+        by_x = by_v = 0.0
+        if smooth & ON_CARTS:
+            by_x, by_v = cart_slopes(cart, i, s[MID_X, i], s[MID_V, i], u)
+        if s[SIDE, i] != 0.0 and s[V, i] != 0.0:
+            by_v -= scatter[i] * drop_slope(cart, i, abs(s[MID_V, i]), u)
+        most, target, _ = settling(cart, i, s[MID_V, i])
+        if most > 0.0:
+            by_v -= scatter[i] * most * _settled(cart, i, s, target, s[DECAY, i], 0.5 * whole)
+            _add(T, N + i, -s[GRIP, i] * span * scatter[i] * most * s[DECAY, i], 2 * N + i)
+        _bend(T, s, N, i, i, span, by_x, by_v)
+
+
+@jit
+def _settled(cart, i, s, target, decay, span):
+    """Return what the presliding state of cart i is, `span` s later, by the velocity."""
+    by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
+    return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
+
+
+@jit
+def _bend(T, s, N, body, by, span, by_x, by_v):
+    """Give the lanes of a body the impulse of a force with slopes by the state of one."""
+    if by_x != 0.0:
+        _add(T, N + body, s[GRIP, body] * span * by_x, by)
+    if by_v != 0.0:
+        _add(T, N + body, s[GRIP, body] * span * by_v, N + by)
 
 
 @jit
@@ -241,7 +261,7 @@ def restart(lanes, T, shot, free, parent, motor, n, N):
 
 
 @jit
-def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
+def bend_presliding(lanes, T, s, K, most, scatter, i, n, N):
     """Start the presliding state of cart i where the others' sensitivities bend it."""
     for lane in range(lanes.shape[1]):
         kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
@@ -250,6 +270,6 @@ def bend_presliding(lanes, T, s, K, cart, scatter, i, n, N):
             net -= K[i, j] * T[j, block, q]
         if kind == BY_STIFFNESS and (at == i or at == i + 1):
             net += stretch(s, X, at, n) * (1.0 if at == i + 1 else -1.0)
-        T[2 * N + i, block, q] = net / (scatter[i] * cart[i, DAHL])
+        T[2 * N + i, block, q] = net / (scatter[i] * most)
         if kind == BY_FRICTION and at == i:
             T[2 * N + i, block, q] -= s[Z, i] / scatter[i]

@@ -1,4 +1,4 @@
-"""What the compiled functions share: columns, rows and lanes as plain integers, and the compiler.
+"""What the compiled functions share: the rows of the state, and the compiler.
 
 The compiled functions index flat tables: numba cannot see dataclasses. It looks only at a
 function's own file to see whether what it has stored is out of date: who changes a file of this
@@ -8,13 +8,6 @@ folder removes its `__pycache__`.
 from typing import Any
 
 from numba import njit
-
-# The columns of `pipeline.plant.nonlinear.tables` as plain integers, which compile to constants.
-MASS, DAMPING, COULOMB, STATIC, STRIBECK, DAHL, DISTANCE, LOAD = (int(i) for i in range(8))
-DRAG, OFFSET, STOP, STOP_K, STOP_D, GAIN, HID_M, HID_K, HID_C = (int(i) for i in range(8, 17))
-STIFF, CUBIC, CHANGE, STRETCH, COUPLING = (int(i) for i in range(5))
-DEAD, LIMIT, DELAY, LAG, DRIVE_C, BACKLASH = (int(i) for i in range(6))
-MOTOR, CONTACT_K, CONTACT_D, COGGING, PITCH, PHASE = (int(i) for i in range(6, 12))
 
 # Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
 # state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry

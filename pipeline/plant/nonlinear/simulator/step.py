@@ -1,6 +1,6 @@
 """One step of the simulator: forces, the series of the linear flow, the events inside it."""
 
-from math import exp, pi, sin
+from math import exp
 
 import numpy as np
 
@@ -8,28 +8,30 @@ from pipeline.plant.nonlinear.simulator.contacts import contact, guard, position
 from pipeline.plant.nonlinear.simulator.sensitivity import carry, meet, stop
 
 # isort: off
+from pipeline.plant.nonlinear.simulator.laws import (
+    ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, dropping, motor_force, settling,
+    sliding, spring_force,
+)  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, COGGING, COULOMB, CUBIC, D2, D3, D4, DAHL, DECAY, DISTANCE, DRAG, FIX, FORCE, GRIP, INV,
-    LOAD, MID_V, MID_X, OFFSET, PHASE, PITCH, RUB, SIDE, STATIC, STRIBECK, V, X, Z, inlined, jit,
+    ACC, D2, D3, D4, DECAY, FIX, FORCE, GRIP, INV, MID_V, MID_X, RUB, SIDE, V, X, Z, inlined,
     stretch,
 )  # fmt: skip
 
 _MOST_EVENTS = 12  # in one substep; more would be chatter
 
 
-@jit
-def smooth_forces(cart, spring, drive, driven, n, s):
+@inlined
+def smooth_forces(cart, spring, drive, driven, n, s, u, on, smooth):
     """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
-    for i in range(n):
-        s[FORCE, i] += cart[i, OFFSET]
-        if cart[i, DRAG] != 0.0:
-            s[FORCE, i] -= cart[i, DRAG] * s[MID_V, i] * abs(s[MID_V, i])
-    if drive[COGGING] != 0.0:
-        turn = 2.0 * pi * s[MID_X, driven] / drive[PITCH] + drive[PHASE]
-        s[FORCE, driven] += drive[COGGING] * sin(turn)
-    for j in range(n + 1):
-        if spring[j, CUBIC] != 0.0:
-            f = spring[j, CUBIC] * stretch(s, MID_X, j, n) ** 3
+    if smooth & ON_CARTS:
+        for i in range(n):
+            s[FORCE, i] += cart_force(cart, i, s[MID_X, i], s[MID_V, i], u)
+    if smooth & ON_DRIVE:
+        s[FORCE, driven] += motor_force(drive, s[MID_X, driven], s[MID_V, driven], u, on)
+        s[FORCE, 0] += drive_force(drive, s[MID_X, 0], s[MID_V, 0], u, on)
+    if smooth & ON_SPRINGS:
+        for j in range(n + 1):
+            f = spring_force(spring, j, stretch(s, MID_X, j, n), stretch(s, MID_V, j, n))
             if j < n:
                 s[FORCE, j] -= f
             if j > 0:
@@ -41,34 +43,32 @@ def rub(cart, s, K, C, scatter, u, n, N, step):
     """Add dry friction to the forces; a cart that it holds gets no inverse mass."""
     for i in range(n):
         s[RUB, i] = 0.0
-        if cart[i, DAHL] > 0.0 and s[INV, i] > 0.0:
-            sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-            path = 0.5 * abs(s[MID_V, i]) * step / cart[i, DISTANCE]
-            s[DECAY, i] = exp(-path)
-            held = sign + (s[Z, i] - sign) * s[DECAY, i]
-            s[RUB, i] -= cart[i, DAHL] * held
+        most, target, pace = settling(cart, i, s[MID_V, i])
+        if most > 0.0 and s[INV, i] > 0.0:
+            s[DECAY, i] = exp(-0.5 * pace * step)
+            s[RUB, i] -= most * (target + (s[Z, i] - target) * s[DECAY, i])
     for i in range(n):
         # side: the direction the cart slides in, 0 where nothing dry acts on it.
         s[SIDE, i] = 0.0
-        slide = cart[i, COULOMB] + cart[i, LOAD] * abs(u)
-        if slide + cart[i, STATIC] <= 0.0 or s[INV, i] == 0.0:
+        if s[INV, i] == 0.0:
             continue
-        if s[V, i] == 0.0:
+        slide = sliding(cart, i, u)
+        size = slide + dropping(cart, i, abs(s[MID_V, i]) if s[V, i] != 0.0 else 0.0, u)
+        if size <= 0.0:
+            continue
+        if s[V, i] != 0.0:
+            s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
+        else:
             net = s[FORCE, i] + scatter[i] * s[RUB, i]
             for j in range(N):
                 net -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
-            if abs(net) <= scatter[i] * (slide + cart[i, STATIC]):
+            if abs(net) <= scatter[i] * size:
                 s[GRIP, i] = 0.0
                 continue
             s[SIDE, i] = 1.0 if net > 0.0 else -1.0
             speed = 0.5 * step * (abs(net) - scatter[i] * slide) * s[INV, i]
-        else:
-            s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
-            speed = abs(s[MID_V, i])
-        if cart[i, STATIC] != 0.0:
-            ratio = speed / cart[i, STRIBECK]
-            slide += cart[i, STATIC] * exp(-ratio * ratio)
-        s[RUB, i] -= slide * s[SIDE, i]
+            size = slide + dropping(cart, i, speed, u)
+        s[RUB, i] -= size * s[SIDE, i]
     for i in range(n):
         s[FORCE, i] += scatter[i] * s[RUB, i]
 
@@ -142,7 +142,7 @@ def first_switch(switches, active, cart, spring, drive, n, motor, s, step, none)
 
 @inlined
 def advance(
-    cart, spring, drive, n, N, motor, s, K, C, scatter, u, drive_c, h, dry, smooth, switches,
+    cart, spring, drive, n, N, motor, s, K, C, scatter, u, on, h, dry, smooth, switches,
     active, contact_step, lanes, T, phi, work,
 ):  # fmt: skip
     """Advance x, v and the presliding state z by h, from friction event to friction event.
@@ -164,10 +164,9 @@ def advance(
             s[MID_V, i] = s[V, i] + 0.5 * step * s[ACC, i]
             s[FORCE, i] = s[FIX, i]
             s[GRIP, i] = s[INV, i]
-        if not smooth:
-            smooth_forces(cart, spring, drive, driven, n, s)
+        if smooth:
+            smooth_forces(cart, spring, drive, driven, n, s, u, on, smooth)
         s[FORCE, driven] += u
-        s[FORCE, 0] -= drive_c * s[MID_V, 0]
         if dry:
             rub(cart, s, K, C, scatter, u, n, N, step)
         # The usual sizes as constants: the compiler then unrolls the loops.
@@ -190,19 +189,17 @@ def advance(
             if switching != none:
                 stopping = none
         if lanes.size > 0:
-            push = drive_c, driven, drive
+            push = driven, drive, u, on, smooth
             carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
         for i in range(N):
             s[X, i], s[V, i] = position(s, i, step), velocity(s, i, step)
             s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
         if dry:
             for i in range(n):
-                if cart[i, DAHL] > 0.0:
-                    sign = 1.0 if s[MID_V, i] > 0.0 else -1.0
-                    decay = s[DECAY, i] * s[DECAY, i]
-                    if step < whole:
-                        decay = exp(-abs(s[MID_V, i]) * step / cart[i, DISTANCE])
-                    s[Z, i] = sign + (s[Z, i] - sign) * decay
+                most, target, pace = settling(cart, i, s[MID_V, i])
+                if most > 0.0:
+                    decay = s[DECAY, i] * s[DECAY, i] if step == whole else exp(-pace * step)
+                    s[Z, i] = target + (s[Z, i] - target) * decay
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
         if stopping != none:

@@ -1,0 +1,1 @@
+"""Writes what is made from the effects' laws: `python -m docs.codegen`."""

@@ -1,0 +1,34 @@
+"""Write all that is made from the effects' laws: columns, compiled laws, and the effects' page."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+from docs.codegen.laws import columns_source, laws_source, terms_source
+from pipeline.output import write_file
+from pipeline.plant import nonlinear
+from pipeline.plant.nonlinear.effects import CATALOGUE
+
+ROOM = Path(nonlinear.__file__).parent
+MADE = {
+    "columns.py": columns_source,
+    "simulator/laws.py": laws_source,
+    "simulator/terms.py": terms_source,
+}
+STORED = ("plant/nonlinear/simulator", "gap/follow")  # whose compiled functions call the laws
+
+
+def main() -> None:
+    """Write each file; the page is made by another process, which has the new columns."""
+    for name, source in MADE.items():
+        write_file(ROOM / name, source(CATALOGUE))
+    files = [str(ROOM / name) for name in MADE]
+    subprocess.run([sys.executable, "-m", "ruff", "format", "--quiet", *files], check=True)
+    for room in STORED:
+        for stored in (ROOM.parents[1] / room / "__pycache__").glob("*.nb[ic]"):
+            stored.unlink()
+    subprocess.run([sys.executable, "-m", "docs.effects_page"], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,172 @@
+"""Interventions: stretches in which a force that nobody measured, such as a hand, moves a cart.
+
+The force that a law of motion does not explain bursts where a hand acts. An effect that the law
+lacks shows as well, but it shows again and again: in proportion to the motion, wherever position,
+stretch, speed and input are the same. A knock of two bodies is over in an instant. So a burst is
+a hand if it lasts, moves the cart, and acts in a state in which the law holds at other times.
+"""
+
+from collections.abc import Sequence, Set
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
+
+from pipeline.arrays import Array
+from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA
+from pipeline.results_of_runs import Intervention, Record
+
+_BULK = 2.0  # standard deviations, as in the law's fit
+_FAR, _BEGINS = 4.0, 1.5  # times the bulk: of a burst, and where it begins and ends
+_SHARE, _TYPICAL = 0.3, 3.0  # of what acts on the cart; times what the law leaves elsewhere
+_AROUND = 0.15  # s, before and after: what acts at that time
+_REACH = 0.02  # s to each side of its middle: what a window sees most of
+_GAP = 0.1  # s: nearer bursts are one
+_LASTS = 0.06  # s above half its peak; a knock has 0.04, the width of a window
+_KNOWN = 0.03  # s of a burst in a state that is known
+_SWINGS = 3  # times that the force of a hand changes sides: an effect's does so all the time
+_INSTANT = 0.03  # s: nobody pushes twice at the same time to within that
+_BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
+
+
+def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
+    """Return where a hand acts on a free cart, by record, cart and time.
+
+    Runs under feedback are not looked at: what drove their motor is often not what was logged.
+    """
+    open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
+    carts = sorted({cart for r in open_loop for cart in r.free if cart in r.carts})
+    found = [one for cart in carts for one in _bursts(cart, open_loop)]
+    order = [record.id for record in open_loop]
+    return tuple(sorted(found, key=lambda one: (order.index(one.experiment), one.cart, one.start)))
+
+
+def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
+    """Return what a record shows before, between and after the interventions, piece by piece."""
+    touched = np.zeros(record.t.size, dtype=np.bool_)
+    for one in interventions:
+        if one.experiment == record.id:
+            touched |= (record.t >= one.start) & (record.t <= one.end)
+    if not touched.any():
+        return [record]
+    pieces = []
+    for first, last in _runs(~touched):
+        part = slice(first, last + 1)
+        pieces.append(
+            replace(
+                record,
+                t=record.t[part],
+                u=None if record.u is None else record.u[part],
+                y=record.y[:, part],
+                reference=None if record.reference is None else record.reference[part],
+            )
+        )
+    return pieces
+
+
+def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
+    forces, size = forces_left(cart, records)
+    if not forces:
+        return []
+    shares = [_share(force, size) for force in forces]
+    usual = np.concatenate([s[f.follows] for s, f in zip(shares, forces, strict=True)])
+    least = max(_SHARE, _TYPICAL * float(np.quantile(usual, 0.75)))
+    found = []
+    for force, share, known in zip(forces, shares, _known(forces, size), strict=True):
+        left = np.abs(force.left)
+        bulk = size
+        if force.follows.any():  # a record that does not follow the law cannot show a hand
+            own = _BULK * MEDIAN_TO_SIGMA * float(np.median(left[force.follows]))
+            bulk = max(size, own)
+        strong = (left > _FAR * bulk) & (share > least) & ~force.jumps
+        above = left > _BEGINS * bulk
+        times = np.concatenate([force.record.t[:1], force.t[1:-1], force.record.t[-1:]])
+        for first, last in _stretches(above, force.t):
+            inside = slice(first, last + 1)
+            beyond = np.where(above[inside], force.left[inside], 0.0)
+            if _is_hand(beyond, strong=strong[inside], known=known[inside]):
+                found.append(
+                    Intervention(
+                        experiment=force.record.id,
+                        cart=cart,
+                        start=max(float(times[first]) - _REACH, float(times[0])),
+                        end=min(float(times[last]) + _REACH, float(times[-1])),
+                    )
+                )
+    driven = {record.id for record in records if record.u is not None and np.any(record.u)}
+    return [one for one in found if not (one.experiment in driven and _recurs(one, found, driven))]
+
+
+def _recurs(one: Intervention, found: Sequence[Intervention], driven: Set[str]) -> bool:
+    """Tell whether it happens at the same instant in another driven run: no hand is as exact."""
+    return any(
+        abs(one.start - other.start) < _INSTANT
+        for other in found
+        if other.experiment != one.experiment and other.experiment in driven
+    )
+
+
+def _share(force: ForceLeft, size: float) -> Array:
+    """Return how much of what acts on the cart about that time the law leaves."""
+    acting = maximum_filter1d(force.acting, 2 * round(_AROUND / HOP) + 1)
+    return np.abs(force.left) / (acting + size)
+
+
+def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
+    """Return for each window whether the law holds wherever the cart is in such a state.
+
+    Position, stretches, velocity and input are looked at one by one: most windows at about the
+    same value must be quiet. A cart that rests without an input can be held by friction
+    only, whatever the state.
+    """
+    state = np.concatenate([force.state for force in forces], axis=1)
+    follows = np.concatenate([force.follows for force in forces])
+    quiet = np.concatenate([(np.abs(f.left) < _BEGINS * size) & f.moves for f in forces])
+    known = np.ones(follows.size, dtype=np.bool_)
+    for values in state:
+        low, high = values[follows].min(), values[follows].max()
+        if high <= low:
+            continue
+        at = np.floor((values - low) / (high - low) * _BINS).astype(int)
+        inside = (at >= 0) & (at <= _BINS)
+        at = np.clip(at, 0, _BINS)
+        visits = np.bincount(at[follows], minlength=_BINS + 1)
+        calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
+        known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
+    bounds = np.cumsum([0, *(force.t.size for force in forces)])
+    # A window sees a little of its neighbours.
+    parts = [
+        minimum_filter1d(known[first:stop].astype(int), 3) > 0 for first, stop in pairwise(bounds)
+    ]
+    return [part | force.idle for part, force in zip(parts, forces, strict=True)]
+
+
+def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
+    """Return first and last window of each stretch, those with a short gap between them as one."""
+    found: list[tuple[int, int]] = []
+    for first, last in _runs(above):
+        if found and t[first] - t[found[-1][1]] < _GAP:
+            found[-1] = (found[-1][0], last)
+        else:
+            found.append((first, last))
+    return found
+
+
+def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the first and the last of each run of what holds."""
+    edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
+    return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _is_hand(left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_]) -> bool:
+    """Tell whether a burst, `left` being nothing below its beginning, is a hand."""
+    swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
+    lasts = understood = 0
+    for first, last in _runs(strong):
+        burst = np.abs(left[first : last + 1])
+        lasts += np.count_nonzero(burst > 0.5 * burst.max())
+        understood += np.count_nonzero(known[first : last + 1])
+    return bool(swings <= _SWINGS and lasts * HOP >= _LASTS and understood * HOP >= _KNOWN)

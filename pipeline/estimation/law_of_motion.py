@@ -1,0 +1,230 @@
+"""The law of motion of one cart, read off all records at once, and the force that it leaves.
+
+The acceleration of the cart by positions, velocities and input, with dry friction and drag, over
+short windows: linear in what is unknown, so that nothing is simulated and nothing searched. The
+loss lets go of what does not follow the law.
+
+Reference: S. Geman and D. E. McClure, Bull. Int. Statistical Institute 52 (1987) 5-21 (the loss).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter1d
+
+from pipeline.arrays import Array
+from pipeline.estimation.modulating import bump_integral, window_weights
+from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
+from pipeline.results_of_runs import Record
+
+HOP = 0.01  # s from window to window
+_WINDOW = 0.1  # s; the middle 0.04 s weigh most
+_FEWEST = 9  # samples in a window
+_AT_ONCE = 1000  # windows; more would need much memory in long recordings
+_MOVES = 3.0  # smallest changes in a window: with less the cart rests
+_LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
+_JUMP = 0.3  # of the input's range from one sample to the next
+_STATIC = 3.0  # times dry friction in motion: what may hold a cart at rest
+# Columns of the law: rest and gain of a record, positions, inputs; dampers, drag, braking; dry
+# friction, alone and in proportion to the input.
+_OWN, _POSITION = 2, 3
+_SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
+_ROUNDS, _SETTLED = 30, 1e-3  # of weighing anew; relative change of the bulk that ends it
+_SINGULAR = 1e-12  # of the normal equations: what is less is nothing
+_PER_UNKNOWN = 3  # windows, at least
+_BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ForceLeft:
+    """The force on one cart in one record that the law does not explain, over windows at `t` (n,).
+
+    Attributes
+    ----------
+    left : (n,) acceleration that the law does not explain; in a cart at rest, that friction
+        does not hold either.
+    acting : (n,) size of the acceleration, or of what springs and input ask for, if larger.
+    state : (5, n) position about the rest, stretches of both springs, velocity, input.
+    moves : the cart moves; `jumps`: so does the input, suddenly, in the window or just before.
+    idle : (n,) the cart rests without an input.
+    """
+
+    record: Record
+    t: Array
+    left: Array
+    acting: Array
+    state: Array
+    moves: NDArray[np.bool_]
+    jumps: NDArray[np.bool_]
+    idle: NDArray[np.bool_]
+
+    @property
+    def follows(self) -> NDArray[np.bool_]:
+        """(n,) where the law should hold."""
+        return self.moves & ~self.jumps
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Windows:
+    """Means over windows (n,) of one record: `x`, `v` (3, n) of the cart between its neighbours."""
+
+    record: Record
+    t: Array
+    x: Array
+    v: Array
+    acceleration: Array
+    u: Array
+    on: Array
+    noise: float
+    moves: NDArray[np.bool_]
+    jumps: NDArray[np.bool_]
+
+    def columns(self, *, driven: bool) -> Array:
+        """Return (n, unknowns) the columns of the law: those of `_SPRINGS`, `_DAMPERS`, `_DRY`.
+
+        Each record has a rest of its own, and a gain: a drive does not treat all levels alike.
+        """
+        v, u = self.v[1], driven * self.u
+        # Within a window in which the cart turns, it goes this way for longer.
+        turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
+        side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
+        rest = np.ones(v.size)
+        dampers = [*self.v, np.abs(v) * v, v * self.on]
+        dry = [side, side * np.abs(self.u[0])]
+        return np.array([rest, u[0], *self.x, *u, *dampers, *dry]).T
+
+
+def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], float]:
+    """Return the force in each record that one law of a cart does not explain, and its usual size.
+
+    Records in which a free neighbour was not measured are left out. The list is empty if the cart
+    moves too little to fit the law.
+    """
+    cut = [_cut(record, cart) for record in records if cart in record.free]
+    windows = [one for one in cut if one is not None]
+    if not windows:
+        return [], 0.0
+    columns = [one.columns(driven=cart == 1) for one in windows]
+    usable = [one.moves & ~one.jumps for one in windows]
+    parts = [(c[use], w.acceleration[use])
+             for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
+    unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
+    if sum(target.size for _, target in parts) < _PER_UNKNOWN * unknowns:
+        return [], 0.0
+    laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
+    found = []
+    for one, column, law in zip(windows, columns, laws, strict=True):
+        asked = column[:, _SPRINGS] @ law[_SPRINGS]
+        free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
+        rubs, by_load = np.abs(law[_DRY])
+        holds = _STATIC * (rubs + by_load * np.abs(one.u[0]))
+        at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
+        offset, stiffness = law[0], -law[_POSITION]
+        rest = offset / stiffness if stiffness * np.ptp(one.x[1]) > size else 0.0
+        found.append(
+            ForceLeft(
+                record=one.record,
+                t=one.t,
+                left=np.where(one.moves, free - column[:, _DRY] @ law[_DRY], at_rest),
+                acting=np.maximum(np.abs(one.acceleration), np.abs(asked)),
+                state=np.array([one.x[1] - rest, *np.diff(one.x, axis=0), one.v[1], one.u[0]]),
+                moves=one.moves,
+                jumps=one.jumps,
+                idle=~one.moves & ~np.any(one.u, axis=0),
+            )
+        )
+    return found, size
+
+
+def _cut(record: Record, cart: int) -> _Windows | None:
+    """Return a record in windows, or None where it does not serve."""
+    neighbours = (cart - 1, cart, cart + 1)
+    if any(c in record.free and c not in record.carts for c in neighbours):
+        return None
+    t, interval = record.t, record.sample_time
+    width = max(round(_WINDOW / interval) + 1, _FEWEST)
+    if width >= t.size:
+        return None
+    first = np.arange(0, t.size - width + 1, max(1, round(HOP / interval)))
+    still = np.zeros(t.size)
+    around = np.array([record.position(c) if c in record.carts else still for c in neighbours])
+    y, u = around[1], still if record.u is None else record.u
+    inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
+    parts = np.array_split(first, -(-first.size // _AT_ONCE))
+    means = np.hstack([_means(t, around, inputs, part[:, None] + np.arange(width))
+                       for part in parts])  # fmt: skip
+    step = grain(t, y, step=record.encoder_step(cart))
+    reach = round(_LAGS[-1] / interval) + 1
+    jump = np.abs(np.diff(u, prepend=u[0])) > _JUMP * np.ptp(u)
+    lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
+    return _Windows(
+        record=record,
+        t=means[0],
+        x=means[1:4],
+        v=means[4:7],
+        acceleration=means[7],
+        u=means[8:11],
+        on=means[11],
+        noise=float(np.median(means[12])) * step / np.sqrt(12.0),
+        moves=means[13] > _MOVES * step,
+        jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
+    )
+
+
+def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
+    """Return (14, n) means over the windows whose samples are `at` (n, samples).
+
+    Time, positions, velocities, acceleration, inputs; how the acceleration scales white noise,
+    and by how much the reading moves.
+    """
+    local = t[at]
+    w, w1, w2 = window_weights(local)
+    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
+    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
+    return np.array(
+        [
+            (w * local).sum(1),
+            *((w * x[at]).sum(1) for x in around),
+            *(-(w1 * x[at]).sum(1) for x in around),
+            (w2 * around[1][at]).sum(1),
+            *((held * u[at[:, :-1]]).sum(1) for u in inputs),
+            np.linalg.norm(w2, axis=1),
+            np.ptp(around[1][at], axis=1),
+        ]
+    )
+
+
+def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:
+    """Return the law that the bulk of the windows follows, by record, and the size of the rest.
+
+    Parameters
+    ----------
+    parts : columns (windows, unknowns) and accelerations (windows,) of each record; the first
+        columns belong to the record alone.
+    """
+    shared = parts[0][0].shape[1] - _OWN
+    behind = np.arange(_OWN * len(parts), _OWN * len(parts) + shared)
+    places = [np.append(np.arange(_OWN * k, _OWN * (k + 1)), behind) for k in range(len(parts))]
+    count = _OWN * len(parts) + shared
+    power = np.zeros(count)
+    for (columns, _), place in zip(parts, places, strict=True):
+        power[place] += (columns**2).sum(axis=0)
+    scale = 1.0 / np.sqrt(np.where(power > 0.0, power, np.inf))
+    weights, bulk, law = [np.ones(target.size) for _, target in parts], np.inf, np.zeros(count)
+    for _ in range(_ROUNDS):
+        H, b = np.zeros((count, count)), np.zeros(count)
+        for (columns, target), place, weight in zip(parts, places, weights, strict=True):
+            weighed = columns.T * weight**2
+            H[np.ix_(place, place)] += weighed @ columns
+            b[place] += weighed @ target
+        law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=_SINGULAR)[0]
+        left = [target - columns @ law[place]
+                for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip
+        before = bulk
+        bulk = max(_BULK * MEDIAN_TO_SIGMA * float(np.median(np.abs(np.concatenate(left)))), least)
+        if abs(bulk - before) < _SETTLED * bulk:
+            break
+        weights = [1.0 / (1.0 + (one / bulk) ** 2) for one in left]
+    return [law[place] for place in places], bulk

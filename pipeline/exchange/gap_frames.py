@@ -1,0 +1,84 @@
+"""What the linear carts leave out as pandas tables, their columns named as in `gap.json`."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.document import gap_json
+from pipeline.gap.types import Gap
+from pipeline.results import Analysis
+
+if TYPE_CHECKING:
+    import pandas as pd  # a fifth of a second: imported where it is used
+
+_EFFECT = (
+    "effect", "where", "parameters", "details", "confidence", "nrmse_before", "nrmse_after",
+    "rivals",
+)  # fmt: skip
+_PARAMETER = ("effect", "cart", "spring", "parameter", "value", "std", "unit")
+_LEFT = ("experiment", "time", "cart", "position", "velocity", "input", "force")
+
+
+def effects(gap: Gap) -> "pd.DataFrame":
+    """Return one row an effect, in the order found."""
+    import pandas as pd
+
+    return pd.DataFrame(gap_json(gap)["effects"], columns=list(_EFFECT))
+
+
+def parameters(gap: Gap) -> "pd.DataFrame":
+    """Return one row a parameter; `cart` or `spring` is where its effect acts."""
+    import pandas as pd
+
+    rows = [
+        {"effect": found.effect.key, **found.where, "parameter": name, "value": value.value,
+         "std": value.std, "unit": value.unit}
+        for found in gap.effects
+        for name, value in (found.parameters | found.details).items()
+    ]  # fmt: skip
+    frame = pd.DataFrame(rows, columns=list(_PARAMETER))
+    return frame.astype({"cart": "Int64", "spring": "Int64", "std": float})
+
+
+def simulated(gap: Gap, experiment: str) -> "pd.DataFrame":
+    """Return a recording by `time`: measured, and simulated by both models, for each cart."""
+    import pandas as pd
+
+    columns: dict[tuple[str, str], pd.Series] = {}
+    for what, name in (("measured", "measured"), ("baseline", "linear"), ("final", "with_effects")):
+        by_cart: dict[int, list[tuple[Array, Array]]] = {}
+        for trace in gap.traces:
+            if trace.experiment == experiment:
+                by_cart.setdefault(trace.cart, []).append((trace.t, getattr(trace, what)))
+        for cart, pieces in sorted(by_cart.items()):
+            t, y = (np.concatenate(parts) for parts in zip(*pieces, strict=True))
+            columns[name, f"x{cart}"] = pd.Series(y, index=pd.Index(t, name="time")).sort_index()
+    return pd.DataFrame(columns)
+
+
+def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
+    """Return the force that the model does not explain, one row a cart and short window."""
+    import pandas as pd
+
+    parts = [
+        pd.DataFrame(
+            {
+                "experiment": one.experiment,
+                "time": one.mean(one.t),
+                "cart": one.cart,
+                "position": one.mean(one.x),
+                "velocity": one.mean(one.v),
+                "input": one.mean(one.u),
+                "force": one.force,
+            }
+        )
+        for one in gap.left_forces
+    ]
+    frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(_LEFT))
+    position, drive = analysis.position_unit, analysis.input_unit
+    frame.attrs["units"] = {
+        "time": "s", "position": position, "velocity": f"{position}/s", "input": drive,
+        "force": drive,
+    }  # fmt: skip
+    return frame

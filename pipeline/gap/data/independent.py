@@ -1,0 +1,20 @@
+"""How many readings of a residual tell as much as independent ones."""
+
+import numpy as np
+
+from pipeline.arrays import Array
+
+
+def independent(residual: Array) -> float:
+    """Return the number of independent readings that a residual (samples,) is worth.
+
+    Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a mean
+    square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²). That is of what swings: on
+    no spring errors add up, and the correlation of a drift says nothing of what is new in it.
+    """
+    power = np.abs(np.fft.rfft(residual - residual.mean(), 2 * residual.size)) ** 2
+    covariance = np.fft.irfft(power)[: residual.size]
+    if covariance[0] <= 0.0:
+        return float(residual.size)
+    correlation = covariance[1:] / covariance[0]
+    return residual.size / (1.0 + 2.0 * float((correlation**2).sum()))

@@ -1,0 +1,161 @@
+"""Choose the laws: all at once from nothing, then those of a shape, then drop what is nothing."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.gap import limits
+from pipeline.gap.follow import forces
+from pipeline.gap.follow.drop import criterion, drop_needless, is_better, is_rough
+from pipeline.gap.follow.fit import Follow, start_follow
+from pipeline.gap.follow.laws import Bench, Law, smooth_laws
+from pipeline.gap.follow.records import Records
+from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
+from pipeline.plant.linear.chain import Chain
+
+CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
+_NEAR_FREE = 0.02
+_FIRST = 25  # iterations of the first fit, from a chain that may be far off
+_FEW = 6  # … and of one that shows whether a rival comes near
+_SHORT_LIST = 4  # of laws with a shape, refitted
+_HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
+_ROUNDS = 6  # of adding one of them: a real bench has several
+
+
+def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
+    """Return the model with all laws that need no shape, fitted from nothing.
+
+    It starts from each of the `chains`.
+    """
+    tracks = records.tracks
+    largest = max(float(np.abs(track.command).max()) for track in tracks)
+    free = tuple(tuple(track.free.tolist()) for track in tracks)
+    pinned = int(np.argmax(np.any(free, axis=0))) if largest == 0.0 else None
+    starts = []
+    for chain in chains:
+        bench = Bench(
+            chain=chain, springs=tuple(springs), largest=largest, free=free, pinned=pinned
+        )
+        laws = smooth_laws(bench, columns=records.columns)
+        starts.append(
+            start_follow(laws, laws.start(chain), tracks, gain=CLOSE, mapper=records.mapper)
+        )
+    fits = [records.fit(start, iterations=_FIRST) for start in starts]
+    return records.fit(min(fits, key=lambda follow: follow.total), gain=LOOSE)
+
+
+def choose_laws(
+    records: Records,
+    *,
+    springs: Sequence[bool],
+    chains: Sequence[Chain],
+    tell: Callable[[str], None] = lambda text: None,
+) -> Follow:
+    """Return the model that following finds: the laws that are left, fitted to free runs."""
+    full = start_all(records, springs=springs, chains=chains)
+    lean = let_go(full, records)
+    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
+    for _ in range(_ROUNDS):
+        if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
+            break
+        more = add_shaped(full, records)
+        if more is None:
+            break
+        leaner = let_go(more, records)
+        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
+        full = more
+        if leaner.gain < lean.gain or is_better(leaner, lean):
+            lean = leaner
+    return lean
+
+
+def add_shaped(follow: Follow, records: Records) -> Follow | None:
+    """Return the model with one more law that has a shape, or None where none helps."""
+    best: Follow | None = None
+    trials = [one.law for one in shaped_trials(follow, records)[:_SHORT_LIST]]
+    for law in (*trials, *backlash_laws(follow, records)):
+        laws, p = follow.laws.with_laws(follow.p, [law])
+        trial = records.refit(follow, laws, p, iterations=8)
+        if best is None or criterion(trial, follow.news) < criterion(best, follow.news):
+            best = trial
+    if best is None or not is_better(best, follow):
+        return None
+    # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
+    if is_rough(follow) and best.total > _half_way(follow):
+        return None
+    return best
+
+
+def _half_way(follow: Follow) -> float:
+    """Return the cost that leaves half of what is beyond the noise."""
+    return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
+
+
+def let_go(full: Follow, records: Records) -> Follow:
+    """Drop what is nothing, then loosen the gain to none, dropping again.
+
+    Where a looser model leaves more, something is missing: what it leaves then swings with the
+    carts, and would ask for laws that are not there.
+    """
+    lean = _one_friction(drop_needless(full, records), records)
+    for gain in (_NEAR_FREE, FREE):
+        loose = records.fit(lean, gain=gain)
+        if not loose.chi < _HOLDS * max(lean.chi, limits.AT_FLOOR):
+            break
+        lean = drop_needless(loose, records)
+    return _look_again(lean, records) if lean.gain == FREE else lean
+
+
+def _look_again(lean: Follow, records: Records) -> Follow:
+    """Fit all laws once more, now that a free run shows what adds up; drop what is nothing."""
+    everything = smooth_laws(lean.laws.bench, columns=records.columns)
+    missing = [key for key in everything.keys if key not in lean.laws.keys]
+    extra = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
+    laws, p = replace(lean.laws, drive=everything.drive).with_laws(lean.p, extra)
+    again = records.refit(lean, laws, p, iterations=_FEW)
+    again = _one_friction(drop_needless(again, records), records)
+    return again if is_better(again, lean) else lean
+
+
+def _one_friction(follow: Follow, records: Records) -> Follow:
+    """Leave each cart one law of dry friction where it has two that exclude each other."""
+    for place in range(follow.laws.bench.n):
+        here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
+        sides = [
+            [i for i in here if follow.laws.keys[i][0] in kinds]
+            for kinds in ((forces.COULOMB, forces.STRIBECK), (forces.DAHL,))
+        ]
+        if all(sides):
+            trials = [
+                records.refit(follow, *follow.laws.without(follow.p, groups)) for groups in sides
+            ]
+            follow = min(trials, key=lambda one: one.total)
+    return follow
+
+
+def rivals_of(lean: Follow, records: Records) -> list[Follow]:
+    """Return models with one law exchanged for another, fitted as fully, the best first."""
+    everything = smooth_laws(lean.laws.bench, columns=records.columns)
+    out: list[Follow] = []
+    for group in lean.laws.groups():
+        laws, p = lean.laws.without(lean.p, [group])
+        bare = records.refit(lean, laws, p, gain=LOOSE, iterations=_FEW)
+        gone = lean.laws.keys[group] if group >= 0 else None
+        taken = {gone, *laws.keys}
+        plain = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
+        trials = [*score(bare, records, plain), *shaped_trials(bare, records)]
+        trials = sorted(
+            (one for one in trials if one.law.key not in taken), key=lambda one: -one.drop
+        )
+        exchanged = [laws.with_laws(bare.p, [one.law]) for one in trials[:_SHORT_LIST]]
+        for q, free in enumerate(everything.drive):
+            if free and not laws.drive[q] and group != -1 - q:
+                drive = tuple(f or i == q for i, f in enumerate(laws.drive))
+                exchanged.append((replace(laws, drive=drive), bare.p))
+        out += [
+            _one_friction(records.refit(bare, *model, iterations=_FEW), records)
+            for model in exchanged
+        ]
+    near = sorted((one for one in out if np.isfinite(one.cost)), key=lambda one: one.total)
+    return [records.fit(one, gain=lean.gain) for one in near[:_SHORT_LIST]]

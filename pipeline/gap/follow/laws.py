@@ -1,0 +1,338 @@
+"""Which laws a following model has, and its parameters as one vector in physical units."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.follow import forces
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.effects.law import Force, Friction
+from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS
+from pipeline.plant.nonlinear.tables import TABLES, Drive
+
+_CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go
+_REACH = 0.3  # of a mass or spring, in one step, …
+_SMALL = 0.1  # … or of this share of the largest, from which on a first estimate is believed
+_DELAY = (-0.05, 0.1)  # s
+_LONGEST_LAG = 0.3  # s
+_LEAST_LIMIT = 0.2  # of the largest input
+_SHORT = 0.01  # s: how far a delay or lag may go in one step
+_CONTACT = 40.0  # of cart 1's springs
+_BOUNCE = (0.02, 0.9)  # of the speed, behind a contact
+_SLACK = 0.95  # of a spring that goes slack, at most
+# By kind, the order of the catalogue: in which coordinates each grows from nothing.
+GROWTHS = tuple(effect.grown for effect in CATALOGUE)
+SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
+POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
+DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
+SIDED = (forces.STOP, forces.SLACK)  # with a position whose sign is the side
+# The columns of the simulator's tables that the laws fill.
+COLUMNS = tuple(
+    tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
+)
+# The laws that need no shape: they can start from nothing.
+PLAIN = tuple(
+    kind
+    for kind, effect in enumerate(CATALOGUE)
+    if isinstance(effect.law, Force | Friction) and len(COEFFICIENTS[kind]) == SIZES[kind]
+)
+Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
+DRIVE_COLUMNS = (
+    Drive.DEAD_ZONE_WIDTH,
+    Drive.SATURATION_LIMIT,
+    Drive.INPUT_DELAY_DELAY,
+    Drive.ACTUATOR_LAG_TIME_CONSTANT,
+)
+DEAD_ZONE, LIMIT, DELAY, LAG = range(forces.DRIVE)
+
+
+def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
+    """Return columns as a set, each with its table."""
+    return frozenset((type(column), int(column)) for column in columns)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Law:
+    """A law at a cart or spring (from 0), with the values of its parameters."""
+
+    kind: int
+    place: int
+    values: tuple[float, ...]
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Kind and place."""
+        return self.kind, self.place
+
+    @property
+    def sided(self) -> tuple[int, int, float]:
+        """Kind, place and, where it has one, side."""
+        return self.kind, self.place, float(np.sign(self.values[1]) if self.kind in SIDED else 0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Bench:
+    """What bounds the laws on one bench.
+
+    Attributes
+    ----------
+    chain : the first estimate; springs (n + 1,) which there are.
+    largest : of the input, 0 where there is none.
+    free : which carts move, by run.
+    pinned : the mass that sets the scale where no input does.
+    """
+
+    chain: Chain
+    springs: tuple[bool, ...]
+    largest: float
+    free: tuple[tuple[bool, ...], ...]
+    pinned: int | None = None
+
+    @cached_property
+    def shown(self) -> tuple[bool, ...]:
+        """(n,) which carts move in any run."""
+        return tuple(any(moves) for moves in zip(*self.free, strict=True))
+
+    @cached_property
+    def rows(self) -> tuple[int, ...]:
+        """The springs that any run shows; of those that always stretch alike, one."""
+        shown: dict[tuple, int] = {}
+        for j in (j for j, there in enumerate(self.springs) if there):
+            ends = [i for i in (j - 1, j) if 0 <= i < self.n]
+            moving = tuple(tuple(i for i in ends if run[i]) for run in self.free)
+            if any(moving):
+                shown.setdefault(moving, j)
+        return tuple(shown.values())
+
+    @property
+    def n(self) -> int:
+        """Number of carts."""
+        return self.chain.n
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Laws:
+    """Which laws act: the shape of the vector `p`.
+
+    It holds masses, dampings, springs (n + 1), the four values of the drive, then each law's.
+    """
+
+    bench: Bench
+    keys: tuple[tuple[int, int], ...]
+    drive: tuple[bool, ...]  # which of its laws are free
+
+    @cached_property
+    def kinds(self) -> np.ndarray:
+        """(laws,) the kind of each."""
+        return np.array([kind for kind, _ in self.keys], dtype=np.int64)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """(laws,) the cart or spring of each, from 0."""
+        return np.array([place for _, place in self.keys], dtype=np.int64)
+
+    @cached_property
+    def base(self) -> int:
+        """Parameters of chain and drive."""
+        return 3 * self.bench.n + 1 + forces.DRIVE
+
+    @cached_property
+    def first(self) -> np.ndarray:
+        """(laws,) where the parameters of each begin."""
+        sizes = [SIZES[kind] for kind, _ in self.keys]
+        return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
+
+    @cached_property
+    def size(self) -> int:
+        """How long the vector is."""
+        return self.base + sum(SIZES[kind] for kind, _ in self.keys)
+
+    @cached_property
+    def dry(self) -> np.ndarray:
+        """(n,) on which carts dry friction acts."""
+        there = {place for kind, place in self.keys if kind in DRY}
+        return np.array([i in there for i in range(self.bench.n)])
+
+    @property
+    def drive_at(self) -> int:
+        """Where the values of the drive begin."""
+        return 3 * self.bench.n + 1
+
+    def neutral_drive(self) -> Array:
+        """Return the values of a drive without any law."""
+        return np.array([0.0, self.bench.largest, 0.0, 0.0])
+
+    def start(self, chain: Chain) -> Array:
+        """Return the vector of a chain without any law, no mass or spring next to nothing."""
+        p = np.zeros(self.size)
+        n = self.bench.n
+        p[:n] = np.maximum(chain.m, _SMALL * chain.m.max())
+        p[n : 2 * n] = chain.c
+        p[2 * n : 3 * n + 1] = np.maximum(chain.k, _SMALL * chain.k.max())
+        p[2 * n + np.flatnonzero(~np.array(self.bench.springs))] = 0.0
+        p[self.drive_at : self.base] = self.neutral_drive()
+        return p
+
+    def chain(self, p: Array) -> Chain:
+        """Return the chain in a vector."""
+        n = self.bench.n
+        k = p[2 * n : 3 * n + 1].copy()
+        return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=k)
+
+    def bounds(self) -> tuple[Array, Array, Array]:
+        """Return lower and upper bounds, and the largest steps."""
+        n, chain = self.bench.n, self.bench.chain
+        low, high = np.full(self.size, -np.inf), np.full(self.size, np.inf)
+        reach = np.full(self.size, np.inf)
+        for at, value in ((slice(0, n), chain.m), (slice(2 * n, 3 * n + 1), chain.k)):
+            most = value.max()
+            low[at], high[at] = _CHAIN[0] * most, _CHAIN[1] * most
+            reach[at] = _REACH * np.maximum(value, _SMALL * most)
+        missing = 2 * n + np.flatnonzero(~np.array(self.bench.springs))
+        low[missing] = high[missing] = 0.0
+        if self.bench.pinned is not None:
+            low[self.bench.pinned] = high[self.bench.pinned] = chain.m[self.bench.pinned]
+        if n == 1 and all(self.bench.springs):  # both wall springs act as one
+            low[3] = high[3] = chain.k[1]
+        low[n : 2 * n] = 0.0
+        d, largest = self.drive_at, max(self.bench.largest, 1e-12)
+        low[d : d + 4] = (0.0, _LEAST_LIMIT * largest, _DELAY[0], 0.0)
+        high[d : d + 4] = (0.9 * largest, largest, _DELAY[1], _LONGEST_LAG)
+        reach[d : d + 4] = (0.1 * largest, 0.1 * largest, _SHORT, _SHORT)
+        neutral = self.neutral_drive()
+        for q, free in enumerate(self.drive):
+            if not free:
+                low[d + q] = high[d + q] = neutral[q]
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            if kind in POSITIVE:
+                low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
+            if kind == forces.SLACK:
+                low[o] = -_SLACK * max(chain.k[place], _SMALL * chain.k.max())
+            elif kind == forces.GAIN:
+                low[o], high[o] = -0.5, 0.5
+        return low, high, reach
+
+    def steps_of_shape(self, p: Array) -> tuple[Array, Array, Array]:
+        """Return bounds and steps with the shapes of the laws kept near where they are."""
+        low, high, reach = self.bounds()
+        for (kind, _), o in zip(self.keys, self.first, strict=True):
+            for q in range(SIZES[kind]):
+                if q in COEFFICIENTS[kind]:
+                    continue
+                value = abs(p[o + q])
+                reach[o + q] = 0.15 * value
+                side = 1.0 if p[o + q] >= 0 else -1.0
+                low[o + q], high[o + q] = sorted((side * 0.02 * value, side * 50.0 * value))
+        return low, high, reach
+
+    def with_laws(self, p: Array, extra: Sequence[Law]) -> tuple["Laws", Array]:
+        """Return the laws and vector with more of them."""
+        laws = Laws(
+            bench=self.bench, keys=(*self.keys, *(law.key for law in extra)), drive=self.drive
+        )
+        return laws, np.concatenate([p, *(law.values for law in extra)])
+
+    def without(self, p: Array, groups: Sequence[int]) -> tuple["Laws", Array]:
+        """Return the laws and vector without some groups: laws by index, drive from -1 to -4."""
+        kept = [i for i in range(len(self.keys)) if i not in groups]
+        drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
+        laws = Laws(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
+        base = p[: self.base].copy()
+        for q, value in enumerate(self.neutral_drive()):
+            if not drive[q]:
+                base[self.drive_at + q] = value
+        parts = [p[self.first[i] : self.first[i] + SIZES[self.keys[i][0]]] for i in kept]
+        return laws, np.concatenate([base, *parts])
+
+    def groups(self) -> dict[int, np.ndarray]:
+        """Return what may be dropped: by its number the indices of its coefficients."""
+        out = {-1 - q: np.array([self.drive_at + q]) for q, free in enumerate(self.drive) if free}
+        for i, ((kind, _), o) in enumerate(zip(self.keys, self.first, strict=True)):
+            out[i] = np.array([o + q for q in COEFFICIENTS[kind]])
+        return out
+
+    def whole_group(self, group: int) -> np.ndarray:
+        """Return the indices of all parameters of a group."""
+        if group < 0:
+            return np.array([self.drive_at - 1 - group])
+        o = self.first[group]
+        return np.arange(o, o + SIZES[self.keys[group][0]])
+
+    def neutral(self) -> Array:
+        """Return the vector's neutral values (0 but for the limit)."""
+        out = np.zeros(self.size)
+        out[self.drive_at + LIMIT] = self.bench.largest
+        return out
+
+    def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
+        """Return, by symbol, the parameters of the friction within a law: 0 where it is not."""
+        law = CATALOGUE[kind].law
+        if not (isinstance(law, Friction) and law.beyond):
+            return {}
+        within = next(i for i, effect in enumerate(CATALOGUE) if effect.key == law.beyond)
+        there = dict(zip(self.keys, self.first, strict=True)).get((within, place))
+        symbols = GROWTHS[within].coordinates
+        return {s: 0.0 if there is None else float(p[there + q]) for q, s in enumerate(symbols)}
+
+    def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
+        """Return what the laws fill of the simulator's tables: by table and row (0 for a drive)."""
+        n = self.bench.n
+        out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}
+        for q, column in enumerate(DRIVE_COLUMNS):
+            if self.drive[q]:
+                out.setdefault((Drive, 0), {})[column] = float(p[self.drive_at + q])
+        for (kind, place), o in zip(self.keys, self.first, strict=True):
+            effect, own = CATALOGUE[kind], self._shared(kind, place, p)
+            if effect.place == "spring":
+                own["k"] = float(p[2 * n + place])
+            own |= zip(GROWTHS[kind].coordinates, p[o : o + SIZES[kind]].tolist(), strict=True)
+            table = TABLES[effect.place]
+            row = out.setdefault((table, 0 if table is Drive else place), {})
+            row.update(effect.columns(effect.grown_values(own)))
+            if kind == forces.BACKLASH:
+                firm, damping = self._contact(p, motor=own["m_m"], bounce=own["e"])
+                row[Drive.BACKLASH_CONTACT_STIFFNESS] = firm
+                row[Drive.BACKLASH_CONTACT_DAMPING] = damping
+        return out
+
+    def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
+        """Return stiffness and damping of a contact from which bodies part as they should.
+
+        What follows is rigid; a bench is not quite. W. Goldsmith, Impact (1960), chapter 4.
+        """
+        firm = _CONTACT * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
+        fall = -float(np.log(np.clip(bounce, *_BOUNCE)))
+        both = motor * max(1.0 - motor / float(p[0]), 0.0)
+        return firm, 2.0 * fall / float(np.hypot(np.pi, fall)) * float(np.sqrt(firm * both))
+
+
+def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:
+    """Return every law that needs no shape, at every place: all to start from nothing.
+
+    `columns` are those that effects may fill.
+    """
+    n, driven = bench.n, bench.largest > 0.0
+
+    def here(place: str) -> list[int]:
+        """Return the kinds of a place that the runs may show."""
+        return [
+            kind
+            for kind in PLAIN
+            if (effect := CATALOGUE[kind]).place == place
+            and (driven or not effect.needs_drive)
+            and not (effect.only_rest and any(bench.springs))
+        ]
+
+    keys = [(kind, i) for i in range(n) if bench.shown[i] for kind in here("cart")]
+    for j in bench.rows:
+        ends = 0 < j < n
+        keys += [(kind, j) for kind in here("spring") if ends or not CATALOGUE[kind].between_carts]
+    keys += [(kind, 0) for kind in here("input")]
+    kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
+    drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
+    return Laws(bench=bench, keys=kept, drive=drive)

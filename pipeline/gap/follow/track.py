@@ -1,0 +1,185 @@
+"""One run as a following model sees it: its readings thinned, its own parameters, its errors."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.data.runs import Run
+from pipeline.gap.follow import forces, kernel
+from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, Bench, Laws
+from pipeline.plant.linear.chain import Chain
+
+_RATE = 100.0  # Hz, at the usual pace: some twenty readings in a swing
+_LONGEST = 2.5e-3  # s, of a step, at the usual pace …
+_FREELY = 0.4  # … times this where the model runs on, and the errors of the steps add up
+_KNOCK = 0.25  # … or this where bodies meet in between
+_FOLLOWS = 0.05  # the gain from which on it does not
+_SURE = 1e6  # weight of what is known
+_START = 0.3  # of the swing: how far a release may be from its first readings
+_SPREAD = 0.05  # of dry friction from run to run
+_FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Own:
+    """What belongs to one run: (n,) zeros, shifts of the start, start velocities, factors."""
+
+    zero: Array
+    shift: Array
+    v0: Array
+    factor: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Track:
+    """One run, thinned: y, weight over noise, and `guided` motion of held carts (samples, n)."""
+
+    t: Array
+    y: Array
+    weight: Array
+    free: np.ndarray
+    seen: np.ndarray
+    guided: Array
+    knots: Array
+    command: Array
+    start: Array
+    slope: Array
+    zero: Array
+    zero_std: Array
+    at_rest: bool
+    start_std: tuple[Array, Array]
+    longest: float
+    swing: float
+
+    @property
+    def points(self) -> float:
+        """How many readings there are, each by its weight."""
+        largest = np.maximum(self.weight.max(axis=0), 1e-300)
+        return float(((self.weight / largest) ** 2).sum())
+
+    def fresh(self) -> Own:
+        """Return the run's own parameters where they are expected."""
+        n = self.free.size
+        return Own(
+            zero=self.zero.copy(), shift=np.zeros(n), v0=self.slope.copy(), factor=np.ones(n)
+        )
+
+    def prior(self, own: Own, dry: np.ndarray) -> tuple[Array, Array]:
+        """Return (4 n,) weights of the priors on its own parameters, and their residuals."""
+        n = self.free.size
+        start = np.full(n, _SURE if self.at_rest else 1.0 / max(_START * self.swing, 1e-12))
+        speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
+        start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
+        factor = np.where(dry, 1.0 / _SPREAD, _SURE)
+        weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
+        off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
+        # An unknown velocity needs some hold, or a run that is followed closely has none.
+        weight[2 * n : 3 * n] = np.maximum(weight[2 * n : 3 * n], 1e-3 / max(self.swing, 1e-12))
+        return weight, weight * np.concatenate(off)
+
+    def moved(self, own: Own, by: Array) -> Own:
+        """Return its own parameters after a step (4 n,)."""
+        zero, shift, v0, factor = by.reshape(4, -1)
+        step = np.clip(factor, -_FACTOR_STEP, _FACTOR_STEP)
+        return Own(
+            zero=own.zero + zero,
+            shift=own.shift + shift,
+            v0=own.v0 + v0,
+            factor=np.clip(own.factor + step, *_FACTORS),
+        )
+
+
+def make_track(run: Run, *, rate: float = _RATE) -> Track:
+    """Thin a run to what a swing needs."""
+    n = run.zero.size
+    sampled = 1.0 / float(np.median(np.diff(run.t)))
+    thin = replace(run, block=max(1, int(sampled * run.pace / rate))).thin
+    y, weight = np.zeros((thin.t.size, n)), np.zeros((thin.t.size, n))
+    seen, free = np.zeros(n, dtype=np.bool_), np.array(run.free)
+    for j, row in enumerate(thin.rows):
+        y[:, row], weight[:, row] = thin.y[j], thin.weight[j] / thin.sigma[j]
+        seen[row] = True
+    return Track(
+        t=np.ascontiguousarray(thin.t),
+        y=y,
+        weight=weight,
+        free=free,
+        seen=seen & free,
+        guided=np.ascontiguousarray(thin.guided.T),
+        knots=np.array(run.knots, dtype=np.float64),
+        command=np.array(run.command, dtype=np.float64),
+        start=np.where(free, run.start, 0.0),
+        slope=np.where(free, 0.0 if run.at_rest else run.slope, 0.0),
+        zero=np.where(free, run.zero, 0.0),
+        zero_std=run.zero_std,
+        at_rest=run.at_rest,
+        start_std=run.start_std,
+        longest=_LONGEST * run.pace,
+        swing=float(run.swing.max()),
+    )
+
+
+def errors_of(
+    laws: Laws, p: Array, track: Track, own: Own, *, gain: float, derive: bool
+) -> tuple[Array, Array] | None:
+    """Return errors (samples, n) and derivatives of the model's readings (lanes, samples, n).
+
+    None where the model runs away. Lanes: the vector, then zeros, shifts, velocities, factors.
+    """
+    n = laws.bench.n
+    lanes = p.size + 4 * n if derive else 0
+    at = laws.drive_at
+    held = _shaped(track, p[at + DEAD_ZONE], p[at + LIMIT])
+    E, J = np.zeros((track.t.size, n)), np.zeros((lanes, track.t.size, n))
+    x = np.where(track.free, track.start - own.zero + own.shift, 0.0)
+    DX, DV = np.zeros((n, lanes)), np.zeros((n, lanes))
+    for i in np.flatnonzero(track.free) if derive else ():
+        DX[i, p.size + i], DX[i, p.size + n + i], DV[i, p.size + 2 * n + i] = -1.0, 1.0, 1.0
+    count = len(laws.keys)
+    aux, DA = np.zeros((count, forces.ROOM)), np.zeros((2 * count, lanes))
+    for law, (kind, place) in enumerate(laws.keys):
+        if kind in (forces.HIDDEN, forces.BACKLASH):
+            aux[law, : forces.OWN] = x[place], own.v0[place]
+            DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
+    room = np.zeros((n, lanes)), np.zeros((n, lanes)), DA, np.zeros((6 + 2 * n, max(n, 4)))
+    longest = track.longest * (1.0 if gain > _FOLLOWS else _FREELY)
+    if forces.BACKLASH in laws.kinds:
+        longest = min(longest, _KNOCK * track.longest)
+    fine = kernel.follow_run(
+        p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.guided, track.t,
+        track.y, track.knots, held, track.command, float(gain), own.zero, own.factor, longest,
+        derive, E, J, x, own.v0.copy(), aux, DX, DV, *room,
+    )  # fmt: skip
+    return (E, J) if fine and np.all(np.isfinite(E)) else None
+
+
+def _shaped(track: Track, dead: float, limit: float) -> Array:
+    """Return (3, 2, knots): the input behind dead zone and limit, its derivatives by them, each …
+
+    … with its integral.
+    """
+    u = track.command
+    sign, past = np.sign(u), np.maximum(np.abs(u) - dead, 0.0)
+    full = past >= limit * (1.0 - 1e-9)
+    out = np.zeros((3, 2, u.size))
+    out[0, 0] = sign * np.minimum(past, limit)
+    out[1, 0] = np.where((np.abs(u) > dead) & ~full, -sign, 0.0)
+    out[2, 0] = np.where(full, sign, 0.0)
+    out[:, 1, 1:] = np.cumsum(out[:, 0, :-1] * np.diff(track.knots), axis=1)
+    return out
+
+
+def compile_follower() -> None:
+    """Follow a record of two readings once, so that it is compiled: seconds, where nobody has."""
+    one, two = np.ones(1), np.array([0.0, 0.01])
+    track = Track(
+        t=two, y=np.zeros((2, 1)), weight=np.ones((2, 1)), free=one > 0.0, seen=one > 0.0,
+        guided=np.zeros((2, 1)), knots=two, command=np.zeros(2), start=np.zeros(1),
+        slope=np.zeros(1), zero=np.zeros(1), zero_std=one, at_rest=True, start_std=(one, one),
+        longest=_LONGEST, swing=1.0,
+    )  # fmt: skip
+    chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
+    bench = Bench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))
+    laws = Laws(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+    errors_of(laws, laws.start(chain), track, track.fresh(), gain=0.0, derive=True)

@@ -1,0 +1,31 @@
+"""How far one simulation of a whole record strays, started from its first readings."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.gap.data.runs import Run
+from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
+from pipeline.gap.types import FreeRun
+
+
+def free_runs(fit: Fit, runs: Sequence[Run], nuisance: Sequence[Nuisance]) -> tuple[FreeRun, ...]:
+    """Return the error of each record, all carts together, in the order of their ids.
+
+    Of what was fitted to a run itself only the encoders' zeros are used. Runs that were cut out of
+    one record count as one.
+    """
+    squares: dict[str, list[Array]] = {}
+    for run, own in zip(runs, nuisance, strict=True):
+        zero = np.where(run.free, own.zero, 0.0)
+        fresh = fresh_nuisance(replace(run, zero=zero))
+        off = run.y - simulate_run(fit, run, fresh)
+        squares.setdefault(run.id, []).append(off.ravel() ** 2)
+    found = []
+    for experiment, parts in sorted(squares.items()):
+        size = float(np.sqrt(np.mean(np.concatenate(parts))))
+        found.append(FreeRun(experiment=experiment, error=size if np.isfinite(size) else None))
+    return tuple(found)

@@ -1,0 +1,110 @@
+"""The force that a model does not explain: where it is, how fast the carts are, what drives them.
+
+The model is started from the measurement again and again and runs freely over a short stretch. In
+the second part of each, what it is off by has the curvature of the force it lacks: an average of
+that force, by modulating functions, in which neither the start nor the noise counts for much.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.polynomial import chebyshev
+
+from pipeline.arrays import Array
+from pipeline.estimation.modulating import window_weights
+from pipeline.gap.data.runs import Run, cut_shots
+from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
+from pipeline.gap.fit.structure import Model
+from pipeline.gap.types import LeftForce
+
+_WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2)  # s, at the usual pace
+_LEAD = 0.5  # of a window: what hides (a lag, a bent bristle) finds its place before one begins
+_DEGREE = 4  # of the polynomial through what a model is off by in a window
+_FEWEST = 9  # samples in a window
+_NOISE = 0.3  # of the force left that noise may make
+_MOVES = 4.0  # noises within which a cart stands still: friction then answers any force
+
+
+def left_forces(
+    model: Model, runs: Sequence[Run], nuisance: Sequence[Nuisance]
+) -> tuple[LeftForce, ...]:
+    """Return the force left on each cart of each run whose neighbours were measured."""
+    found = []
+    for run, own in zip(runs, nuisance, strict=True):
+        best: list[LeftForce] = []
+        for length in _WINDOWS:
+            forces = _of_run(model, run, own, length=length * run.pace)
+            best = [force for force, _ in forces] or best
+            if forces and all(noise < _NOISE * _rms(force.force) for force, noise in forces):
+                break
+        found += best
+    return tuple(found)
+
+
+def _of_run(
+    model: Model, run: Run, own: Nuisance, *, length: float
+) -> list[tuple[LeftForce, float]]:
+    """Return the force left on each cart, by windows of `length` s, and what noise makes of it."""
+    width = round(length / run.record.sample_time) + 1
+    if not _FEWEST <= width <= run.t.size // 3:
+        return []
+    cut = cut_shots(run, length=(1.0 + _LEAD) * length / run.pace)
+    cut = replace(cut, zero=np.where(run.free, own.zero, 0.0))
+    read = simulate_run(model, cut, replace(fresh_nuisance(cut), scatter=own.scatter))
+    first = np.array([end - width for start, end in pairwise(cut.shots) if end - start >= width])
+    windows = first[:, None] + np.arange(width)
+    w, w1, w2 = window_weights(t := cut.t[windows])
+    n, chain = run.zero.size, model.structure.chain(model.theta)
+    x, simulated = np.zeros((n, run.t.size)), np.zeros((n, run.t.size))
+    for j, row in enumerate(run.rows):
+        x[row], simulated[row] = cut.y[j] - own.zero[row], read[j] - own.zero[row]
+    speed = np.concatenate(
+        [np.gradient(simulated[:, a:b], cut.t[a:b], axis=1) for a, b in pairwise(cut.shots)], axis=1
+    )
+    u = np.interp(cut.t, run.knots, run.command) if run.knots.size != run.t.size else run.command
+    off = x - simulated
+    out = []
+    for j, i in enumerate(run.rows):
+        around = {i - 1, i + 1} & {k for k in range(n) if run.free[k]}
+        if not run.free[i] or not around <= set(run.rows):
+            continue
+        own_weight = chain.m[i] * w2 - chain.c[i] * w1 + (chain.k[i] + chain.k[i + 1]) * w
+        force = (own_weight * off[i][windows]).sum(1)
+        for k, spring in ((i - 1, i), (i + 1, i + 1)):
+            if 0 <= k < n:
+                force -= chain.k[spring] * (w * off[k][windows]).sum(1)
+        moves = np.ptp(x[i][windows], axis=1) > _MOVES * run.sigma[j]
+        if not moves.any():
+            continue
+        drift, rate = _smooth(t, off[i][windows])
+        noise = float(np.median(np.std(off[i][windows] - drift, axis=1)))
+        left = LeftForce(
+            experiment=run.id,
+            cart=i + 1,
+            weight=w[moves],
+            t=t[moves],
+            x=(simulated[i][windows] + drift)[moves],
+            v=(speed[i][windows] + rate)[moves],
+            u=(u if i == 0 else 0.0 * u)[windows[moves]],
+            acceleration=(w2 * x[i][windows]).sum(1)[moves],
+            force=force[moves],
+        )
+        out.append((left, noise * float(np.sqrt(np.median((own_weight**2).sum(1))))))
+    return out
+
+
+def _smooth(t: Array, values: Array) -> tuple[Array, Array]:
+    """Return a polynomial through each row of (windows, samples) values, and its derivative."""
+    span = t[:, -1:] - t[:, :1]
+    # The samples are evenly spaced, or nearly so: one basis serves all windows.
+    s = np.linspace(-1.0, 1.0, t.shape[1])
+    basis = chebyshev.chebvander(s, _DEGREE)
+    coefficients = np.linalg.lstsq(basis, values.T, rcond=None)[0]
+    rate = chebyshev.chebvander(s, _DEGREE - 1) @ chebyshev.chebder(coefficients)
+    return (basis @ coefficients).T, rate.T * 2.0 / span
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))

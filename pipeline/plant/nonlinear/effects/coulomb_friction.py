@@ -1,0 +1,22 @@
+"""Dry (Coulomb) friction."""
+
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter, spring_force
+from pipeline.plant.nonlinear.effects.law import Friction
+
+FORCE = Parameter(
+    "force", "F", "input", scale=spring_force, trials=(0.003, 0.012, 0.04), neutral=0.0
+)
+EFFECT = Effect(
+    key="coulomb_friction",
+    title="Dry (Coulomb) friction",
+    sentence="A constant force opposes the motion and holds the cart when it stops.",
+    place="cart",
+    law=Friction("F"),
+    parameters=(FORCE,),
+    fingerprint="Peaks fall along a straight line, not an exponential; the cart stops dead and "
+    "its rest point scatters.",
+    deciding_run="Free decay from two release heights: the fitted ζ falls as the amplitude grows.",
+    reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
+    axis="velocity",
+    family="dry friction",
+)

@@ -1,0 +1,30 @@
+"""A damper between two carts."""
+
+from math import inf
+
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.effects.law import Force
+
+EFFECT = Effect(
+    key="coupling_damper",
+    title="A damper between two carts",
+    sentence="The spring (or a hose, a cable) dissipates as it is stretched.",
+    place="spring",
+    law=Force("c * rate", step=inf),
+    parameters=(
+        Parameter(
+            "coefficient",
+            "c",
+            "input s/position",
+            scale=lambda s: s.damping,
+            trials=(0.3,),
+            neutral=0.0,
+        ),
+    ),
+    fingerprint="Modes in which the carts move against each other are damped more.",
+    deciding_run="Free decay of each mode: damping of the in-phase against the opposed mode.",
+    reference="L. Meirovitch, Fundamentals of Vibrations, chapter 7",
+    axis="velocity",
+    between_carts=True,
+    equivalent="The carts' own damping, where the spring ends at a wall.",
+)

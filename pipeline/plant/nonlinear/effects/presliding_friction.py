@@ -1,0 +1,26 @@
+"""Presliding (Dahl) friction."""
+
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
+from pipeline.plant.nonlinear.effects.law import Hysteresis
+
+EFFECT = Effect(
+    key="presliding_friction",
+    title="Presliding (Dahl) friction",
+    sentence="Dry friction that builds up like a spring over a short distance after each reversal.",
+    place="cart",
+    law=Hysteresis("-F * z", rate="(v - abs(v) * z) / δ", step=2.3e-3),
+    parameters=(
+        FORCE,
+        Parameter(
+            "distance", "δ", "position", scale=lambda s: s.position, trials=(0.005, 0.02, 0.06)
+        ),
+    ),
+    fingerprint="The half period shortens as the amplitude falls, and the cart never quite stops "
+    "dead: it rings stiffly about where it came to rest.",
+    deciding_run="Small free decays: the frequency rises as the swing comes below δ.",
+    reference="P. R. Dahl, AIAA Journal 14 (1976), 1675-1682",
+    axis="velocity",
+    family="dry friction",
+    grows_from="coulomb_friction",
+)

@@ -1,0 +1,32 @@
+"""Stiction (Stribeck friction)."""
+
+from pipeline.plant.limits import LEAST_SLIDING
+from pipeline.plant.nonlinear.effects.base import Effect, Parameter, spring_force
+from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
+from pipeline.plant.nonlinear.effects.law import Friction, Growth
+
+EFFECT = Effect(
+    key="stiction",
+    title="Stiction (Stribeck friction)",
+    sentence="Dry friction that holds more firmly at rest than it drags in motion.",
+    place="cart",
+    law=Friction(
+        "F + (S - F) * exp(-(v / w)**2)", at_rest="S", beyond="coulomb_friction", step=1.2e-3
+    ),
+    growth=Growth(("E", "w"), {"S": "F + E"}),
+    parameters=(
+        FORCE,
+        Parameter("static_force", "S", "input", scale=spring_force, trials=(0.02, 0.06)),
+        Parameter("velocity", "w", "position/s", scale=lambda s: s.velocity, trials=(0.02, 0.1)),
+    ),
+    fingerprint="The cart sticks at its turning points and breaks loose with a jerk; the last "
+    "swings end abruptly.",
+    deciding_run="A slow ramp of the input: the force at which the cart breaks loose is above the "
+    "force that keeps it moving.",
+    reference="B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994)",
+    axis="velocity",
+    family="dry friction",
+    grows_from="coulomb_friction",
+    # Without a drop it is Coulomb's law; without sliding friction no dry surface behaves like it.
+    genuine=lambda p: LEAST_SLIDING * p["static_force"] < p["force"] < p["static_force"],
+)

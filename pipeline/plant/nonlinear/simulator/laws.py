@@ -1,0 +1,222 @@
+"""The laws of the effects: what the compiled simulators know of them.
+
+Made by `python -m docs.codegen` from the laws of the effects.
+"""
+
+from math import cos, exp, inf, pi, sin
+
+from pipeline.plant.nonlinear.columns import Cart, Drive, Spring
+from pipeline.plant.nonlinear.simulator.state import inlined, jit
+
+
+@inlined
+def cart_force(cart, i, x, v, u):
+    """Return the nonlinear force of cart i."""
+    f = 0.0
+    if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+        f += -cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * v * abs(v)
+    if cart[i, Cart.FORCE_OFFSET_FORCE] != 0.0:
+        f += cart[i, Cart.FORCE_OFFSET_FORCE]
+    return f
+
+
+@inlined
+def cart_slopes(cart, i, x, v, u):
+    """Return the derivatives of `cart_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+        by_v += -2 * cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] * abs(v)
+    return by_x, by_v
+
+
+@inlined
+def spring_force(spring, j, d, rate):
+    """Return the nonlinear tension of spring j, beyond its stiffness."""
+    f = 0.0
+    if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+        f += d**3 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    return f
+
+
+@inlined
+def spring_slopes(spring, j, d, rate):
+    """Return the derivatives of `spring_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+        by_x += 3 * d**2 * spring[j, Spring.CUBIC_SPRING_COEFFICIENT]
+    return by_x, by_v
+
+
+@inlined
+def drive_force(drive, x, v, u, on):
+    """Return the nonlinear force of cart 1."""
+    f = 0.0
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        f += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on * v
+    return f
+
+
+@inlined
+def drive_slopes(drive, x, v, u, on):
+    """Return the derivatives of `drive_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        by_v += -drive[Drive.DRIVE_DAMPING_COEFFICIENT] * on
+    return by_x, by_v
+
+
+@inlined
+def motor_force(drive, x, v, u, on):
+    """Return the nonlinear force of the motor."""
+    f = 0.0
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        f += drive[Drive.COGGING_FORCE] * sin(
+            drive[Drive.COGGING_PHASE] + 2 * pi * x / drive[Drive.COGGING_PITCH]
+        )
+    return f
+
+
+@inlined
+def motor_slopes(drive, x, v, u, on):
+    """Return the derivatives of `motor_force` by position and velocity."""
+    by_x = by_v = 0.0
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        by_x += (
+            2
+            * pi
+            * drive[Drive.COGGING_FORCE]
+            * cos(drive[Drive.COGGING_PHASE] + 2 * pi * x / drive[Drive.COGGING_PITCH])
+            / drive[Drive.COGGING_PITCH]
+        )
+    return by_x, by_v
+
+
+@inlined
+def cart_matrix(cart, i):
+    """Return what linear laws add to the stiffness and damping of a cart."""
+    stiffness = damping = 0.0
+    return stiffness, damping
+
+
+@inlined
+def spring_matrix(spring, j):
+    """Return what linear laws add to the stiffness and damping of a spring."""
+    stiffness = damping = 0.0
+    damping += spring[j, Spring.COUPLING_DAMPER_COEFFICIENT]
+    return stiffness, damping
+
+
+@inlined
+def sliding(cart, i, u):
+    """Return the dry friction on cart i that is the same at any speed."""
+    return cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.LOAD_FRICTION_COEFFICIENT] * abs(u)
+
+
+@inlined
+def dropping(cart, i, v, u):
+    """Return the dry friction that changes with the speed."""
+    size = 0.0
+    if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+        size += (-cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.STICTION_STATIC_FORCE]) * exp(
+            -(v**2) / cart[i, Cart.STICTION_VELOCITY] ** 2
+        )
+    return size
+
+
+@inlined
+def drop_slope(cart, i, v, u):
+    """Return the derivative of `dropping` by the velocity."""
+    slope = 0.0
+    if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+        slope += (
+            2
+            * v
+            * (cart[i, Cart.COULOMB_FRICTION_FORCE] - cart[i, Cart.STICTION_STATIC_FORCE])
+            * exp(-(v**2) / cart[i, Cart.STICTION_VELOCITY] ** 2)
+            / cart[i, Cart.STICTION_VELOCITY] ** 2
+        )
+    return slope
+
+
+@inlined
+def settling(cart, i, v):
+    """Return the most that hysteresis holds, where its state tends to, how fast."""
+    if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+        return (
+            cart[i, Cart.PRESLIDING_FRICTION_FORCE],
+            (1.0 if v > 0.0 else -1.0),
+            abs(v) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
+def settling_slopes(cart, i, v):
+    """Return the derivatives by the velocity of where the state tends to, how fast."""
+    if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+        return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
+    return 0.0, 0.0
+
+
+@inlined
+def stop_of(cart, i):
+    """Return stiffness, damping and (signed) position of what stops cart i."""
+    if cart[i, Cart.END_STOP_STIFFNESS] != 0.0:
+        return (
+            cart[i, Cart.END_STOP_STIFFNESS],
+            cart[i, Cart.END_STOP_DAMPING],
+            cart[i, Cart.END_STOP_POSITION],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
+def slack_of(spring, j):
+    """Return what spring j has more, past which stretch, and how by its stiffness."""
+    if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
+        return (
+            spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS],
+            spring[j, Spring.SLACK_SPRING_STRETCH],
+            spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE],
+        )
+    return 0.0, 0.0, 0.0
+
+
+@inlined
+def arriving(drive, u):
+    """Return what dead zone, saturation and the like leave of an input."""
+    if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
+        u = (1.0 if u > 0.0 else -1.0) * max(0, -drive[Drive.DEAD_ZONE_WIDTH] + abs(u))
+    if drive[Drive.SATURATION_LIMIT] != 0.0:
+        u = min(drive[Drive.SATURATION_LIMIT], max(u, -drive[Drive.SATURATION_LIMIT]))
+    return u
+
+
+ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # where smooth forces are: a sum of these
+
+
+@jit
+def reach_of(cart, spring, drive):
+    """Return the longest step for the laws, in s, and where there are smooth forces."""
+    longest, smooth = inf, 0
+    for i in range(cart.shape[0]):
+        if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
+            longest = min(longest, 0.0012)
+        if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
+            longest = min(longest, 0.0023)
+        if cart[i, Cart.QUADRATIC_DRAG_COEFFICIENT] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_CARTS
+        if cart[i, Cart.FORCE_OFFSET_FORCE] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_CARTS
+    for j in range(spring.shape[0]):
+        if spring[j, Spring.CUBIC_SPRING_COEFFICIENT] != 0.0:
+            longest = min(longest, 0.0025)
+            smooth |= ON_SPRINGS
+    if drive[Drive.DRIVE_DAMPING_COEFFICIENT] != 0.0:
+        smooth |= ON_DRIVE
+    if drive[Drive.COGGING_FORCE] != 0.0:
+        longest = min(longest, 0.001)
+        smooth |= ON_DRIVE
+    return longest, smooth

@@ -1,0 +1,51 @@
+"""Hands in the recordings: no part of fits and errors, and what follows is used."""
+
+import numpy as np
+import pytest
+
+from pipeline.gap.document import gap_json
+from pipeline.gap.explain import explain_gap
+from pipeline.gap.types import Gap
+from tests.truth.cases import Case, make_case
+
+
+@pytest.fixture(scope="module", params=[1, 2])
+def explained(request) -> tuple[Case, Gap]:
+    """A linear bench on which every decay is plucked, one step nudged, no hold firm."""
+    n = request.param
+    case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
+    return case, explain_gap(case.records, springs=case.springs)
+
+
+def test_a_linear_bench_with_hands_is_linear(explained):
+    """Neither a hand nor a hold that yields is taken for an effect; only noise is left."""
+    _, gap = explained
+
+    assert gap.verdict == "none"
+    assert gap.final == pytest.approx(gap.noise_floor, rel=0.1)
+
+
+def test_hands_are_reported(explained):
+    """In `gap.json` each has its record, cart and times."""
+    case, gap = explained
+    hands = [(name, h) for name, laid in case.hands.items() for h in laid if h.end < 1e9]
+    told = gap_json(gap)["interventions"]
+
+    assert len(told) == len(hands)
+    for name, hand in hands:
+        own = [one for one in told if one["from"] < hand.end and one["to"] > hand.start]
+        assert (name, hand.cart) in {(one["experiment"], one["cart"]) for one in own}
+
+
+def test_what_follows_a_hand_is_used_without_it(explained):
+    """Every plucked record is fitted or judged; no sample in which a hand acts is."""
+    case, gap = explained
+
+    assert {*gap.training, *gap.held_out} == {record.id for record in case.records}
+    for trace in gap.traces:
+        for hand in case.hands.get(trace.experiment, ()):
+            if hand.end < 1e9:
+                middle = slice(*np.searchsorted(trace.t, [hand.start + 0.06, hand.end - 0.06]))
+                assert trace.t[middle].size == 0
+    rows = [(row.experiment, row.cart, row.held_out) for row in gap.by_record]
+    assert len(rows) == len(set(rows))

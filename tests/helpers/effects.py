@@ -1,0 +1,23 @@
+"""A size for every effect, on `throne-2dof`: plain to see, and safely simulated."""
+
+SIZES = {
+    "coulomb_friction": {"force": 0.001},
+    "stiction": {"force": 0.001, "static_force": 0.002, "velocity": 1.0},
+    "presliding_friction": {"force": 0.001, "distance": 0.02},
+    "load_friction": {"coefficient": 0.05},
+    "quadratic_drag": {"coefficient": 3e-5},
+    "force_offset": {"force": 0.004},
+    "cubic_spring": {"coefficient": 0.02},
+    "slack_spring": {"stiffness_change": 0.8, "stretch": 0.15},
+    "coupling_damper": {"coefficient": 3e-4},
+    "drive_damping": {"coefficient": 3e-4},
+    "dead_zone": {"width": 0.005},
+    "saturation": {"limit": 0.03},
+    "input_delay": {"delay": 0.0123},
+    "actuator_lag": {"time_constant": 0.015},
+    "sensor_gain": {"gain": 1.05},
+    "extra_mode": {"mass": 3e-5, "stiffness": 0.03, "damping": 5e-5},
+    "end_stop": {"position": 0.8, "stiffness": 2.0},
+    "backlash": {"gap": 0.05},
+    "cogging": {"force": 0.003, "pitch": 0.3, "phase": 1.0},
+}

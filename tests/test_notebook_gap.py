@@ -1,0 +1,83 @@
+"""`explain` in a notebook: tables and systems that say what `cartlab gap` says."""
+
+import control
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import pipeline
+from pipeline.errors import ConfigError
+from pipeline.notebook import Explained, explain
+from tests.helpers.commandline import cartlab_here
+
+FORCE, LAG = 0.004, 0.02  # V, s
+
+
+@pytest.fixture(scope="module")
+def gap(tmp_path_factory) -> Explained:
+    """One cart with dry friction and a drive that lags."""
+    folder = tmp_path_factory.mktemp("explained") / "lab"
+    hide = ["--hide", f"coulomb_friction:cart=1,force={FORCE}"]
+    hide += ["--hide", f"actuator_lag:time_constant={LAG}"]
+    done = cartlab_here("simulate", "--preset", "throne-1dof", *hide, "--out", folder)
+    assert done.returncode == 0, done.stderr
+    return explain(folder)
+
+
+def test_effects_are_a_table(gap):
+    """A row an effect, in the order found, and a row a parameter with its unit."""
+    assert pipeline.explain is explain
+    assert gap.verdict == "named"
+    assert sorted(gap.effects["effect"]) == ["actuator_lag", "coulomb_friction"]
+    assert list(gap.effects["nrmse_after"])[-1] == pytest.approx(gap.results.final)
+    values = gap.parameters.set_index("parameter")
+    assert values.loc["force", "value"] == pytest.approx(FORCE, rel=0.02)
+    assert values.loc["force", "cart"] == 1
+    assert values.loc["time_constant", "value"] == pytest.approx(LAG, rel=0.02)
+    assert list(gap.parameters["unit"].sort_values()) == ["V", "s"]
+    assert "Dry (Coulomb) friction on cart 1" in repr(gap)
+
+
+def test_a_recording_is_simulated_by_both_models(gap):
+    """By time: measured, linear, with the effects; only these come near the measurement."""
+    frame = gap.simulate(gap.records[-1])
+
+    assert frame.index.name == "time"
+    assert list(frame.columns) == [("measured", "x1"), ("linear", "x1"), ("with_effects", "x1")]
+    off = frame.sub(frame["measured"]["x1"], axis=0).pow(2).mean() ** 0.5
+    assert off["with_effects", "x1"] < 0.2 * off["linear", "x1"]
+    with pytest.raises(ConfigError, match="no recording 'nothing'"):
+        gap.simulate("nothing")
+
+
+def test_the_systems_are_those_of_the_models(gap):
+    """The linear one is the chain's; the other has a lag, and friction that stops a release."""
+    assert gap.linear.state_labels == ["x1", "v1"]
+    assert_allclose(gap.linear.A, gap.results.linear.chain.state_space()[0])
+    assert isinstance(gap.system, control.NonlinearIOSystem)
+    assert gap.system.state_labels == ["x1", "v1", "u_lag"]
+
+    t = np.linspace(0.0, 8.0, 801)
+    response = control.input_output_response(
+        gap.system,
+        t,
+        np.zeros(t.size),  # pyright: ignore[reportArgumentType]
+        [2.0, 0.0, 0.0],  # pyright: ignore[reportArgumentType]
+        solve_ivp_method="LSODA",
+    )
+
+    (x,) = np.atleast_2d(response.outputs)
+    assert np.abs(x[:100]).max() > 1.0
+    # Friction holds the cart within force / stiffness of its spring's rest.
+    assert np.ptp(x[-100:]) < 1e-3
+    assert abs(x[-1]) <= FORCE / gap.results.model.chain.k.sum()
+
+
+def test_the_force_left_is_a_table(gap):
+    """A row for each window; of a right model only noise is left."""
+    assert list(gap.residual.columns) == [
+        "experiment", "time", "cart", "position", "velocity", "input", "force",
+    ]  # fmt: skip
+    assert set(gap.residual["experiment"]) <= set(gap.records)
+    assert gap.residual.attrs["units"]["velocity"] == "cm/s"
+    assert gap.residual["force"].std() < 0.2 * FORCE
