@@ -20,20 +20,15 @@ AS_REPEATS = 1.1
 # J. American Statistical Association 90 (1995), 773-795), and by 2 ln 150 more where the best of
 # some 150 trials is taken; by their "strong" for a law that another cart already has.
 BIC_DROP, SAME_LAW = 20.0, 6.0
-# Times that, where runs that were held out are at the noise already and cannot tell.
-ALONE = 5.0
 # Times the noise, or what repeats differ by, that a name may leave. Wide for the sake of contacts,
 # whose own law is not the model's; nine of ten names leave at most 1.02 times the noise, and who
 # leaves more than FURTHER without a contact is often half of what acts, which is said.
 ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
 SURE = 3.0  # standard errors from nothing: whoever is nearer is not named
-HELD_OUT_GAIN = 0.95  # on held-out runs: of the root of chi-square, 10 % in squares …
-RUN_GAIN, RUN_SHARE = 0.97, 0.6  # … and 6 % in more than half of the runs, whichever they are
 PARTIAL_GAIN = 0.9  # of the error, where too much for a name is left: a tenth is worth telling
-# What a contact, with its many parameters, must take there; and what must be gained behind one,
-# whose own law is known to a factor: a second effect would mop up the rest of the bounce. Below
-# this chi-square that rest is all there is, unless noise alone is left with the second.
-PARTIAL_CONTACT, CONTACT_GAIN, CONTACT_LAW = 0.55, 0.5, 10.0
+# What must be gained behind a play, which a model that follows takes as rigid: another law would
+# mop up the rest of the bounce.
+CONTACT_GAIN = 0.5
 
 # A rival: within 15 % of the error, and in the criterion nearer than a tenth of what is gained, and
 # than twice what an effect must gain.

@@ -50,14 +50,6 @@ class Hypothesis:
         return self.fit.structure.has_contact
 
     @property
-    def leaves_noise(self) -> bool:
-        """Whether noise alone is left of training runs, and little more of those held out.
-
-        A contact found to a thousandth bounces otherwise in the end.
-        """
-        return self.fit.chi < limits.AT_FLOOR and self.held.chi < limits.NEAR_FLOOR**2
-
-    @property
     def size(self) -> int:
         """How many laws act: one of dry friction counts once, on however many carts it acts."""
         effects = self.fit.structure.effects
