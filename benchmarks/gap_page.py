@@ -25,7 +25,8 @@ from scipy.stats import beta
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.free_runs import start_at
-from pipeline.gap.data.sides import prepare
+from pipeline.estimation.interventions import find_interventions
+from pipeline.gap.data.sides import prepare, take_sides
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.baseline import fit_baseline
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
@@ -47,6 +48,8 @@ SUITES = {
     "singles": "one effect, full size",
     "small": "one effect, 0.3 of it",
     "pairs": "two effects",
+    "wide": "one effect, sizes over a decade",
+    "wide-pairs": "two effects, sizes over a decade",
 }
 RIGHT = ("exact", "equivalent", "ambiguous, right first")
 _MUCH = 2.0  # noises left
@@ -100,7 +103,7 @@ def _bounds(right: int, of: int) -> str:
 def confusion_of(rows: Sequence[dict]) -> str:
     """Return what was said of each single effect, and of which of two something was missed."""
     out = []
-    singles = [row for row in rows if row["suite"] in ("singles", "small")]
+    singles = [row for row in rows if row["suite"] in ("singles", "small", "wide")]
     for key in sorted({row["truth"][0][0] for row in singles}):
         cases = [row for row in singles if row["truth"][0][0] == key]
         other = Counter(_said(row) for row in cases if row["outcome"] != "exact")
@@ -129,7 +132,7 @@ def _times(rows: Sequence[dict]) -> str:
 
 def pairs_of(rows: Sequence[dict]) -> str:
     """Return the pairs that were not named exactly."""
-    pairs = [row for row in rows if row["suite"] == "pairs"]
+    pairs = [row for row in rows if row["suite"].endswith("pairs")]
     out = [
         [" + ".join(_named(key) for key, _ in row["truth"]), str(row["n"]), _said(row)]
         for row in pairs
@@ -232,11 +235,11 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:
     """Yield the linear model and that with one effect, two, …, each fitted to the training runs."""
-    runs = {run.id: run for run in prepare(rig.records, springs=rig.springs, notes=[])}
-    training = [runs[name] for name in gap.training]
+    hands = find_interventions(rig.records)
+    runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
+    training, held_out = take_sides(runs, notes=[])
     linear, training = fit_baseline(training, springs=rig.springs, start=gap.linear.chain)
     sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
-    held_out = [runs[name] for name in gap.held_out]
     study = Study(
         training=tuple(training),
         held_out=tuple(

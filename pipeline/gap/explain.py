@@ -18,7 +18,7 @@ from pipeline.gap.fit.restart import holding_force
 from pipeline.gap.fit.structure import Candidate
 from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
-from pipeline.gap.search.search import search, steps_to
+from pipeline.gap.search.search import search, steps_to, without_nothing
 from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.gap.verdict.account import (
@@ -125,11 +125,18 @@ def explain_gap(
                 # The others were judged with the encoders' zeros free.
                 study, found = judged_by, list(path)
         sample_time = max(run.record.sample_time for run in study.training)
-        verdict, path, close = reach_verdict(path, found, study=study, sample_time=sample_time)
-        chosen = path[-1]
-        with suppress(OutOfTime):
-            chosen = _settled(chosen, replace(study, mapper=deadline.map))
-        final = finish(chosen.fit, study)
+        while True:
+            verdict, path, close = reach_verdict(path, found, study=study, sample_time=sample_time)
+            chosen = path[-1]
+            with suppress(OutOfTime):
+                chosen = _settled(chosen, replace(study, mapper=deadline.map))
+            final = finish(chosen.fit, study)
+            without = without_nothing(chosen, final, study)
+            if without is None:
+                break
+            # Fitted to its end, an effect may turn out to be nothing.
+            found = [*found, *path, without]
+            path = steps_to(without, found, study)
         if study.whole:
             judged_runs, nuisance = study.whole, final.nuisance
         else:

@@ -99,6 +99,17 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
     return chosen
 
 
+def without_nothing(chosen: Hypothesis, final: Fit, study: Study) -> Hypothesis | None:
+    """Return a hypothesis without its least sure effect, where that may be nothing; or None.
+
+    `final` is its fit with the covariance.
+    """
+    sure = sureness(final)
+    if not sure or min(sure) >= SURE:
+        return None
+    return _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
+
+
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
     """Does a hypothesis without one of the effects do about as well?
 
