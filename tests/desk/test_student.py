@@ -721,9 +721,8 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 # -------------------------------------------------------------------------------- jobs
 
 
-def test_the_gap_is_looked_for_as_a_job(filled, monkeypatch):
+def test_the_gap_is_looked_for_as_a_job(filled):
     """The page is that of `cartlab gap`, in the folder, and shown."""
-    monkeypatch.setattr("pipeline.desk.student.report._GAP_BUDGET", 1.0)
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
     assert visitor.post(HERE + "make-gap").status == 303
