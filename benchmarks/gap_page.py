@@ -9,6 +9,7 @@ Without one of them its part of the page stays as it is.
 import argparse
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -51,6 +52,12 @@ SUITES = {
     "wide": "one effect, sizes over a decade",
     "wide-pairs": "two effects, sizes over a decade",
 }
+PLUCKED = (
+    "07-Feb-2025_10_34_21.txt",
+    "07-Feb-2025_11_28_21.txt",
+    "14-Feb-2025_09_22_43.txt",
+    "14-Feb-2025_09_44_21.txt",
+)
 RIGHT = ("exact", "equivalent", "ambiguous, right first")
 _MUCH = 2.0  # noises left
 _THINNED = 2  # samples a point of a picture
@@ -195,6 +202,28 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
             r for r in analysis.records if r.id.startswith(start) and r.kind != "closed_loop"
         )
         yield Rig(name=name, words=words, records=records, springs=analysis.springs)
+    with tempfile.TemporaryDirectory() as copy:
+        lab = _write_plucked(Path(copy) / "lab", folder.parent / "ecp210-2025")
+        analysis = analyse(load_submission(lab), design=False)
+    yield Rig(
+        name="plucked",
+        words="another rig: cart 2 plucked by hand, up to three times in a recording",
+        records=tuple(analysis.records),
+        springs=analysis.springs,
+    )
+
+
+def _write_plucked(lab: Path, folder: Path) -> Path:
+    """Write a submission of the recordings in which a hand plucks cart 2; cart 1 is held."""
+    lab.mkdir()
+    text = ['version = 1\ntitle = "Plucked"\n[system]\ncarts = 2\nsprings = [true, true, false]\n']
+    for number, name in enumerate(PLUCKED, start=1):
+        shutil.copyfile(folder / name, lab / name)
+        text.append(
+            f'[[experiments]]\nid = "pluck-{number}"\nkind = "decay"\nfile = "{name}"\ncarts = [2]\n'
+        )
+    (lab / "submission.toml").write_text("".join(text), encoding="utf-8")
+    return lab
 
 
 def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
@@ -210,6 +239,7 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
         f"linear model, {gap.final:.2%} with the effects (noise {gap.noise_floor:.2%}{repeats}); "
         f"{cpu:.0f} s of one core.\n",
         *(f"{note[0].upper()}{note[1:]}.\n" for note in gap.notes),
+        *_hands(gap),
     ]
     steps = _steps(gap, rig)
     for number, (found, (study, before, after)) in enumerate(
@@ -231,6 +261,14 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
             f"with {number} effect{'s' * (number > 1)}, what each leaves](figures/{file})\n",
         ]
     return "\n".join(lines)
+
+
+def _hands(gap: Gap) -> list[str]:
+    """Return the stretches in which a hand moved a cart, as a sentence."""
+    if not gap.interventions:
+        return []
+    times = (f"{one.experiment} {one.start:.2f} to {one.end:.2f} s" for one in gap.interventions)
+    return [f"A hand, in no fit and no error: {', '.join(times)}.\n"]
 
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:

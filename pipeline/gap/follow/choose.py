@@ -13,6 +13,7 @@ from pipeline.gap.follow.laws import Bench, Law, smooth_laws
 from pipeline.gap.follow.records import Records
 from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
 from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import CATALOGUE
 
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
 _NEAR_FREE = 0.02
@@ -55,7 +56,7 @@ def choose_laws(
     """Return the model that following finds: the laws that are left, fitted to free runs."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
-    tell(f"all at once: {full.chi:.3f}, let go: {lean.chi:.3f}")
+    tell(f"all laws fitted together: {len(lean.laws.groups())} are left")
     for _ in range(_ROUNDS):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
@@ -63,7 +64,8 @@ def choose_laws(
         if more is None:
             break
         leaner = let_go(more, records)
-        tell(f"with {more.laws.keys[-1]}: {more.chi:.3f}, let go: {leaner.chi:.3f}")
+        added = CATALOGUE[more.laws.keys[-1][0]].title.lower()
+        tell(f"with {added}: {len(leaner.laws.groups())} laws are left")
         full = more
         if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner
