@@ -220,7 +220,8 @@ def _write_plucked(lab: Path, folder: Path) -> Path:
     for number, name in enumerate(PLUCKED, start=1):
         shutil.copyfile(folder / name, lab / name)
         text.append(
-            f'[[experiments]]\nid = "pluck-{number}"\nkind = "decay"\nfile = "{name}"\ncarts = [2]\n'
+            f'[[experiments]]\nid = "pluck-{number}"\nkind = "decay"\n'
+            f'file = "{name}"\ncarts = [2]\n'
         )
     (lab / "submission.toml").write_text("".join(text), encoding="utf-8")
     return lab
