@@ -248,7 +248,11 @@ def check_held(records: Sequence[Record]) -> list[Check]:
                 )
                 checks.append(
                     Check.of(
-                        f"held.{record.id}", False, message, value=share, limit=limits.HELD_FIRMLY
+                        f"held.{record.id}.cart_{cart}",
+                        False,
+                        message,
+                        value=share,
+                        limit=limits.HELD_FIRMLY,
                     )
                 )
     return checks

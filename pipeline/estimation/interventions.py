@@ -6,7 +6,7 @@ stretch, speed and input are the same. A knock of two bodies is over in an insta
 a hand if it lasts, moves the cart, and acts in a state in which the law holds at other times.
 """
 
-from collections.abc import Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.arrays import Array
-from pipeline.estimation.law_of_motion import HOP, ForceLeft, forces_left
+from pipeline.estimation.law_of_motion import ForceLeft, forces_left
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results_of_runs import Intervention, Record
 
@@ -38,10 +38,23 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     Runs under feedback are not looked at: what drove their motor is often not what was logged.
     """
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
-    carts = sorted({cart for r in open_loop for cart in r.free if cart in r.carts})
-    found = [one for cart in carts for one in _bursts(cart, open_loop)]
+    first = {record.id: _first_alike(record, open_loop) for record in open_loop}
+    alone = [record for record in open_loop if first[record.id] == record.id]
+    carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
+    bursts = [one for cart in carts for one in _bursts(cart, alone)]
+    found = [
+        replace(one, experiment=name)
+        for name, twin in first.items()
+        for one in bursts
+        if one.experiment == twin
+    ]
     order = [record.id for record in open_loop]
     return tuple(sorted(found, key=lambda one: (order.index(one.experiment), one.cart, one.start)))
+
+
+def _first_alike(record: Record, records: Sequence[Record]) -> str:
+    """Return the id of the first record with the same readings: a file may be listed twice."""
+    return next(other.id for other in records if np.array_equal(other.y, record.y))
 
 
 def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
@@ -54,6 +67,8 @@ def between(record: Record, interventions: Sequence[Intervention]) -> list[Recor
         return [record]
     pieces = []
     for first, last in _runs(~touched):
+        if record.t[last] - record.t[first] < _GAP:
+            continue
         part = slice(first, last + 1)
         pieces.append(
             replace(
@@ -87,7 +102,7 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
         for first, last in _stretches(above, force.t):
             inside = slice(first, last + 1)
             beyond = np.where(above[inside], force.left[inside], 0.0)
-            if _is_hand(beyond, strong=strong[inside], known=known[inside]):
+            if _is_hand(beyond, strong=strong[inside], known=known[inside], hop=force.hop):
                 found.append(
                     Intervention(
                         experiment=force.record.id,
@@ -96,12 +111,21 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                         end=min(float(times[last]) + _REACH, float(times[-1])),
                     )
                 )
-    driven = {record.id for record in records if record.u is not None and np.any(record.u)}
-    return [one for one in found if not (one.experiment in driven and _recurs(one, found, driven))]
+    driven = {
+        record.id: float(record.t[0])
+        for record in records
+        if record.u is not None and np.any(record.u)
+    }
+    return [one for one in found if not _recurs(one, found, driven)]
 
 
-def _recurs(one: Intervention, found: Sequence[Intervention], driven: Set[str]) -> bool:
-    """Tell whether it happens at the same instant in another driven run: no hand is as exact."""
+def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
+    """Tell whether it happens at the same instant in another driven run: no hand is as exact.
+
+    Driven runs with their first instant, at which any hand that was there before begins.
+    """
+    if one.start == driven.get(one.experiment, one.start):
+        return False
     return any(
         abs(one.start - other.start) < _INSTANT
         for other in found
@@ -111,7 +135,7 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Set[str]) 
 
 def _share(force: ForceLeft, size: float) -> Array:
     """Return how much of what acts on the cart about that time the law leaves."""
-    acting = maximum_filter1d(force.acting, 2 * round(_AROUND / HOP) + 1)
+    acting = maximum_filter1d(force.acting, 2 * round(_AROUND / force.hop) + 1)
     return np.abs(force.left) / (acting + size)
 
 
@@ -161,12 +185,17 @@ def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
     return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def _is_hand(left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_]) -> bool:
-    """Tell whether a burst, `left` being nothing below its beginning, is a hand."""
+def _is_hand(
+    left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_], hop: float
+) -> bool:
+    """Tell whether a burst, `left` being nothing below its beginning, is a hand.
+
+    Its windows are `hop` s apart.
+    """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
     lasts = understood = 0
     for first, last in _runs(strong):
         burst = np.abs(left[first : last + 1])
         lasts += np.count_nonzero(burst > 0.5 * burst.max())
         understood += np.count_nonzero(known[first : last + 1])
-    return bool(swings <= _SWINGS and lasts * HOP >= _LASTS and understood * HOP >= _KNOWN)
+    return bool(swings <= _SWINGS and lasts * hop >= _LASTS and understood * hop >= _KNOWN)

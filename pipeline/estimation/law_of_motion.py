@@ -19,7 +19,7 @@ from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
 from pipeline.results_of_runs import Record
 
-HOP = 0.01  # s from window to window
+_HOP = 0.01  # s from window to window
 _WINDOW = 0.1  # s; the middle 0.04 s weigh most
 _FEWEST = 9  # samples in a window
 _AT_ONCE = 1000  # windows; more would need much memory in long recordings
@@ -64,6 +64,11 @@ class ForceLeft:
     def follows(self) -> NDArray[np.bool_]:
         """(n,) where the law should hold."""
         return self.moves & ~self.jumps
+
+    @property
+    def hop(self) -> float:
+        """The time from window to window, s."""
+        return _hop(self.record) * self.record.sample_time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -147,7 +152,7 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     width = max(round(_WINDOW / interval) + 1, _FEWEST)
     if width >= t.size:
         return None
-    first = np.arange(0, t.size - width + 1, max(1, round(HOP / interval)))
+    first = np.arange(0, t.size - width + 1, _hop(record))
     still = np.zeros(t.size)
     around = np.array([record.position(c) if c in record.carts else still for c in neighbours])
     y, u = around[1], still if record.u is None else record.u
@@ -171,6 +176,11 @@ def _cut(record: Record, cart: int) -> _Windows | None:
         moves=means[13] > _MOVES * step,
         jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
     )
+
+
+def _hop(record: Record) -> int:
+    """Return how many samples there are from window to window."""
+    return max(1, round(_HOP / record.sample_time))
 
 
 def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:

@@ -77,8 +77,10 @@ def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
     ]
     frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(_LEFT))
     position, drive = analysis.position_unit, analysis.input_unit
+    driven = any(np.any(one.u) for one in gap.left_forces)
+    force = drive if driven else f"{position}/s^2"  # the first mass is one
     frame.attrs["units"] = {
         "time": "s", "position": position, "velocity": f"{position}/s", "input": drive,
-        "force": drive,
+        "force": force,
     }  # fmt: skip
     return frame

@@ -111,7 +111,7 @@ def explain_gap(
             if not deadline.cut:
                 study, (chosen, found) = quiet, again
         if chosen.fit.chi < limits.NEAR_FLOOR**2 < chosen.held.chi and not deadline.cut:
-            # What acts in the runs held out alone no search among the others finds.
+            # An effect that acts only in the held-out runs cannot be found from the training runs.
             turned = replace(study, training=study.held_out, held_out=study.training)
             fit = fit_model(fit, turned.training, mapper=pool.map)
             again = _investigate(fit, turned, deadline)
@@ -141,9 +141,11 @@ def explain_gap(
             judged_runs, nuisance = study.whole, final.nuisance
         else:
             chosen = replace(chosen, fit=final)
-            path = (*path[:-1], chosen)
             judged_runs = (*study.training, *study.held_out)
             nuisance = (*final.nuisance, *chosen.held.nuisance)
+        path = (*path[:-1], chosen)
+        zeros = {run.id: own.zero for run, own in zip(judged_runs, nuisance, strict=True)}
+        free = free_runs(final, runs, zeros)
     if verdict == "named" and not study.explains(chosen):
         verdict = "partial"
     if verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -204,7 +206,7 @@ def explain_gap(
         if told
         else map_residual(forces, springs=springs, position=position_unit, drive=force_unit),
         left_forces=forces,
-        free_run=free_runs(final, judged_runs, nuisance),
+        free_run=free,
         complete=not deadline.cut,
         notes=tuple(notes),
         contenders=() if settled else list_contenders(chosen, close or found),

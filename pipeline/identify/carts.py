@@ -204,6 +204,8 @@ def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement
     ------
     DataError : none of them does.
     """
+    if not pieces:
+        raise DataError("a force that was not measured acts on a cart throughout")
     decays: list[LogDecrement] = []
     fault: DataError | None = None
     for piece in pieces:

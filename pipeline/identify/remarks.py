@@ -36,7 +36,7 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
         (
             one.experiment,
             f"cart {one.cart} is {one.what} from {one.start:.2f} to {one.end:.2f} s (a hand?); "
-            "what follows counts as a release of its own",
+            "what follows a hand counts as a decay of its own; the gap leaves the stretch out",
         )
         for one in interventions
         if (one.experiment, one.start) not in released

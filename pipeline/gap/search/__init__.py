@@ -1,1 +1,1 @@
-"""The effects tried: screened, refitted, grown into hypotheses and held against each other."""
+"""What following finds, as effects of the catalogue, fitted to whole runs and judged."""

@@ -51,7 +51,10 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
             found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
         found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.sound]
         leading = min(found[1:], key=lambda h: h.bic_of_all, default=baseline)
-        return prune(leading, study, found), [h for h in found if h.sound]
+        chosen = prune(leading, study, found)
+        usable = chosen.sound and np.isfinite(chosen.error)
+        return chosen if usable else baseline, [h for h in found if h.sound]
+    found = [h for h in found if np.isfinite(h.error) and h.sound]
     worth = [h for h in found if worth_it(h, baseline, study)]
     return min(worth, key=lambda h: h.bic, default=baseline), found
 

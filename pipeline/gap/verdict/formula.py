@@ -1,9 +1,8 @@
 """The shortest formula for the force that a model does not explain, by regression in weak form.
 
 The force is known as its mean over windows; so is each term of a library. Masses, dampings and
-springs were fitted without what is missing, and so were the encoders' zeros: they are taken anew
-beside the terms. Of all sums
-of a few terms the one of the best criterion is the formula; no term is as good as none.
+springs, and the encoders' zeros, were fitted without what is missing, so they are fitted again
+beside the terms. The formula is the sum of a few terms with the best criterion, if any beats none.
 
 References: S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113 (2016), 3932-3937 (sparse regression
 for laws of motion); D. A. Messenger, D. M. Bortz, J. Computational Physics 443 (2021), 110525 (in
@@ -95,7 +94,8 @@ def find_formula(
     size = np.linalg.norm(columns, axis=0)
     usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > _DEAD * size[j] > 0]
     best, lowest = (), _criterion(left, 0)
-    for count in range(1, min(_MOST_TERMS, force.size // _PER_TERM) + 1):
+    free = force.size - linear.shape[1]
+    for count in range(1, min(_MOST_TERMS, free // _PER_TERM) + 1):
         for chosen in combinations(usable, count):
             A = alone[:, chosen]
             rest = left - A @ np.linalg.lstsq(A, left, rcond=None)[0]
@@ -106,8 +106,7 @@ def find_formula(
     A = alone[:, best]
     coefficients = np.linalg.lstsq(A, left, rcond=None)[0]
     rest = left - A @ coefficients
-    freedom = force.size - len(best) - linear.shape[1]
-    variance = float(rest @ rest) / freedom * np.diag(np.linalg.inv(A.T @ A))
+    variance = float(rest @ rest) / (free - len(best)) * np.diag(np.linalg.inv(A.T @ A))
     formula = ForceFormula(
         terms=tuple(
             FormulaTerm(

@@ -1,6 +1,6 @@
 """How far one simulation of a whole record strays, started from its first readings."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -8,19 +8,19 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.gap.data.runs import Run
 from pipeline.gap.fit.levenberg_marquardt import Fit
-from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
+from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.types import FreeRun
 
 
-def free_runs(fit: Fit, runs: Sequence[Run], nuisance: Sequence[Nuisance]) -> tuple[FreeRun, ...]:
+def free_runs(fit: Fit, runs: Sequence[Run], zeros: Mapping[str, Array]) -> tuple[FreeRun, ...]:
     """Return the error of each record, all carts together, in the order of their ids.
 
-    Of what was fitted to a run itself only the encoders' zeros are used. Runs that were cut out of
-    one record count as one.
+    Of what was fitted to a record only its encoders' `zeros` (n,) are used. What a hand divides is
+    simulated piece by piece, and counts as one.
     """
     squares: dict[str, list[Array]] = {}
-    for run, own in zip(runs, nuisance, strict=True):
-        zero = np.where(run.free, own.zero, 0.0)
+    for run in runs:
+        zero = np.where(run.free, zeros[run.id], 0.0)
         fresh = fresh_nuisance(replace(run, zero=zero))
         off = run.y - simulate_run(fit, run, fresh)
         squares.setdefault(run.id, []).append(off.ravel() ** 2)
