@@ -64,6 +64,30 @@ def test_a_hand_is_found_where_it_was():
     np.testing.assert_allclose([end for *_, end in at], [h.end for _, h in hands], atol=TO)
 
 
+@pytest.mark.parametrize("rate", [50.0, 25.0])
+def test_hands_are_found_at_low_rates(rate):
+    """The windows are then a sample apart, which is more than usual."""
+    case = make_case(seed=71, n=1, rate=rate, handled=True)
+    missed, more = unmatched(case)
+
+    assert len(missed) <= 1
+    assert more == []
+
+
+def test_a_recording_that_is_listed_twice_keeps_its_hands():
+    """A hand is not taken for an effect because a copy of the file repeats it exactly."""
+    case = make_case(seed=71, n=1, rate=250.0, handled=True)
+    found = find_interventions(case.records)
+    driven = {r.id for r in case.records if r.u is not None and np.any(r.u)}
+    name = next(one.experiment for one in found if one.experiment in driven)
+    twin = replace(next(r for r in case.records if r.id == name), id="copy")
+
+    both = find_interventions([*case.records, twin])
+    times = [(one.start, one.end) for one in found if one.experiment == name]
+    assert [(one.start, one.end) for one in both if one.experiment == "copy"] == times
+    assert [one for one in both if one.experiment != "copy"] == list(found)
+
+
 @pytest.mark.parametrize(
     "effect",
     [
