@@ -70,5 +70,5 @@ def test_a_hold_that_was_none_is_said(rig):
     """In the last decay somebody moved the cart that should be held: by 7 % of the other's."""
     held = [check for check in rig.failed_checks if check.kind == "held"]
 
-    assert [check.about for check in held] == ["14-Feb-2025_09_44_21"]
+    assert [check.about for check in held] == ["14-Feb-2025_09_44_21.cart_1"]
     assert held[0].value == pytest.approx(0.075, abs=0.005)

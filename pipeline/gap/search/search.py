@@ -49,9 +49,12 @@ def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothe
         study.tell(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
         for rival in rivals_of(lean, records):
             found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
-        found[1:] = [h for h in found[1:] if np.isfinite(h.error) and h.sound]
-        leading = min(found[1:], key=lambda h: h.bic_of_all, default=baseline)
-        chosen = prune(leading, study, found)
+        found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
+        # What ends at a bound is often nothing: it goes, and what remains is sound.
+        chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
+        sound = [h for h in found if h.sound and np.isfinite(h.error)]
+        if not chosen.sound:
+            chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
         usable = chosen.sound and np.isfinite(chosen.error)
         return chosen if usable else baseline, [h for h in found if h.sound]
     found = [h for h in found if np.isfinite(h.error) and h.sound]
