@@ -57,6 +57,14 @@ def _first_alike(record: Record, records: Sequence[Record]) -> str:
     return next(other.id for other in records if np.array_equal(other.y, record.y))
 
 
+def but_releases(
+    interventions: Sequence[Intervention], records: Sequence[Record]
+) -> list[Intervention]:
+    """Return the interventions without the holds from which decays are let go, as they should."""
+    released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
+    return [one for one in interventions if (one.experiment, one.start) not in released]
+
+
 def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
     """Return what a record shows before, between and after the interventions, piece by piece."""
     touched = np.zeros(record.t.size, dtype=np.bool_)

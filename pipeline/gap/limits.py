@@ -17,8 +17,8 @@ NOTHING = 1.05  # times the noise: what goes beyond it, √(1.05² - 1), is a th
 AS_REPEATS = 1.1
 
 # The Bayesian criterion must fall by 10 for very strong evidence (R. E. Kass, A. E. Raftery,
-# J. American Statistical Association 90 (1995), 773-795), and by 2 ln 150 more where the best of
-# some 150 trials is taken; by their "strong" for a law that another cart already has.
+# J. American Statistical Association 90 (1995), 773-795), and by 2 ln 150 more, as if the best of
+# some 150 laws and places were taken; by their "strong" for a law that another cart already has.
 BIC_DROP, SAME_LAW = 20.0, 6.0
 # Times the noise, or what repeats differ by, that a name may leave. Wide for the sake of contacts,
 # whose own law is not the model's; nine of ten names leave at most 1.02 times the noise, and who

@@ -5,6 +5,7 @@ from math import ceil
 
 import numpy as np
 
+from pipeline.estimation.interventions import but_releases
 from pipeline.identify import limits
 from pipeline.identify.soundness.encoders import find_other_units
 from pipeline.ingest.columns import conversion
@@ -31,15 +32,13 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
 
 def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
     """Return in which records a hand acts on a cart, and when; but not that a decay is let go."""
-    released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
     return by_note(
         (
             one.experiment,
             f"cart {one.cart} is {one.what} from {one.start:.2f} to {one.end:.2f} s (a hand?); "
             "what follows a hand counts as a decay of its own; the gap leaves the stretch out",
         )
-        for one in interventions
-        if (one.experiment, one.start) not in released
+        for one in but_releases(interventions, records)
     )
 
 

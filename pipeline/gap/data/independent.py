@@ -9,8 +9,8 @@ def independent(residual: Array) -> float:
     """Return the number of independent readings that a residual (samples,) is worth.
 
     Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a mean
-    square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²). That is of what swings: on
-    no spring errors add up, and the correlation of a drift says nothing of what is new in it.
+    square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²). This holds for what swings,
+    not for a drift.
     """
     power = np.abs(np.fft.rfft(residual - residual.mean(), 2 * residual.size)) ** 2
     covariance = np.fft.irfft(power)[: residual.size]

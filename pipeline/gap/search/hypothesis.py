@@ -142,7 +142,7 @@ def _news(fit: Fit, runs: Sequence[Run]) -> float:
     What a model leaves that is not noise swings with the carts: few of its points are news.
     """
     most = fit.n_points / limits.THINNING
-    # The correlation of a drift says nothing of its news; nor does what ran away.
+    # Without springs errors add up to a drift; a model that ran away has no residuals.
     if not any(fit.structure.springs) or not np.isfinite(fit.cost):
         return most
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)

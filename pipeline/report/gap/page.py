@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pipeline import __version__
 from pipeline.arrays import Array
+from pipeline.estimation.interventions import but_releases
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
@@ -271,7 +272,8 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
 
 
 def _hands(page: Page, gap: Gap) -> list[Block]:
-    return [intervention_table(page, gap.interventions)] if gap.interventions else []
+    hands = but_releases(gap.interventions, list(page.records.values()))
+    return [intervention_table(page, hands)] if hands else []
 
 
 def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
