@@ -19,9 +19,9 @@ from pipeline.bench.host.acquire import acquire
 from pipeline.bench.host.raw import read_raw
 from pipeline.bench.host.record import readings_of
 from pipeline.bench.live.observer import Anomalies
-from pipeline.bench.planning.plan import Limits
 from pipeline.bench.protocol.messages import Reading
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import PlanLimits
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
@@ -95,7 +95,7 @@ def stops(folder: Path, *, n: int) -> None:
     with emulator() as bench:
         for trial in range(n):
             work = folder / str(trial)
-            limits = Limits(input=0.5, travel=0.05 + 0.1 * trial / n)
+            limits = PlanLimits(input=0.5, travel=0.05 + 0.1 * trial / n)
             write_work(work, [sine("far", seconds=5.0, frequency=1.6)], limits=limits)
             acquire(work, port=bench.address, observers=[_Once()], only=["far"])
             while (sent := bench.event("run"))["ended"] != "stopped":

@@ -27,6 +27,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import ChainFit, FrequencyResponse, Record
+from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 
 TITLE = "Resonances of one, two and three carts"
@@ -179,7 +180,7 @@ def from_records(*, seeds: int) -> Trials:
                 )
 
                 def ours(record: Record = record, chain: Chain = chain) -> Modes:
-                    fit = fit_records([record], n=chain.n, springs=(True,) * (chain.n + 1))
+                    fit = fit_records([record], bench=Bench(springs=(True,) * (chain.n + 1)))
                     return _of_fit(fit, chain)
 
                 tried: list[tuple[str, Callable[[], Modes]]] = [(OURS, ours)]

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.bench.emulator.carts import TRUE_PERIOD
 from pipeline.ingest.read import read_data
 from pipeline.output import write_file
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, Term
+from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, EffectTerm
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.emulator.carts import TRUE_PERIOD
+from pipeline.simulated.hidden import default_values, prepare_bench
 from pipeline.submission import Submission
-from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench
 
 _SPREAD = 0.3  # of the logarithms of masses, dampings and springs about a preset's
 USUAL = (0.6, 1.6)  # times the usual size of an effect
@@ -32,7 +33,7 @@ Named = tuple[str, int]  # an effect and where it sits
 class Drawn:
     """A bench, which springs it has, and what is hidden in it."""
 
-    bench: HiddenBench
+    bench: SimulatedBench
     springs: tuple[bool, ...]
     hidden: tuple[Named, ...]
 
@@ -49,7 +50,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
     chain = Chain(m=m, c=c, k=k)
     bench = replace(bench, chain=chain, name=f"drawn-{seed}")
     springs = tuple(bool(one > 0) for one in chain.k)
-    terms: list[Term] = []
+    terms: list[EffectTerm] = []
     while len(terms) < effects:
         effect = CATALOGUE[int(rng.integers(len(CATALOGUE)))]
         places = effect.places(springs)
@@ -92,7 +93,7 @@ def acted(drawn: Drawn, submission: Submission) -> list[list]:
     return sorted(list(one) for one in drawn.hidden if one not in missed)
 
 
-def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:
+def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm:
     """Return the effect with its first parameter, and what goes with it, at a share of the usual.
 
     Of what it differs by from doing nothing. Two of dry friction's grow together: a static force
@@ -101,7 +102,7 @@ def _sized(effect: Effect, place: int, chain: Chain, share: float) -> Term:
     values = default_values(effect, chain, place=place, travel=1.0)
     forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]
     sized = set(forces if effect.family else forces[:1])
-    return Term(
+    return EffectTerm(
         effect=effect,
         place=place,
         values=tuple(

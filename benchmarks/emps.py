@@ -12,6 +12,7 @@ from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.results import Record
+from pipeline.set_up import Bench, Units
 from tests.helpers.places import REAL_DATA
 
 TITLE = "EMPS, a positioning axis"
@@ -70,7 +71,7 @@ def tables(*, quick: bool) -> list[Table]:
         return [Table(title=title, head=head, rows=[row], note=_NOTE)]
     train, test = emps_record("train"), emps_record("test")
     began = time.process_time()
-    gap = explain_gap([train], springs=SPRINGS, position_unit="m", workers=1)
+    gap = explain_gap([train], Bench(springs=SPRINGS, units=Units(position="m", input="V")))
     seconds = f"{time.process_time() - began:.0f}"
     rows = []
     for name, model, own in (

@@ -21,10 +21,11 @@ import json
 import numpy as np
 
 from benchmarks.drawn import Drawn, acted, counted, draw, run_study, wilson
-from pipeline.bench.explore.explore import Wish, explore
-from pipeline.bench.planning.plan_words import session_time
-from pipeline.bench.planning.propose import extend_plan, propose_plan
 from pipeline.errors import DataError, PipelineError
+from pipeline.experiments.exploring.error_goal import ErrorGoal
+from pipeline.experiments.exploring.exploration import Exploration
+from pipeline.experiments.plan_words import session_time
+from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.submission import load_submission
 from tests.helpers.virtual import LimitPassed, VirtualBench, VirtualSession
@@ -45,9 +46,13 @@ def run(seed: int) -> dict:
         session = VirtualSession(folder, bench, springs=drawn.springs)
         row = {"carts": bench.description.carts, "hidden": sorted(map(list, drawn.hidden))}
         try:
-            turns = explore(
-                folder, record=session, wish=Wish(), seconds=ALLOWED, tell=lambda text: None
-            )
+            turns = Exploration(
+                folder=folder,
+                record=session,
+                goal=ErrorGoal(),
+                seconds=ALLOWED,
+                tell=lambda text: None,
+            ).run()
         except (PipelineError, AssertionError) as error:
             return row | {"ended": f"{type(error).__name__}: {error}"[:200]}
         submission = load_submission(folder)

@@ -11,6 +11,7 @@ from pipeline.plant.linear.step_response import overshoot_percent, settling_time
 from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
+from pipeline.submission import Design
 
 TITLE = "State feedback"
 WORDS = """
@@ -35,11 +36,7 @@ def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
 def design(chain: Chain, cart: int, method: Method) -> FeedbackDesign:
     return design_feedback(
         chain,
-        cart=cart,
-        reference=1.0,
-        overshoot_percent=10.0,
-        settling_time=1.0,
-        method=method,
+        Design(cart=cart, reference=1.0, overshoot_percent=10.0, settling_time=1.0, method=method),
     )
 
 

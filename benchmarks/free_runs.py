@@ -12,7 +12,7 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import make_run
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import Candidate, Structure
-from pipeline.gap.fit.structure import Model as FitModel
+from pipeline.gap.fit.structure import GapModel as FitModel
 from pipeline.gap.types import Gap
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.results import Record

@@ -55,6 +55,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
     """Make one case, explain it, and say how it went."""
     suite, index, base = job
     from pipeline.gap.explain import explain_gap
+    from pipeline.set_up import Bench
     from tests.truth.cases import make_case
 
     n, effects, severity, dirt = plan(suite, index)
@@ -67,7 +68,7 @@ def run_case(job: tuple[str, int, int]) -> dict:
         wide=suite.startswith("wide"),
     )
     wall, cpu = time.perf_counter(), time.process_time()
-    gap = explain_gap(case.records, springs=case.springs, workers=1)
+    gap = explain_gap(case.records, Bench(springs=case.springs))
     truth = sorted((h.effect, h.place) for h in case.hidden)
     found = sorted((f.effect.key, next(iter(f.where.values()), 0)) for f in gap.effects)
     listed = set(found) | {

@@ -41,6 +41,7 @@ from pipeline.report.figures.gap import before_after_figure
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Record
+from pipeline.set_up import Bench, Units
 
 PAGE = Path(__file__).with_name("gap.md")
 FIGURES = Path(__file__).with_name("figures")
@@ -201,7 +202,7 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
         records = tuple(
             r for r in analysis.records if r.id.startswith(start) and r.kind != "closed_loop"
         )
-        yield Rig(name=name, words=words, records=records, springs=analysis.springs)
+        yield Rig(name=name, words=words, records=records, springs=analysis.bench.springs)
     with tempfile.TemporaryDirectory() as copy:
         lab = _write_plucked(Path(copy) / "lab", folder.parent / "ecp210-2025")
         analysis = analyse(load_submission(lab), design=False)
@@ -209,7 +210,7 @@ def rigs_in(folder: Path) -> Iterator[Rig]:
         name="plucked",
         words="another rig: cart 2 plucked by hand, up to three times in a recording",
         records=tuple(analysis.records),
-        springs=analysis.springs,
+        springs=analysis.bench.springs,
     )
 
 
@@ -230,7 +231,9 @@ def _write_plucked(lab: Path, folder: Path) -> Path:
 def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
     """Return the account of one rig, and draw a picture of each step."""
     cpu = time.process_time()
-    gap = explain_gap(rig.records, springs=rig.springs, position_unit="count", workers=1)
+    gap = explain_gap(
+        rig.records, Bench(springs=rig.springs, units=Units(position="count", input="V"))
+    )
     cpu = time.process_time() - cpu
     tell(f"{rig.name}: {gap.verdict} {gap.baseline:.2%} -> {gap.final:.2%} in {cpu:.1f} s")
     repeats = f", repeats differ by {gap.repeatability:.2%}" if gap.repeatability else ""
@@ -278,18 +281,14 @@ def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]
     runs = prepare(rig.records, springs=rig.springs, interventions=hands, notes=[])
     training, held_out = take_sides(runs, notes=[])
     linear, training = fit_baseline(training, springs=rig.springs, start=gap.linear.chain)
-    sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
     study = Study(
-        training=tuple(training),
-        held_out=tuple(
-            replace(run, sigma=np.array([sigma[row] for row in run.rows])) for run in held_out
-        ),
+        training=(),
+        held_out=tuple(held_out),
         springs=rig.springs,
         catalogue=CATALOGUE,
         repeatability=gap.repeatability or 0.0,
-        mapper=map,
-        tell=print,
-    )
+        progress=print,
+    ).with_noise(training)
     before = judge(linear, study)
     for count in range(1, len(gap.effects) + 1):
         model = AugmentedChain(chain=gap.model.chain, terms=gap.model.terms[:count])
@@ -336,7 +335,9 @@ def main() -> None:
         parts["pairs"] = pairs_of(rows)
     if options.rig:
         rigs = list(rigs_in(options.rig))
-        explain_gap(rigs[0].records, springs=rigs[0].springs, budget=0.0)  # compiles the simulator
+        explain_gap(
+            rigs[0].records, Bench(springs=rigs[0].springs), budget=0.0
+        )  # compiles the simulator
         parts["rigs"] = "\n".join(explain_rig(rig, print) for rig in rigs)
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():

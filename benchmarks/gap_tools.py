@@ -26,6 +26,8 @@ from benchmarks.page import Table, installed, missing, share, spread
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.results import Record
+from pipeline.set_up import Bench as SetUp
+from pipeline.set_up import Units
 from tests.helpers.places import REAL_DATA
 from tests.helpers.ucsd import ecp_record
 from tests.truth.cases import EFFECTS, further_records, make_case, make_rig
@@ -80,7 +82,7 @@ def compare(
 ) -> Bench:
     """Let every tool learn and choose as cartlab does, by its sides; judge by further records."""
     began = time.process_time()
-    gap = explain_gap(records, springs=springs, position_unit=unit, workers=1)
+    gap = explain_gap(records, SetUp(springs=springs, units=Units(position=unit, input="V")))
     seconds = time.process_time() - began
     by_id = {record.id: record for record in records}
     training, choosing = (
@@ -305,7 +307,7 @@ to run, which nothing learnt from other runs can know.
 def tables(*, quick: bool) -> list[Table]:
     """Compare on simulated benches, on real carts, on the Silverbox."""
     warm = make_case(seed=FIRST_SEED, n=1, rate=RATE)
-    explain_gap(warm.records, springs=warm.springs, budget=0.0, workers=1)  # compiles the simulator
+    explain_gap(warm.records, SetUp(springs=warm.springs), budget=0.0)  # compiles the simulator
     found = benches(quick=quick)
     return [
         summary(found),

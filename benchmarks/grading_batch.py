@@ -23,18 +23,18 @@ import numpy as np
 import psutil
 
 from benchmarks.page import Table
-from pipeline.grading.batch.grade_class import grade_class
-from pipeline.grading.batch.runner import Limits
+from pipeline.grading.batch.grade_class import Options, grade_class
+from pipeline.grading.grade import grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.grading.similarity.shared import find_shared
 from pipeline.ingest.read import read_data
 from pipeline.results import Record
-from pipeline.schemas.grade import grade_text
+from pipeline.simulated.bench import COUNT
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import Students, write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import COUNT, write_submission
-from pipeline.synthesis.hidden import prepare_bench, write_bench
 
 ROOT = Path(__file__).parents[1]
 PRESET = "throne-2dof"
@@ -57,11 +57,11 @@ def write_class(folder: Path, teams: int, *, preset: str = PRESET) -> None:
     for seed in range(teams):
         write_submission(
             folder / f"team-{seed:03d}",
-            chain=preset,
+            preset,
             seed=seed,
-            authors=(f"s{seed}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{seed}",)),
         )
 
 
@@ -114,11 +114,7 @@ def grade(
             [folder],
             rubric_file=Path(preset),
             out=out,
-            jobs=jobs,
-            cluster=cluster,
-            limits=Limits(),
-            figures=figures,
-            progress=lambda *_: None,
+            options=Options(jobs=jobs, cluster=cluster, figures=figures),
         )
     return costs[0]
 
@@ -189,12 +185,12 @@ def copies(base: Path, *, teams: int) -> Table:
     for seed in range(teams):
         folder = base / str(seed)
         if seed % 3:
-            write_submission(folder, chain=PRESET, seed=seed, compact=True)
+            write_submission(folder, PRESET, seed=seed, compact=True)
         else:
             friction = prepare_bench(
                 preset=PRESET, model=None, hide=["coulomb_friction:cart=1,force=0.004"]
             )
-            write_bench(folder, friction, seed=seed, reported=False)
+            write_submission(folder, friction, seed=seed, reported=False)
         records.append(read_data(load_submission(folder)).records)
         shutil.rmtree(folder)
 

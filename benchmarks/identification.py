@@ -20,6 +20,7 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.parametrisation import Parametrisation, named_estimates
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, FrequencyResponse
+from pipeline.set_up import Bench
 from pipeline.stages.bode_fit import fit_bode
 
 RELATIVE_STD = 0.01
@@ -91,7 +92,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
 
 def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
     """Return the Cramér-Rao bound where values of standard error 1 are measured, by name."""
-    P = Parametrisation(n=chain.n, springs=(True,) * (chain.n + 1))
+    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
     p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))
     columns = []
@@ -143,7 +144,7 @@ def fit_from(
     responses: Sequence[FrequencyResponse], *, start: dict[str, float], n: int
 ) -> ChainFit:
     """Fit with all springs free, as for a bench nobody has told us about."""
-    return fit_bode(responses, n=n, springs=(True,) * (n + 1), initial=start)
+    return fit_bode(responses, bench=Bench(springs=(True,) * (n + 1)), initial=start)
 
 
 def drawn_start(chain: Chain, *, rng: np.random.Generator, wide: bool) -> dict[str, float]:

@@ -23,19 +23,19 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from pipeline.bench.design.information import Knowledge
-from pipeline.bench.design.next_plan import choose_next
-from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.next_recordings import choose_next
+from pipeline.experiments.plan import Plan, Recording
+from pipeline.experiments.propose import FURTHEST, propose_plan, renamed, rounded, rounded_down
 from pipeline.output import write_file
 from pipeline.plant.linear.chain import Array, Chain
 from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, settling_wait, steady_time
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.report.figures.style import LIFT, drawing, legend_above, small_multiples
+from pipeline.report.figures.style import drawing, legend_above, small_multiples
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Analysis
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.virtual import VirtualBench, new_folder
 
@@ -139,7 +139,7 @@ def draw(results: dict[str, list[tuple[list[Stage], Array]]]) -> str:
             axes.set(xlabel="time at the bench in s", yscale="log")
         panels[0].set_xlim(0.0)
         panels[0].set_ylabel("worst standard error in %")
-        legend_above(panels[0], lift=LIFT)
+        legend_above(panels[0])
         return plain_svg(to_svg(figure, name="next", alt="worst standard error against bench time"))
 
 

@@ -19,9 +19,9 @@ from matplotlib.figure import Figure
 from benchmarks.page import Table, installed, missing, spread
 from pipeline.report.figures.style import MODEL, SECOND, legend_above, panels
 from pipeline.resources import EXAMPLES
+from pipeline.simulated.submission import write_submission
 from pipeline.submission.load import NAME
 from pipeline.submission.models import MOST_EXPERIMENTS
-from pipeline.synthesis import write_submission
 
 TITLE = "Report"
 WORDS = """
@@ -160,7 +160,7 @@ def write_records(folder: Path, count: int) -> None:
     document: Any = None
     for session in range(count):  # one has some thirty
         part = folder.with_name(f"{folder.name}-part")
-        write_submission(part, chain="throne-1dof", seed=session, compact=True)
+        write_submission(part, "throne-1dof", seed=session, compact=True)
         document = tomlkit.parse((part / NAME).read_text(encoding="utf-8"))
         (folder / "data").mkdir(parents=True, exist_ok=True)
         for one in document["experiments"].unwrap():

@@ -18,12 +18,12 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 import json
 
 from benchmarks.drawn import acted, counted, draw, run_study, wilson
-from pipeline.bench.design.discriminate import propose_for
-from pipeline.bench.planning.plan import Recording
-from pipeline.bench.planning.plan_file import load_plan
-from pipeline.bench.planning.propose import renamed
 from pipeline.errors import PipelineError
-from pipeline.gap.investigate import investigate
+from pipeline.experiments.discriminate import propose_for
+from pipeline.experiments.plan import Recording
+from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.propose import renamed
+from pipeline.gap.explain import investigate
 from pipeline.gap.types import FoundEffect, Gap
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse

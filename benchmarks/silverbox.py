@@ -19,6 +19,7 @@ from benchmarks.free_runs import (
 from benchmarks.page import Table, installed, missing, significant
 from pipeline.gap.explain import explain_gap
 from pipeline.results import Record
+from pipeline.set_up import Bench, Units
 from tests.helpers.places import REAL_DATA
 
 TITLE = "The Silverbox"
@@ -88,7 +89,7 @@ def free_runs(*, quick: bool) -> Table:
     pieces = [cut(u, y, f"train-{s}", s, s + _PIECE) for s in starts]
     springs = (True, False)
     began = time.process_time()
-    gap = explain_gap(pieces, springs=springs, position_unit="V", workers=1)
+    gap = explain_gap(pieces, Bench(springs=springs, units=Units(position="V", input="V")))
     seconds = time.process_time() - began
     tests = {name: part_of(cut(u, y, name, a, b), first=START) for name, (a, b) in TESTS.items()}
     training = [part_of(piece) for piece in pieces]

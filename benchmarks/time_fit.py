@@ -6,6 +6,7 @@ import numpy as np
 
 from benchmarks.page import Table, share, spread
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 
@@ -45,7 +46,7 @@ def coverage(seeds: int) -> Table:
                     for swing in (1.0, 0.6)
                 ]
                 start = time.process_time()
-                fit = fit_records(records, n=chain.n, springs=(True,) * (chain.n + 1))
+                fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
                 spent.append(1e3 * (time.process_time() - start))
                 value = np.array([p.value for p in fit.parameters.values()])
                 std = np.array([p.std for p in fit.parameters.values()], dtype=float)
@@ -92,7 +93,7 @@ def convergence(chains: int) -> Table:
                 for swing in (1.0, 0.6, -1.0)
             ]
             start = time.process_time()
-            fit = fit_records(records, n=n, springs=springs)
+            fit = fit_records(records, bench=Bench(springs=springs))
             spent.append(1e3 * (time.process_time() - start))
             found += bool(fit.converged and np.max(np.abs(fit.chain.m / chain.m - 1)) < 0.1)
             starts += fit.n_starts

@@ -6,8 +6,7 @@ from benchmarks.page import Table, share
 from pipeline.arrays import Array
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.results import Record
-from pipeline.results_of_runs import Kind
+from pipeline.results import Kind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import fit_sine
 from pipeline.stages.step_gain import fit_step_gain

@@ -6,12 +6,14 @@ from pathlib import Path
 from pipeline.output import write_file
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect
-from pipeline.report.effects.page import BENCH, effect_picture, hiding_command
-from pipeline.report.effects.words import parameter_text
+from pipeline.report.effects.catalogue import parameter_text
+from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_command
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg
-from pipeline.report.phrases import phrases
-from pipeline.synthesis.hidden import usual_term
+from pipeline.report.render.builder import PageBuilder
+from pipeline.simulated.hidden import usual_term
+from pipeline.words.math import to_tex
+from pipeline.words.phrases import phrases
 
 DOCS = Path(__file__).parent
 IMAGES = Path("images", "effects")
@@ -24,7 +26,7 @@ def main() -> None:
     with drawing():
         for effect in CATALOGUE:
             term = usual_term(effect, PRESETS[BENCH])
-            picture = effect_picture(term, PRESETS[BENCH], bench=BENCH, number=1)
+            picture = effect_picture(PageBuilder(), term, PRESETS[BENCH], bench=BENCH)
             write_file(DOCS / IMAGES / f"{effect.key}.svg", plain_svg(picture.svg))
 
 
@@ -33,7 +35,7 @@ def effects_page() -> str:
     head = [
         "# The effects",
         "<!-- written by python -m docs.codegen -->",
-        phrases("report").text("effects"),
+        phrases("effects").text("effects"),
         "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
     ]
     return "\n\n".join([*head, *(part for e in CATALOGUE for part in _entry(e))]) + "\n"
@@ -43,7 +45,7 @@ def _entry(effect: Effect) -> Iterator[str]:
     term = usual_term(effect, PRESETS[BENCH])
     yield f"## {effect.title}"
     yield f"`{effect.key}`: {effect.sentence}"
-    yield f"```math\n{effect.equation}\n```"
+    yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
     yield f"![{effect.title}: its fingerprint, and a run with and without it]({picture})"
     facts = {

@@ -14,8 +14,9 @@ from pipeline.output import write_file
 from pipeline.report.draft.content import build_document
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.solution.write import build_solution
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench, write_bench
 from pipeline.workflow import analyse
 
 IMAGES = Path(__file__).parent / "images"
@@ -56,9 +57,9 @@ def tutorials(out: Path) -> None:
     bench = prepare_bench(
         preset="throne-2dof", model=None, hide=["coulomb_friction:cart=2,force=0.002"]
     )
-    write_bench(out, bench, seed=7, reported=False)
+    write_submission(out, bench, seed=7, reported=False)
     analysis = analyse(load_submission(out))
-    for document in (build_document(analysis, progress=None), build_solution(analysis)):
+    for document in (build_document(analysis), build_solution(analysis)):
         for picture in document.pictures():
             if picture.name in FIGURES:
                 write_file(IMAGES / FIGURES[picture.name], plain_svg(picture.svg))
@@ -91,8 +92,9 @@ def exploration(team: Path) -> None:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"))
         page = browser.new_page(viewport=WINDOW)
         page.goto(server.url)
-        page.get_by_role("link", name=f"{team.name}: bench").click()
-        page.locator("#explore-port").fill(address)
+        page.get_by_role("link", name="Bench").click()
+        page.get_by_text("Explore: the bench records").click()
+        page.locator("#explore-port").select_option(address)
         page.get_by_label("to within ± %").fill("0.01")
         page.get_by_role("button", name="Explore").click()
         page.locator("#thought:not([hidden])").wait_for(timeout=1e5)
@@ -119,12 +121,10 @@ def desk(team: Path, grades: Path) -> None:
         page.screenshot(path=IMAGES / "desk-lesson.png")
         page.goto(f"{server.url.rsplit('/', 2)[0]}/")
         page.get_by_role("link", name="Desk", exact=True).click()
+        page.get_by_text("Type a path").click()
         page.get_by_label("Folder on this computer").fill(str(grades))
         page.get_by_role("button", name="Open").click()
         page.get_by_role("link", name="team-2", exact=True).click()
-        page.locator(
-            "article.criterion", has=page.locator("img")
-        ).first.scroll_into_view_if_needed()
         page.screenshot(path=IMAGES / "desk-team.png")
         page.goto(f"{server.url.rsplit('/', 2)[0]}/exercises/?effect=coulomb_friction")
         page.locator("#hidden img").scroll_into_view_if_needed()

@@ -13,8 +13,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
-from pipeline.report.math.tex import from_tex
-from pipeline.report.math.tree import to_mathml
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.words.math import to_mathml, to_tex
 
 ROOT = Path(__file__).parents[1]
 _SHOWN = (
@@ -65,7 +65,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 
 def _formula(source: str, *_: Any, **__: Any) -> str:
-    return to_mathml(from_tex(source), display=True)
+    laws = {to_tex(effect.formula): effect.formula for effect in CATALOGUE}
+    return to_mathml(laws[source.strip()], display=True)
 
 
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:

@@ -1,11 +1,11 @@
 """One cartlab at a time writes into a folder: a run keeps others out, a change waits its turn."""
 
 import os
-import sqlite3
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from pipeline.errors import ConfigError
 from pipeline.output import LOCK, OWNERS_FOLDER, TURN
@@ -13,16 +13,12 @@ from pipeline.output import LOCK, OWNERS_FOLDER, TURN
 _PATIENCE = 30.0  # s for a turn, which takes less than one
 _AGAIN = 0.02  # s until who waits asks again
 
-# Where a database keeps its user's number, by SQLite's file format; the lock keeps its process
-# there, to be read by whoever the lock keeps out.
-_PROCESS = slice(60, 64)
-
 
 @contextmanager
 def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
     """Make a folder and keep other runs out of it; it goes again where nothing came of it.
 
-    The lock is SQLite's: it works on every system, and is gone with its process however that ends.
+    The lock is the system's: it is gone with its process however that ends.
 
     Parameters
     ----------
@@ -35,7 +31,7 @@ def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
     new, lock = not out.exists(), out / LOCK
     out.mkdir(OWNERS_FOLDER if private else 0o777, parents=True, exist_ok=True)
     try:
-        with _locked(lock):
+        with _locked(lock, patience=0.0):
             yield
     finally:
         if new and list(out.iterdir()) == [lock]:
@@ -59,40 +55,46 @@ def turn_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _locked(lock: Path, *, patience: float = 0.0) -> Iterator[None]:
-    if lock.is_symlink():
-        raise ConfigError(f"{lock}: is a link; remove it")
-    end = time.monotonic() + patience
-    while (connection := _taken(lock)) is None:
-        if time.monotonic() >= end:
-            process = int.from_bytes(lock.read_bytes()[_PROCESS], "big")
-            who = f" (process {process})" if process else ""
-            raise ConfigError(
-                f"{lock.parent}: another cartlab{who} writes there; wait for it, or name another "
-                "folder"
-            )
-        time.sleep(_AGAIN)
-    with closing(connection):
+def _locked(path: Path, *, patience: float) -> Iterator[None]:
+    if path.is_symlink():
+        raise ConfigError(f"{path}: is a link; remove it")
+    lock = FileLock(path, on_acquired=_sign, fallback_to_soft=False)
+    try:
+        lock.acquire(timeout=patience, poll_interval=_AGAIN)
+    except Timeout:
+        raise ConfigError(
+            f"{path.parent}: another cartlab{_holder(path)} writes there; wait for it, or name "
+            "another folder"
+        ) from None
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: {error.strerror or error}; is the folder yours to write?"
+        ) from None
+    try:
         yield
+    finally:
+        lock.release()
 
 
-def _taken(lock: Path) -> sqlite3.Connection | None:
-    """Return the connection that holds the lock until it is closed; None where another has it.
+# The number of the process stands behind a blank: the first byte of a lock can be read on Windows
+# by nobody but who holds it.
 
-    It is not waited for here: of several that wait within SQLite each keeps the others waiting.
-    """
-    with ExitStack() as stack:
-        try:
-            connection = sqlite3.connect(lock, timeout=0.0, isolation_level=None)
-            stack.callback(connection.close)
-            connection.execute("PRAGMA journal_mode = MEMORY")  # no further file
-            connection.execute("PRAGMA locking_mode = EXCLUSIVE")  # a commit keeps the lock
-            connection.execute("BEGIN EXCLUSIVE")
-            connection.execute(f"PRAGMA user_version = {os.getpid()}")
-            connection.execute("COMMIT")
-        except sqlite3.Error as error:
-            if error.sqlite_errorcode != sqlite3.SQLITE_BUSY:
-                raise ConfigError(f"{lock}: {error}; is the folder yours to write?") from None
-            return None
-        stack.pop_all()
-        return connection
+
+def _sign(file: int) -> None:
+    """Write this process's number into a lock that was taken, for whoever is kept out."""
+    before = os.read(file, 32)
+    # Up to version 0.2 a lock was a database.
+    if before.strip() and not before.strip().isdigit() and not before.startswith(b"SQLite format"):
+        raise OSError("is no lock of cartlab")
+    os.ftruncate(file, 0)
+    os.lseek(file, 0, os.SEEK_SET)
+    os.write(file, f" {os.getpid()}".encode())
+
+
+def _holder(path: Path) -> str:
+    try:
+        with path.open("rb", buffering=0) as file:
+            file.seek(1)
+            return f" (process {int(file.read(32))})"
+    except (OSError, ValueError):
+        return ""

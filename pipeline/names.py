@@ -1,13 +1,15 @@
-"""Names: of parameters, as in the paper's Tables 1-3, read only here; and of runs in a list.
+"""Names of parameters, as in the paper's Tables 1-3: read only here.
 
 `K_1` is the static gain of cart 1, `omega_2` and `zeta_2` belong to cart 2 alone, `omega_a`,
 `omega_b`, … are resonances and `omega_x`, `omega_y` the nulls of cart 1 with three carts. One
 cart has no index: `K`, `omega_n`, `zeta`; a body on no spring `mass`, `damping`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
+
+from pipeline.set_up import Units
 
 MODES = "abcdefgh"  # resonances, ascending in frequency
 NULLS = "xy"  # of cart 1 with three carts
@@ -61,6 +63,11 @@ class Name:
         return int(self.suffix) if self.suffix.isdigit() else None
 
     @property
+    def damping(self) -> str:
+        """The name of the damping ratio that belongs to a frequency: "zeta_1" to "omega_1"."""
+        return mode_zeta(self.suffix)
+
+    @property
     def words(self) -> str:
         """What it is, as one says it: "damping ratio ζ of cart 1"."""
         symbols = {"K": "static gain K", "omega": "frequency ω", "zeta": "damping ratio ζ"}
@@ -71,15 +78,15 @@ class Name:
             place = f" of {'null' if self.is_null else 'resonance'} {self.suffix}"
         return symbols.get(self.symbol, self.symbol) + place
 
-    def unit(self, *, position: str, input: str) -> str:
+    def unit(self, units: Units) -> str:
         """Return its unit; "" for a damping ratio."""
-        units = {
-            "K": f"{position}/{input}",
+        by_symbol = {
+            "K": units.gain,
             "omega": "rad/s",
-            "mass": f"{input} s^2/{position}",
-            "damping": f"{input} s/{position}",
+            "mass": units.mass,
+            "damping": units.damping,
         }
-        return units.get(self.symbol, "")
+        return by_symbol.get(self.symbol, "")
 
 
 @cache
@@ -87,6 +94,11 @@ def read_name(name: str) -> Name:
     """Return what a name stands for."""
     symbol, _, suffix = name.partition("_")
     return Name(symbol, suffix)
+
+
+def names_beginning(names: Iterable[str], prefix: str) -> list[str]:
+    """Return the names that somebody means who types how they begin: "zeta", "omega_1"."""
+    return [name for name in names if name.startswith(prefix)]
 
 
 def gain_name(cart: int, *, n: int) -> str:
@@ -128,28 +140,6 @@ def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
     for group in (MODES[:n], NULLS if n == 3 else "", carts):
         names += [f"{symbol}_{suffix}" for symbol in ("omega", "zeta") for suffix in group]
     return names
-
-
-def listed(ids: Sequence[str], *, most: int = 4) -> str:
-    """Return names, the middle of more than `most` left out."""
-    if len(ids) <= most:
-        return ", ".join(ids)
-    return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} in all)"
-
-
-def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Return one sentence a note, headed by the names of all it is about."""
-    about: dict[str, list[str]] = {}
-    for name, note in notes:
-        if note:
-            about.setdefault(note, []).append(name)
-    return [f"{listed(list(dict.fromkeys(names)))}: {note}" for note, names in about.items()]
-
-
-def first_few(names: Sequence[str], most: int) -> str:
-    """Return names with commas between them, those beyond the first few as a number."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
 
 
 def toml_flags(flags: Iterable[bool]) -> str:

@@ -10,17 +10,19 @@ from pipeline.exchange import frames, gap_frames
 from pipeline.gap.types import Gap
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import closed_loop
-from pipeline.plant.nonlinear.motion import Motion
-from pipeline.report.document import Block, Document, Heading, spans
+from pipeline.plant.nonlinear.motion import EquationsOfMotion
+from pipeline.report.document import Block, Document, Heading
 from pipeline.report.draft.content import build_document
 from pipeline.report.gap.section import with_gap
-from pipeline.report.gap.words import terminal_verdict
+from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.report.words import with_symbols
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
+from pipeline.words.progress import silent
+from pipeline.words.spans import spans
+from pipeline.words.text import with_symbols
 from pipeline.workflow import analyse as run
 
 if TYPE_CHECKING:
@@ -84,7 +86,7 @@ class Lab:
 
     @property
     def _reasons(self) -> str:
-        return "; ".join(f"{skip.stage}: {skip.reason}" for skip in self.results.skipped)
+        return "; ".join(f"{skip.name}: {skip.reason}" for skip in self.results.skipped)
 
     @cached_property
     def system(self) -> "control.StateSpace":
@@ -185,7 +187,7 @@ class Lab:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
-class Explained:
+class ExplainedGap:
     """What the linear carts leave out; at the end of a cell it shows its verdict.
 
     Attributes
@@ -225,7 +227,7 @@ class Explained:
         ------
         DataError : the drive leads its log, which no system of states can.
         """
-        return Motion(self.results.model).to_control()
+        return EquationsOfMotion(self.results.model).to_control()
 
     @property
     def records(self) -> tuple[str, ...]:
@@ -253,7 +255,7 @@ class Explained:
         return terminal_verdict(self.results)
 
 
-def explain(folder: Path | str, *, budget: float | None = None) -> Explained:
+def explain(folder: Path | str, *, budget: float | None = None) -> ExplainedGap:
     """Find what the linear model of a submission leaves out, as `cartlab gap` does.
 
     `budget` in s; past it the best answer so far.
@@ -263,11 +265,11 @@ def explain(folder: Path | str, *, budget: float | None = None) -> Explained:
     SubmissionError : `submission.toml` is wrong or missing, or no data can be read.
     DataError : no recording that a model could be held against.
     """
-    from pipeline.gap.investigate import investigate  # compiles, which takes its time
+    from pipeline.gap.explain import investigate  # compiles, which takes its time
 
     analysis = run(load_submission(Path(folder)), design=False)
-    found = investigate(analysis, budget=budget, progress=lambda text: None)
-    return Explained(results=found, analysis=analysis)
+    found = investigate(analysis, budget=budget, progress=silent)
+    return ExplainedGap(results=found, analysis=analysis)
 
 
 def analyse(folder: Path | str) -> Lab:
@@ -279,4 +281,4 @@ def analyse(folder: Path | str) -> Lab:
     """
     submission = load_submission(Path(folder))
     results, gap = with_gap(run(submission), submission.folder)
-    return Lab(results=results, document=build_document(results, gap=gap, progress=None))
+    return Lab(results=results, document=build_document(results, gap=gap))

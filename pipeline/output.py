@@ -15,9 +15,6 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 
-_PART = re.compile(r"\.[0-9a-f]{16}\.part")
-_FILES = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
-_LEFT_OVER = 3600.0  # s: no write takes so long, and no two clocks are so far apart
 OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of what names students
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
 # What looks like the start of a formula and is none: a number, and the dash for nothing.
@@ -47,7 +44,8 @@ def named_folder(out: Path) -> Path:
     ConfigError : something else is in its place, or its name is meant for a file: several are
         written.
     """
-    if not out.is_dir() and out.suffix.lower() in _FILES:
+    files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
+    if not out.is_dir() and out.suffix.lower() in files:
         raise ConfigError(f"{out}: several files are written; name a folder with --out")
     return check_folder(out)
 
@@ -105,9 +103,11 @@ def _for_the_owner(path: str, flags: int) -> int:
 # Once a folder: to look through thousands of files takes as long as to write one.
 @lru_cache(maxsize=1000)
 def _clear_left_over(folder: Path) -> None:
+    an_hour_ago = time.time() - 3600.0  # no write takes so long; clocks are not so far apart
     for part in folder.glob(".*.part"):
         with suppress(OSError):  # another has just removed it
-            if _PART.fullmatch(part.name) and part.stat().st_mtime < time.time() - _LEFT_OVER:
+            ours = re.fullmatch(r"\.[0-9a-f]{16}\.part", part.name)
+            if ours and part.stat().st_mtime < an_hour_ago:
                 part.unlink()
 
 

@@ -1,29 +1,192 @@
 """Processes of our own that do one task after another, so that a bad one can be stopped.
 
-`python -m MODULE` reads a line of JSON for each task on stdin and answers in lines on stdout.
+The parent's side is a `Supervisor`, the child's is `serve`: lines of JSON go both ways. The first
+line to the child says what its tasks have in common, every further one is a task. It answers
+`ready`, then for each task `stage` as often as it likes and `done` or `failed` at the end.
 """
 
+import faulthandler
+import json
 import os
 import queue
 import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Any, Literal
 
 import psutil
 
-_STDERR_SHOWN = 4_000  # characters
-_LAST_WORDS = 300  # characters of what a process said before it died
+from pipeline.errors import PipelineError
+from pipeline.garbage import collect_seldom
+from pipeline.words.progress import Progress, silent
+
+_GLANCE = 0.05  # s between looks at the clock, the memory and who wants it stopped
+_START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
+_STARTS = 3  # whoever frees memory may end a process that has just begun
+_TASKS_EACH = 500  # then a fresh process: what libraries keep does not pile up
+_GRACE = 30.0  # s after its limit until a task without a parent to stop it ends by itself
+_LAST_WORDS = 300  # characters of what a process, or a fault of our own, said
 _LUMP = 65_536  # bytes
-_ONE_THREAD = (
+# One thread computes; another only listens, and needs no heap of its own, of 64 MB in glibc.
+_ONE_EACH = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
+    "MALLOC_ARENA_MAX",
 )
+
+
+class Failed(PipelineError):
+    """A task came to nothing; the text says why."""
+
+
+class Ended(Failed):
+    """A process did not live to answer.
+
+    Attributes
+    ----------
+    how : why it ended; `crash` and `start` by itself, the latter before it could do anything.
+    status : its exit status or signal, in words.
+    said : the end of what it wrote to stderr.
+    """
+
+    def __init__(
+        self,
+        why: str,
+        *,
+        how: Literal["stopped", "time", "memory", "crash", "start"],
+        status: str = "",
+        said: str = "",
+    ) -> None:
+        super().__init__(why)
+        self.how, self.status, self.said = how, status, said
+
+
+class Supervisor:
+    """Has a process do tasks: started when needed, stopped at a limit, replaced after a fault.
+
+    Parameters
+    ----------
+    module : run by `python -m`, it calls `serve`.
+    memory : bytes that a task may take beyond what the process needs itself.
+    setup : plain data for `serve`, the same for all tasks.
+    """
+
+    def __init__(self, module: str, *, memory: int, setup: Mapping[str, Any] | None = None) -> None:
+        self._module, self._memory = module, memory
+        self._first = _json_line({"memory": memory, "setup": setup or {}})
+        self._process: LineProcess | None = None
+        self._done = 0
+
+    def do(
+        self,
+        task: Any,
+        *,
+        limit: float,
+        stop: threading.Event | None = None,
+        tell: Progress = silent,
+    ) -> Any:
+        """Return the answer to a task, both plain data.
+
+        Parameters
+        ----------
+        limit : s for it, the start of a process not included.
+        stop : set by whoever wants it no more.
+        tell : called with what it is about.
+
+        Raises
+        ------
+        Failed : it came to nothing.
+        Ended : neither did its process live on.
+        OSError : the computer starts no process.
+        """
+        stop = stop or threading.Event()
+        process = self._ready(stop)
+        most = process.memory + self._memory
+        end = time.monotonic() + limit
+        try:
+            process.send(_json_line({"task": task, "limit": limit}))
+        except OSError:
+            pass  # it has ended: the next line says so
+        while True:
+            answer = self._line(process, end=end, most=most, stop=stop)
+            if answer is None:
+                raise self._ended(process, f"stopped after {limit:g} s", "time")
+            if "stage" in answer:
+                tell(answer["stage"])
+                continue
+            self._done += 1
+            if self._done >= _TASKS_EACH:
+                self.close()
+            if "failed" in answer:
+                raise Failed(answer["failed"])
+            return answer["done"]
+
+    def close(self) -> None:
+        """End the process; the next task starts another."""
+        process, self._process = self._process, None
+        if process is not None:
+            process.close()
+
+    def _ready(self, stop: threading.Event) -> "LineProcess":
+        if self._process is not None and self._process.runs:
+            return self._process
+        said = why = ""
+        for _ in range(_STARTS):
+            self.close()
+            process = self._process = LineProcess(self._module)
+            self._done = 0
+            try:
+                process.send(self._first)
+                end = time.monotonic() + _START_LIMIT
+                if self._line(process, end=end, most=float("inf"), stop=stop) is not None:
+                    return process
+                why = f"the process did not start in {_START_LIMIT:g} s"
+            except Ended as error:
+                if error.how == "stopped":
+                    raise
+                why = str(error)
+            except OSError as error:  # it has ended
+                why = f"the process ended ({error.strerror})"
+            said = process.said()
+        self.close()
+        raise Ended(why, how="start", said=said)
+
+    def _line(
+        self, process: "LineProcess", *, end: float, most: float, stop: threading.Event
+    ) -> dict[str, Any] | None:
+        """Return what the process says next; None where it says nothing in time."""
+        while True:
+            if stop.is_set():
+                raise self._ended(process, "stopped", "stopped")
+            if time.monotonic() > end:
+                return None
+            if process.memory > most:
+                raise self._ended(process, "needed more memory than allowed", "memory")
+            try:
+                line = process.line(timeout=_GLANCE)
+            except queue.Empty:
+                continue
+            if not line:
+                raise self._ended(process, process.last_words(), "crash", process.ending())
+            return json.loads(line)
+
+    def _ended(
+        self,
+        process: "LineProcess",
+        why: str,
+        how: Literal["stopped", "time", "memory", "crash"],
+        status: str = "",
+    ) -> Ended:
+        said = process.said()
+        self.close()
+        return Ended(why, how=how, status=status, said=said)
 
 
 class LineProcess:
@@ -87,9 +250,11 @@ class LineProcess:
         return f"signal {-code}" if code < 0 else f"exit status {code}"
 
     def said(self) -> str:
-        """Return the end of what it wrote to stderr."""
+        """Return the end of what it wrote to stderr, "" once it is closed."""
+        if self._stderr.closed:
+            return ""
         self._stderr.seek(0)
-        return self._stderr.read().decode(errors="replace")[-_STDERR_SHOWN:]
+        return self._stderr.read().decode(errors="replace")[-4_000:]
 
     def last_words(self) -> str:
         """Return how it ended and the last line that it wrote to stderr."""
@@ -116,6 +281,66 @@ class LineProcess:
         self._lines.put(b"")
 
 
+def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
+    """Do what a `Supervisor` asks of this process; end at once when it is gone.
+
+    Parameters
+    ----------
+    prepare : given the set-up by name, it returns what does a task and tells how far it is.
+    """
+    collect_seldom()
+    say = answering()
+    faulthandler.enable()
+    sent: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_listen, args=(sent,), daemon=True).start()
+    first = json.loads(sent.get())
+    do = prepare(**first["setup"])
+    limit_memory(first["memory"])
+    say(ready=True)
+    while True:
+        asked = json.loads(sent.get())
+        faulthandler.dump_traceback_later(asked["limit"] + _GRACE, exit=True)
+        try:
+            say(done=attempt(lambda task=asked["task"]: do(task, lambda stage: say(stage=stage))))
+        except Failed as error:
+            say(failed=str(error))
+        faulthandler.cancel_dump_traceback_later()
+
+
+def attempt(work: Callable[[], Any]) -> Any:
+    """Do a task: what goes wrong costs this task, not the process.
+
+    Raises
+    ------
+    Failed : with the reason, for whoever asked.
+    """
+    try:
+        return work()
+    except PipelineError as error:
+        raise Failed(str(error)) from error
+    except MemoryError:
+        raise Failed("needs more memory than allowed") from None
+    except OSError as error:
+        said = f"{error.filename or ''}: {error.strerror or error}".lstrip(": ")
+        raise Failed(said) from error
+    except Exception as error:
+        traceback.print_exc()
+        what = f"{type(error).__name__}: {error}"[:_LAST_WORDS]
+        raise Failed(f"cartlab itself failed ({what}); please report it") from error
+
+
+def answering() -> Callable[..., None]:
+    """Keep stdout for answers, a line of JSON each; what libraries print goes to stderr."""
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+
+    def say(**line: Any) -> None:
+        answers.write(_json_line(line))
+        answers.flush()
+
+    return say
+
+
 def lines_sent() -> Iterator[bytes]:
     """Yield the lines that the parent sends, in such a process, until it is gone.
 
@@ -140,8 +365,18 @@ def limit_memory(more: int) -> None:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of such a process: one thread each, and the same package as here."""
+    """Return the environment of such a process: one thread, and the same package as here."""
     package = str(Path(__file__).resolve().parents[1])
     before = os.environ.get("PYTHONPATH")
     path = f"{package}{os.pathsep}{before}" if before else package
-    return {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
+    return {**os.environ, **dict.fromkeys(_ONE_EACH, "1"), "PYTHONPATH": path}
+
+
+def _listen(sent: "queue.SimpleQueue[bytes]") -> None:
+    for line in lines_sent():
+        sent.put(line)
+    os._exit(0)  # whatever is under way: files are written whole or not at all
+
+
+def _json_line(value: Any) -> bytes:
+    return json.dumps(value).encode() + b"\n"

@@ -4,28 +4,39 @@ Units throughout: the submission's own position unit (say cm) and input unit (sa
 radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
 sigma; `None` means it could not be had.
 
-It begins in `results_of_runs.py`, with a recording and what is read off it alone. It goes on
-where a package has types of its own: `Ingested` (`ingest/read.py`, what was read),
-`Identified` and `Fitted` (`identify/`, what the stages make of the records, up to the fit),
-`Repeats` (`identify/soundness/repeated_numbers.py`), `Gap` (`gap/types.py`, what the linear carts
-leave out and what explains it), `Grade` (`schemas/grade.py`, what a submission earned and why) and
-`Grading` (`grading/gradings.py`, what becomes of it in a class). `results_json.py` writes it all.
+It begins with a recording and what is read off it alone. It goes on where a package has types of
+its own: `Ingested` (`ingest/read.py`, what was read), `Identified` and `Fitted` (`identify/`, what
+the stages make of the records up to the fit), `Repeats` (`soundness/repeated_numbers.py`),
+`Gap` (`gap/types.py`, what the linear carts leave out and what explains it), `Grade`
+(`grading/grade.py`, what a submission earned and why) and `Grading` (`grading/gradings.py`, what
+becomes of it in a class). What a type marks as `written` is what its file holds, in that order
+(`json_files.py`).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from decimal import Decimal
+from enum import StrEnum
 from typing import Literal
 
 import numpy as np
 
+from pipeline import __version__
 from pipeline.arrays import Array, ComplexArray, freeze
+from pipeline.json_files import Matrix, Number, Numbers, Sha256, computed, result, written
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import Margins
 from pipeline.plant.loop.sampled_loop import StateFeedback
-from pipeline.results_of_runs import LogDecrement, Record, SinePoint, StepGain
+from pipeline.set_up import Bench, Units
 
+Kind = Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
+Hold = Literal["zero_order", "band_limited"]
 CheckOutcome = Literal["pass", "fail", "skip"]
+
+
+def passed(good: bool) -> CheckOutcome:
+    """Return the outcome of a check that passes where all is good, and else fails."""
+    return "pass" if good else "fail"
 
 
 # χ² per degree of freedom up to which model and noise explain the data: by chance it is under 1.5
@@ -33,24 +44,246 @@ CheckOutcome = Literal["pass", "fail", "skip"]
 EXPLAINED = 2.0
 
 
-# ----------------------------------------------------- frequency-domain stages
+# ----------------------------------------------------- a recording, and what it tells alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeadingUnit:
+    """A unit that a heading states; `converts`: into the submission's, else it was not heeded."""
+
+    role: Literal["position", "input"]
+    heading: str
+    unit: str
+    converts: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FrequencyResponse:
-    """X_cart/U at omega: (n_w,) arrays, ascending; carries its own grid, never interpolated.
+class Record:
+    """One measured time series, in physical units.
 
-    `phase` (rad) and its error are None for a table of amplitude ratios. `source`: sine dwells,
-    a table the students reduced, or transforms of step and sweep records; `experiments` are those.
+    Attributes
+    ----------
+    id : the experiment's id, used in every message.
+    t : (n,) s, strictly increasing, as measured: never assumed uniform.
+    u : (n,) input, or None where the file has none. Positive pushes cart 1 towards positive x.
+    y : (len(carts), n) positions; row j belongs to cart `carts[j]`.
+    carts : the carts that were measured.
+    free : the carts free to move; the others are held.
+    reference : (n,) set point of a closed-loop run, in position units, or None.
+    omega : frequency of a sine dwell, rad/s, or None.
+    resolution : (len(carts),) the encoder step, in position units; 0 where none is seen.
+    hold : how the input behaves between samples.
+    source : path inside the submission; `notes` say what reading it had to mend.
+    turned : its input was found to count the other way than the bench's others, and was turned.
+    position_scale, input_scale : what the file's own numbers were multiplied by to get y and u
+        (the sign included); a controller's gains may be in the file's units.
+    heading_units : what the headings of positions and input state.
     """
 
-    cart: int
-    omega: Array
-    magnitude: Array
-    magnitude_std: Array
-    phase: Array | None
-    phase_std: Array | None
-    source: Literal["dwells", "table", "records"]
+    id: str
+    kind: Kind
+    t: Array
+    u: Array | None
+    y: Array
+    carts: tuple[int, ...]
+    free: tuple[int, ...]
+    reference: Array | None = None
+    omega: float | None = None
+    resolution: Array
+    hold: Hold = "zero_order"
+    source: str = ""
+    notes: tuple[str, ...] = ()
+    turned: bool = False
+    position_scale: float = 1.0
+    input_scale: float = 1.0
+    heading_units: tuple[HeadingUnit, ...] = ()
+
+    def __post_init__(self) -> None:
+        freeze(self, "t", "u", "y", "reference", "resolution")
+        n = self.t.size
+        if self.y.shape != (len(self.carts), n) or self.resolution.shape != (len(self.carts),):
+            raise ValueError(f"{self.id}: y {self.y.shape} does not match carts and t ({n},)")
+        if any(a is not None and a.shape != (n,) for a in (self.u, self.reference)):
+            raise ValueError(f"{self.id}: the input or reference does not match t ({n},)")
+
+    def position(self, cart: int) -> Array:
+        """Return the measured position (n,) of one cart."""
+        return self.y[self.carts.index(cart)]
+
+    def encoder_step(self, cart: int) -> float:
+        """Return the encoder step of one cart, in position units; 0 where none is seen."""
+        return float(self.resolution[self.carts.index(cart)])
+
+    @property
+    def sample_time(self) -> float:
+        """The mean sample interval, s."""
+        return float((self.t[-1] - self.t[0]) / (self.t.size - 1))
+
+
+@result()
+class Intervention:
+    """A stretch of a record in which an unmeasured force moves a cart.
+
+    A hand, most likely; or one holds the cart away from its rest until it lets go.
+    """
+
+    experiment: str = written()
+    cart: int = written()
+    start: float = written("s", key="from")
+    end: float = written("s", key="to")
+    what: str = written(default="held or moved by a force that was not measured")
+
+
+@result(eq=False)
+class SinePoint:
+    """Sinusoidal steady state of one cart in one dwell."""
+
+    experiment: str = written()
+    cart: int = written()
+    omega: float = written("rad/s; fitted where the submission did not state it")
+
+    @property
+    @computed()
+    def gain(self) -> float:
+        """Amplitude ratio, position unit per input unit."""
+        return self.amplitude / self.input_amplitude
+
+    @property
+    @computed()
+    def gain_std(self) -> float:
+        """Standard error of the amplitude ratio, both amplitudes' errors combined."""
+        relative = (
+            (self.amplitude_std / self.amplitude) ** 2
+            + (self.input_amplitude_std / self.input_amplitude) ** 2
+            if self.amplitude > 0
+            else 0.0
+        )
+        return self.gain * relative**0.5 if self.amplitude > 0 else self.amplitude_std
+
+    phase: float = written("rad, of the position against the input's sine, in (-pi, pi]")
+    phase_std: float = written()
+    amplitude: float = written("of the position")
+    amplitude_std: float = written()
+    input_amplitude: float = written("of the measured input, fitted the same way")
+    input_amplitude_std: float = written()
+    steady_from: float = written("s; the transient is over, the fit uses t >= steady_from")
+    settled: bool = written("false where the record ends before a steady state is seen")
+    note: str = written(
+        "what a reader must know (few counts, not settled, off-sine residual), or empty", default=""
+    )
+    n_points: int
+
+
+@result(eq=False)
+class FrictionTest:
+    """The F-test for dry friction in a decay: does it explain more than viscous damping alone?"""
+
+    present: bool = written("whether the statistic is above its threshold")
+    f_statistic: Number = written("of one further parameter")
+    threshold: Number = written()
+    drop: Number = written("d = F/k, half the width of the friction band, position units")
+    drop_std: Number = written()
+    zeta: Number = written("with friction taken out")
+    zeta_std: Number = written()
+
+
+@result(eq=False)
+class LogDecrement:
+    """Free decay of one cart: peaks, envelope, natural frequency and damping ratio.
+
+    Attributes
+    ----------
+    peak_t, peak_y : (n_peaks,) the extrema used, maxima and minima in turn.
+    amplitude : (n_peaks - 2,) half the swing about the moving rest point, at peak_t[1:-1].
+    fit_t, fit_y : the fitted decay, for the figure; envelope_upper/lower at fit_t.
+    zeta_at_amplitude : (2, n) amplitude and the local damping ratio there.
+    """
+
+    experiment: str = written()
+    cart: int = written()
+    number: int | None = written(
+        "which of the recording's decays, from 1; null: the only one", older=None, default=None
+    )
+    release: float = written(
+        "s, where the free decay begins; a hold or a hand may come before it", older=0.0
+    )
+    delta: Number = written("logarithmic decrement per full cycle")
+    delta_std: Number = written()
+    omega_n: Number = written("rad/s, of the exponential-sinusoid fit, the better estimate")
+    omega_n_std: Number = written()
+    zeta: Number = written("of that fit; with dry friction present it is biased")
+    zeta_std: Number = written()
+    omega_n_peaks: Number = written("rad/s, of the extrema")
+    omega_n_peaks_std: float
+    zeta_peaks: Number = written("by the logarithmic decrement")
+    zeta_peaks_std: Number = written()
+    friction: FrictionTest | None = written()
+    note: str = written("what a reader must know, or empty", default="")
+    peak_t: Array
+    peak_y: Array
+    amplitude: Array
+    fit_t: Array
+    fit_y: Array
+    envelope_upper: Array
+    envelope_lower: Array
+    zeta_at_amplitude: Array
+
+    @property
+    def name(self) -> str:
+        """The record's id, and which of its decays it is."""
+        return f"{self.experiment}, decay {self.number}" if self.number else self.experiment
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StepEdge:
+    """One edge of the input and the levels on its two sides.
+
+    `gain` is (level_after - level_before) / (u_after - u_before); windows in s.
+    """
+
+    t: float
+    u_before: float
+    u_after: float
+    level_before: float
+    level_after: float
+    window_before: tuple[float, float]
+    window_after: tuple[float, float]
+    gain: float
+    gain_std: float
+
+
+@result(eq=False)
+class StepGain:
+    """Static gain of one cart from one step record."""
+
+    experiment: str = written()
+    cart: int = written()
+    gain: Number = written("weighted mean over the edges")
+    gain_std: Number = written("the spread of the edges included")
+    interval: tuple[float, float] | None = written("of the gain, where the cart sticks")
+    rest_shift: float | None = written(
+        "how far the rest point moved between first and last rest, by friction"
+    )
+    note: str = written(default="")
+    edges: tuple[StepEdge, ...]
+
+
+# ----------------------------------------------------- frequency-domain stages
+
+
+@result(eq=False)
+class FrequencyResponse:
+    """X_cart/U at each frequency; carries its own grid, never interpolated: (n_w,) arrays."""
+
+    cart: int = written()
+    omega: Array = written("rad/s, ascending")
+    magnitude: Array = written("position unit per input unit")
+    magnitude_std: Numbers = written()
+    phase: Numbers | None = written("rad; null for a table of amplitude ratios")
+    phase_std: Numbers | None = written()
+    source: Literal["dwells", "table", "records"] = written(
+        "sine dwells, a table the students reduced, or transforms of step and sweep records"
+    )
     experiments: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -73,13 +306,12 @@ class Estimate:
     experiments: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
 class ChainFit:
     """One chain fitted to the measurements of all carts at once.
 
     Attributes
     ----------
-    method : "bode_fit" (frequency response) or "time_fit" (time records).
     chain : the fitted plant.
     names : physical parameters that have a standard error ("m_1", "c_1", "k_2", …).
     covariance : (n_p, n_p) of those.
@@ -88,25 +320,24 @@ class ChainFit:
     parameters : the named parameters of the chain with standard errors, in table order. One that
         ended at its bound says so (`Estimate.at_bound`) and is in no table.
     staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.
-    chi_square_per_dof : near 1 where model and stated noise explain the data; see `explains_data`.
     misfit : of a "bode_fit" by how much of their magnitude points lie off it, beyond their errors.
     standardised : per cart (n_w,) or per record (n,): residual over its standard error.
     experiments : the recordings that it was fitted to.
     """
 
-    method: Literal["bode_fit", "time_fit"]
+    method: Literal["bode_fit", "time_fit"] = written("to the frequency response or time records")
+    chi_square_per_dof: Number = written("near 1 where model and stated noise explain the data")
+    dof: int = written()
+    n_points: int = written(key="points")
+    n_starts: int = written(key="starts")
+    converged: bool = written()
+    message: str = written()
     chain: Chain
     names: tuple[str, ...]
     covariance: Array
     at_bound: tuple[str, ...] = ()
     parameters: dict[str, Estimate]
     staged: dict[str, float] = field(default_factory=dict)
-    chi_square_per_dof: float
-    dof: int
-    n_points: int
-    n_starts: int
-    converged: bool
-    message: str
     misfit: float = 0.0
     standardised: dict[str, Array] = field(default_factory=dict)
     experiments: tuple[str, ...] = ()
@@ -125,117 +356,184 @@ class ChainFit:
 # ------------------------------------------------------------------- comparing
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class ParameterRow:
-    """A line of the paper's Tables 1-3.
+    """One parameter of the transfer functions, estimated in up to two ways: Tables 1-3."""
 
-    `consistent` is None where there is nothing to compare, or errors too wide to tell;
-    `independent` tells whether the two share no recording, None where there are not two.
-    """
-
-    name: str
-    unit: str
+    name: str = written("K_1, omega_a, zeta_1, …")
+    unit: str = written("empty for a damping ratio")
     initial: Estimate | None
     final: Estimate | None
-    change_percent: float | None
-    change_sigmas: float | None
-    consistent: bool | None
-    independent: bool | None = None
-    note: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Check:
-    """One consistency check, in a sentence for a student; outcome against `limit`."""
-
-    id: str
-    outcome: CheckOutcome
-    value: float | None
-    limit: float | None
-    message: str
 
     @property
-    def kind(self) -> str:
-        """What is asked, whatever it is asked of: "decay" of "decay.run-1.cart_1"."""
-        return self.id.partition(".")[0]
+    @computed(key="initial")
+    def initial_value(self) -> float | None:
+        """From the first stages."""
+        return self.initial and self.initial.value
+
+    @property
+    @computed()
+    def initial_std(self) -> float | None:
+        """In the unit of the parameter."""
+        return self.initial and self.initial.std
+
+    @property
+    @computed()
+    def initial_from(self) -> str | None:
+        """`step`, `log_decrement`, `frequency_response` or `assumed`."""
+        return self.initial and self.initial.source
+
+    @property
+    @computed(key="final")
+    def final_value(self) -> float | None:
+        """From the fit of all carts at once."""
+        return self.final and self.final.value
+
+    @property
+    @computed()
+    def final_std(self) -> float | None:
+        """In the unit of the parameter."""
+        return self.final and self.final.std
+
+    @property
+    @computed()
+    def final_from(self) -> str | None:
+        """`bode_fit`, `time_fit` or `log_decrement`."""
+        return self.final and self.final.source
+
+    change_percent: float | None = written("final against initial")
+    change_sigmas: float | None = written("in combined standard errors")
+    consistent: bool | None = written("null: nothing to compare, or errors too wide to tell")
+    independent: bool | None = written(
+        "false: both rest on the same recordings; null: there are not two",
+        older=None,
+        default=None,
+    )
+    note: str = written(default="")
+
+
+CheckKind = Literal[
+    "input",
+    "data",
+    "record",
+    "position_unit",
+    "input_unit",
+    "position_scale",
+    "input_scale",
+    "setup",
+    "held",
+    "dwells",
+    "late_channel",
+    "fit",
+    "physical",
+    "vanishing",
+    "redundancy",
+    "order",
+    "repeats",
+    "initial_final",
+    "step",
+    "decay",
+    "hardware",
+    "feedback",
+]
+
+
+@result()
+class Check:
+    """One consistency check, in a sentence for a student; outcome against `limit`.
+
+    Attributes
+    ----------
+    kind : what is asked, whatever it is asked of.
+    run, cart, parameter : what it is asked of, where that is one.
+    part : which of several questions of a kind: "converged" of the fit, "in_ab" of a frequency's
+        order, the number of a recording's decay.
+    """
+
+    @property
+    @computed()
+    def id(self) -> str:
+        """What is asked, and of what: "decay.run-1.cart_1"."""
+        return f"{self.kind}.{self.about}" if self.about else self.kind
+
+    kind: CheckKind
+    run: str = ""
+    cart: int | None = None
+    parameter: str = ""
+    part: str = ""
+    outcome: CheckOutcome = written()
+    value: float | None = written(default=None)
+    limit: float | None = written(default=None)
+    message: str = written()
 
     @property
     def about(self) -> str:
-        """Of what it is asked, "" where there is one thing only: "run-1.cart_1"."""
-        return self.id.partition(".")[2]
-
-    @classmethod
-    def of(
-        cls,
-        id: str,
-        good: bool,
-        message: str,
-        *,
-        value: float | None = None,
-        limit: float | None = None,
-    ) -> "Check":
-        """Return a check that passed, or failed."""
-        outcome: CheckOutcome = "pass" if good else "fail"
-        return cls(id=id, outcome=outcome, value=value, limit=limit, message=message)
-
-
-SIGN = "input.sign"  # of the check that fails where the data contradict the sign stated
+        """What it is asked of, "" where there is one thing only: "run-1.cart_1"."""
+        cart = "" if self.cart is None else f"cart_{self.cart}" if self.run else f"cart-{self.cart}"
+        if self.parameter and self.part:
+            return f"{self.parameter}_{self.part}"
+        return ".".join(filter(None, (self.run, cart, self.parameter, self.part)))
 
 
 # --------------------------------------------------------------------- control
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
 class FeedbackDesign:
-    """State feedback u = prefilter r - gains [x1, v1, x2, v2, …] and what it should do.
+    """The designed state feedback u = prefilter r - gains [x1, v1, x2, v2, …].
 
     Attributes
     ----------
-    gains : (2n,); prefilter = 1 / DC gain of the loop for the chosen cart.
-    poles : closed-loop poles as continuous equivalents (log z / sample_time), rad/s.
     requested_poles : what pole placement was asked for; None with LQR.
     Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u²; None with pole placement.
-    sample_time : s; the one-sample delay is part of the model the gains are made for.
-    overshoot_percent, settling_time (s, 2 %), peak_input : of the simulated step.
-    t, y (n_carts, n), u : that step.
-    reachable : False where the goal cannot be met; `message` says what is reachable.
-    margins : of the loop with its observer and delay, cut at the motor; None where not looked at.
+    t, y (n_carts, n), u : the simulated step.
     """
 
-    cart: int
-    method: Literal["poles", "lqr"]
-    reference: float
-    gains: Array
-    prefilter: float
-    poles: ComplexArray
+    cart: int = written()
+    method: Literal["poles", "lqr"] = written()
+    reference: float = written("size of the step, in position units")
+    gains: Array = written("(2n)")
+    prefilter: Number = written("1 / DC gain of the loop for the chosen cart")
+    poles: ComplexArray = written(
+        "[re, im] of the closed loop, continuous equivalents (log z / sample_time), rad/s"
+    )
+    sample_time: float = written("s; the delay of one sample is part of the model")
+    overshoot_percent: Number = written("of the simulated step")
+    settling_time: float | None = written("s, to within 2 %")
+    peak_input: Number = written()
+    margins: Margins | None = written(
+        "of the loop with its observer and delay, cut at the motor", older=None, default=None
+    )
+    reachable: bool = written("false where the goal cannot be met")
+    message: str = written("what is reachable")
     requested_poles: ComplexArray | None
     Q: Array | None = None
     R: float | None = None
-    sample_time: float
-    overshoot_percent: float
-    settling_time: float | None
-    peak_input: float
     t: Array
     y: Array
     u: Array
-    reachable: bool
-    message: str
-    margins: Margins | None = None
 
     def controller(self, chain: Chain) -> StateFeedback:
         """Return what runs: its observer knows the carts it was designed for."""
         return StateFeedback(gains=self.gains, prefilter=self.prefilter, model=chain)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result()
+class MeasuredInput:
+    """The plant alone, driven by the logged input."""
+
+    nrmse: Number = written()
+    input_scale: float | None = written(
+        "the factor on the logged input that explains the motion best"
+    )
+
+
+@result(eq=False)
 class HardwareCheck:
     """Model against measurement for one cart of one run, as Figures 15-17.
 
     Attributes
     ----------
-    loop : "closed" (the controller that ran, simulated) or "open" (measured input applied).
-    nrmse : root-mean-square of measured minus model over that of the measured position.
-    overshoot in percent of the change in level; settling_time s; steady_state position units.
     input_scale : the factor on the logged input that explains the motion best (1 = as logged),
         its sign included; None where it was not looked for.
     t, measured, model : (n,).
@@ -244,21 +542,26 @@ class HardwareCheck:
     contradicted : what was logged or stated of the run cannot be so; the note says how.
     """
 
-    experiment: str
-    cart: int
-    loop: Literal["closed", "open"]
-    nrmse: float
-    overshoot_model: float | None
-    overshoot_measured: float | None
-    settling_model: float | None
-    settling_measured: float | None
-    steady_state_model: float | None
-    steady_state_measured: float | None
+    experiment: str = written()
+    cart: int = written()
+    loop: Literal["closed", "open"] = written(
+        "closed: the controller that ran, simulated; open: the measured input applied"
+    )
+    nrmse: Number = written(
+        "root-mean-square of measured minus simulated position over that of the measured one"
+    )
+    overshoot_model: float | None = written("percent of the change in level")
+    overshoot_measured: float | None = written()
+    settling_model: float | None = written("s", key="settling_time_model")
+    settling_measured: float | None = written(key="settling_time_measured")
+    steady_state_model: float | None = written("position units")
+    steady_state_measured: float | None = written()
+    measured_input: MeasuredInput | None = written(default=None)
+    note: str = written(default="")
     input_scale: float | None
     t: Array
     measured: Array
     model: Array
-    note: str = ""
     contradicted: bool = False
     effort: Array | None = None
     set_point: Array | None = None
@@ -267,56 +570,77 @@ class HardwareCheck:
 # -------------------------------------------------------------------- together
 
 
-@dataclass(frozen=True, kw_only=True)
+class Stage(StrEnum):
+    """A stage that may not run, as results.json calls it."""
+
+    READING = "reading"
+    LOG_DECREMENT = "log decrement"
+    STEP_GAIN = "step gain"
+    SINE = "sine steady state"
+    FREQUENCY_RESPONSE = "frequency response"
+    RESONANCES = "resonances"
+    BODE_FIT = "Bode fit"
+    FINAL_ESTIMATES = "final estimates"
+    NAMED_PARAMETERS = "named parameters"
+    FINAL_PARAMETER = "final"
+    STATE_FEEDBACK = "state feedback"
+    MARGINS = "margins"
+    HARDWARE_CHECK = "hardware check"
+
+
+@result()
 class Skipped:
-    """A stage that could not run, and why.
+    """A stage that could not run, of what recording, cart or parameter if of one, and why.
 
     `missing` is what would let it run, in words. Where recordings are there and do not serve,
     the reason says why, and nothing is missing.
     """
 
-    stage: str
-    reason: str
+    @property
+    @computed(key="stage")
+    def name(self) -> str:
+        """The stage and what it is of: "step gain, run-1, cart 1", "reading run-1"."""
+        if self.stage in (Stage.READING, Stage.FINAL_PARAMETER):
+            return f"{self.stage} {self.run}{self.parameter}"
+        cart = "" if self.cart is None else f"cart {self.cart}"
+        return ", ".join(filter(None, (self.stage, self.run, cart)))
+
+    stage: Stage
+    run: str = ""
+    cart: int | None = None
+    parameter: str = ""
+    reason: str = written()
     missing: str = ""
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class LeftOut:
-    """A recording that was not used, and why, in words that follow its name.
+    """A recording that was not used, and why."""
 
-    `is_wrong` : it does not hold what happened, and the reason says how; else it only stands off
-    its repeats.
-    """
+    experiment: str = written()
+    reason: str = written("in words that follow its name")
+    is_wrong: bool = written(
+        "it does not hold what happened, and the reason says how; else it only stands off its "
+        "repeats",
+        older=False,
+    )
 
-    experiment: str
-    reason: str
-    is_wrong: bool
 
-
-@dataclass(frozen=True, kw_only=True)
+@result()
 class Assumption:
-    """Something about the bench that every number rests on, and how the data support it.
+    """Something about the bench that every number rests on, and how the data support it."""
 
-    Attributes
-    ----------
-    key : of submission.toml ("system.springs"); `about` says which ("wall-1"), "" the only one.
-    value : what was taken.
-    origin : "stated" in submission.toml, found from the "data", or a "default".
-    support : "open" where the data do not tell.
-    found, found_std : the number that the data give for it, if it is one.
-    experiments : the recordings that it is about, or that tell it.
-    reason : how the data support or contradict it, or why they do not tell.
-    """
-
-    key: str
-    about: str = ""
-    value: bool | str | float | tuple[int, ...]
-    origin: Literal["stated", "data", "default"]
-    support: Literal["supported", "contradicted", "open"]
-    found: float | None = None
-    found_std: float | None = None
-    experiments: tuple[str, ...] = ()
-    reason: str
+    key: str = written("of submission.toml: system.springs, …")
+    about: str = written("which one, where there are several: wall-1", default="")
+    value: bool | float | str | tuple[int, ...] = written("what was stated or taken")
+    origin: Literal["stated", "data", "default"] = written()
+    support: Literal["supported", "contradicted", "open"] = written("open: the data do not tell")
+    found: float | None = written("what the data give for it, if it is a number", default=None)
+    found_std: float | None = written(default=None)
+    experiments: tuple[str, ...] = written(
+        "the recordings it is about, or that tell it", default=()
+    )
+    reason: str = written("how the data support or contradict it, or why they do not tell")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,46 +658,154 @@ class LateChannel:
     experiments: tuple[str, ...]
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Analysis:
-    """All results of one submission, in pipeline order.
+@result()
+class Submitted:
+    """Whose it is, and the bench."""
 
-    `files` maps each data file to its SHA-256, `unreadable` each experiment that could not be read
-    to its reason, `unexplained` each driven recording in which the carts move to the share of its
-    motion's power that the fitted carts leave. `rows` are the table; `chain` is None where no fit
-    was possible (then `skipped` says why). `tables` are the students' own reduced tables, also
-    where dwells stand in their place; `reported` their numbers, initial and final, as typed;
-    `assumptions` what all of it rests on.
+    title: str = written()
+    section: str = written()
+    authors: tuple[str, ...] = written("ids")
+    carts: int = written()
+    springs: tuple[bool, ...] = written("wall-1, 1-2, …, n-wall")
+    units: Units = written()
+
+
+@result()
+class Provenance:
+    """What made a file, and of what."""
+
+    version: str = written("of cartlab", default=__version__)
+    files: dict[str, Sha256] = written("SHA-256 of every data file")
+
+
+@result()
+class ChainUnits:
+    """Units of masses, dampings and stiffnesses."""
+
+    m: str = written()
+    c: str = written()
+    k: str = written()
+
+
+@result(eq=False)
+class ChainWithUnits(Chain):
+    """Carts and springs with their units."""
+
+    units: ChainUnits = written()
+
+    @classmethod
+    def of(cls, chain: Chain, units: Units) -> "ChainWithUnits":
+        """Return a chain with the units that it has in the submission's."""
+        own = ChainUnits(m=units.mass, c=units.damping, k=units.stiffness)
+        return cls(m=chain.m, c=chain.c, k=chain.k, units=own)
+
+
+@result(eq=False)
+class StateSpaceMatrices:
+    """The state model; the state is (x1, v1, x2, v2, …)."""
+
+    A: Matrix = written()
+    B: Matrix = written()
+    C: Matrix = written()
+    D: Matrix = written()
+
+
+@result(eq=False)
+class Analysis:
+    """All results of one submission. A number that could not be had is null, never 0 or NaN.
+
+    Attributes
+    ----------
+    authors : (id, name) of each.
+    tables : the students' own reduced tables, also where dwells stand in their place.
+    rows : the table of parameters; `chain` is None where no fit was possible (then `skipped` says
+        why).
+    files : the SHA-256 of each data file.
+    unreadable : each experiment that could not be read to its reason.
+    unexplained : each driven recording in which the carts move to the share of its motion's power
+        that the fitted carts leave.
+    discussion : `notes.md`, without its comments.
+    reported : the students' own numbers, initial and final, as typed.
     """
 
+    schema: Literal["cartlab-results/1"] = written(default="cartlab-results/1")
     title: str
     section: str
-    authors: tuple[tuple[str, str], ...]  # (id, name)
-    carts: int
-    springs: tuple[bool, ...]
-    position_unit: str
-    input_unit: str
+    authors: tuple[tuple[str, str], ...]
+    bench: Bench
+
+    @property
+    @computed()
+    def submission(self) -> Submitted:
+        """Whose it is, and the bench."""
+        return Submitted(
+            title=self.title,
+            section=self.section,
+            authors=tuple(id_ for id_, _ in self.authors),
+            carts=self.bench.n,
+            springs=self.bench.springs,
+            units=self.bench.units,
+        )
+
     records: tuple[Record, ...]
-    log_decrements: tuple[LogDecrement, ...]
-    step_gains: tuple[StepGain, ...]
     sine_points: tuple[SinePoint, ...]
-    frequency_responses: tuple[FrequencyResponse, ...]
     tables: tuple[FrequencyResponse, ...] = ()
-    fit: ChainFit | None
-    rows: tuple[ParameterRow, ...]
-    checks: tuple[Check, ...]
-    feedback: FeedbackDesign | None
+    rows: tuple[ParameterRow, ...] = written(key="parameters")
+
+    @property
+    @computed(key="chain")
+    def chain_with_units(self) -> ChainWithUnits | None:
+        """The fitted carts and springs."""
+        return self.chain and ChainWithUnits.of(self.chain, self.bench.units)
+
+    @property
+    @computed()
+    def state_space(self) -> StateSpaceMatrices | None:
+        """The state model of the chain."""
+        if self.chain is None:
+            return None
+        A, B, C, D = self.chain.state_space()
+        return StateSpaceMatrices(A=A, B=B, C=C, D=D)
+
+    fit: ChainFit | None = written()
+    log_decrements: tuple[LogDecrement, ...] = written()
+    step_gains: tuple[StepGain, ...] = written()
+    frequency_responses: tuple[FrequencyResponse, ...] = written(key="frequency_response")
+    checks: tuple[Check, ...] = written()
+    feedback: FeedbackDesign | None = written()
     hardware: tuple[HardwareCheck, ...]
-    skipped: tuple[Skipped, ...]
-    warnings: tuple[str, ...]
+
+    @property
+    @computed(key="hardware")
+    def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
+        """One entry a run and cart: the loop that ran, with the measured-input check inside it."""
+        found: dict[tuple[str, int], HardwareCheck] = {}
+        for check in sorted(self.hardware, key=lambda check: check.loop):  # "closed" before "open"
+            key = (check.experiment, check.cart)
+            found.setdefault(key, check)
+            if check.loop == "open":
+                own = MeasuredInput(nrmse=check.nrmse, input_scale=check.input_scale)
+                found[key] = replace(found[key], measured_input=own)
+        return tuple(found[key] for key in sorted(found))
+
+    assumptions: tuple[Assumption, ...] = written(
+        "springs, units, scales, sign, free carts", older=(), default=()
+    )
+    skipped: tuple[Skipped, ...] = written()
+    warnings: tuple[str, ...] = written()
     files: dict[str, str]
     unreadable: dict[str, str] = field(default_factory=dict)
     unexplained: dict[str, float] = field(default_factory=dict)
-    discussion: str | None  # notes.md, without its comments
+    discussion: str | None
     left_out: tuple[LeftOut, ...] = ()
     late_channels: tuple[LateChannel, ...] = ()
     reported: Mapping[str, Mapping[str, Decimal]] = field(default_factory=dict)
-    assumptions: tuple[Assumption, ...] = ()
+
+    @property
+    @computed()
+    def provenance(self) -> Provenance:
+        """What made the file, and of what."""
+        return Provenance(files=dict(sorted(self.files.items())))
 
     @property
     def chain(self) -> Chain | None:

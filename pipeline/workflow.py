@@ -4,45 +4,43 @@ The stages that measure the carts stand in order in `identify/carts.py`, their f
 `identify/fit.py`; what follows them is here.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from pipeline.checks.carts import check_carts
-from pipeline.checks.channels import check_channels, find_late_channels
 from pipeline.checks.estimates import check_decays, check_rows, check_steps
 from pipeline.checks.loops import check_loops, design_margins, verify_design
-from pipeline.checks.recordings import (
-    check_dwells,
-    check_files,
-    check_held,
-    check_left_out,
-    check_scales,
-    check_setup,
-    check_signs,
-    check_units,
-)
+from pipeline.checks.recordings import check_recordings
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
-from pipeline.identify.carts import UNTIED
-from pipeline.identify.log import Log, Progress
+from pipeline.identify.carts import compare_estimates
+from pipeline.identify.log import Log
 from pipeline.identify.remarks import hand_remarks, reading_remarks, turn_of_the_gains
 from pipeline.identify.sound import identify_from_sound
-from pipeline.ingest.read import read_data
-from pipeline.names import by_note, parameter_names
-from pipeline.results import Analysis, ChainFit, FeedbackDesign, HardwareCheck, LeftOut, Record
-from pipeline.stages.compare import compare, why_open
+from pipeline.ingest.read import Ingested, read_data
+from pipeline.results import (
+    Analysis,
+    ChainFit,
+    FeedbackDesign,
+    HardwareCheck,
+    Intervention,
+    Stage,
+)
+from pipeline.soundness.fault import sound_ones
+from pipeline.soundness.late_channels import find_late_channels
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design, Submission
+from pipeline.words.numbers import by_note
+from pipeline.words.phrases import phrases
+from pipeline.words.progress import Progress, silent
 
-
-def _silent(text: str) -> None:
-    pass
+_WORDS = phrases("skipped")
 
 
 def analyse(
-    submission: Submission, *, design: bool = True, progress: Progress = _silent
+    submission: Submission, *, design: bool = True, progress: Progress = silent
 ) -> Analysis:
     """Run every stage that the submission's data support; the rest is skipped with its reason.
 
@@ -52,91 +50,44 @@ def analyse(
     ------
     SubmissionError : none of the data files can be read.
     """
-    system = submission.system
-    position, drive = system.position.unit, system.input.unit
-    log = Log()
+    bench, log = submission.system.bench, Log()
 
     progress("reading the data")
-    data = read_data(submission)
-    for name, reason in data.unreadable.items():
-        log.skip(f"reading {name}", reason)
-    log.warn(reading_remarks(data, unit=position))
+    data, interventions = _read(submission, log=log)
 
-    interventions = find_interventions(data.records)
-    log.warn(hand_remarks(interventions, records=data.records))
     found, left_out = identify_from_sound(
-        data, interventions=interventions, system=system, progress=progress
+        data, interventions=interventions, bench=bench, progress=progress
     )
+    rows = compare_estimates(found, bench=bench)
     log.add(found.log)
-    wrong = {one.experiment for one in left_out if one.is_wrong}
-    sound = [record for record in data.records if record.id not in wrong]
-    fit, final = found.fit, found.fit.parameters if found.fit else {}
-    if fit and not final:
-        log.skip("named parameters", UNTIED)
-    for name, estimate in final.items():
-        if reason := why_open(name, estimate):
-            log.skip(f"final {name}", reason)
-    rows = compare(
-        found.initial,
-        final=final,
-        names=list(final) or parameter_names(system.carts, rigid=system.rigid),
-        position_unit=position,
-        input_unit=drive,
-        fitted_to=fit.experiments if fit else (),
-    )
-    late = find_late_channels(sound, carts=system.carts)
-    signs = check_signs(data.signs, without=wrong)
-    checks = [
-        *signs,
-        *check_files(data.unreadable),
-        *check_units(data.records, system=system),
-        *check_scales(sound, system=system),
-        *check_left_out(left_out, records=data.records),
-        *check_setup(data.records),
-        *check_held(data.records),
-        *check_dwells(data.records, found.sines),
-        *check_channels(late),
+    late = find_late_channels(sound_ones(data.records, left_out), carts=bench.n)
+    checks = (
+        *check_recordings(data, left_out=left_out, sines=found.sines, late=late, bench=bench),
         *found.repeats.checks,
         *check_rows(rows),
-        *check_decays(found.decays, records=data.records, position_unit=position),
-        *check_steps(found.gains, decays=found.decays, gain_unit=f"{position}/{drive}"),
-        *check_carts(fit, springs=system.springs),
-    ]
+        *check_decays(found.decays, records=data.records, bench=bench),
+        *check_steps(found.gains, decays=found.decays, bench=bench),
+        *check_carts(found.fit, bench=bench),
+    )
 
-    feedback = None
-    if design:
-        progress("state feedback")
-        feedback = _design(submission, fit, log=log)
-    if feedback and fit:
-        margins = log.attempt("margins", design_margins, fit.chain, feedback)
-        feedback = replace(feedback, margins=margins)
-        checks.append(verify_design(fit.chain, feedback))
-        log.warn([] if signs else turn_of_the_gains(data.records))
-    progress("hardware against model")
-    hardware = _hardware(submission, data.records, fit, left_out=left_out, log=log)
-    checks += check_loops(hardware)
-
-    return Analysis(
+    analysis = Analysis(
         title=submission.title,
         section=submission.section,
         authors=tuple((author.id, author.name) for author in submission.authors),
-        carts=system.carts,
-        springs=system.springs,
-        position_unit=position,
-        input_unit=drive,
+        bench=bench,
         records=data.records,
         log_decrements=tuple(found.decays),
         step_gains=tuple(found.gains),
         sine_points=tuple(found.sines),
         frequency_responses=tuple(found.responses),
         tables=tuple(data.tables),
-        fit=fit,
+        fit=found.fit,
         rows=rows,
-        checks=tuple(checks),
-        feedback=feedback,
-        hardware=tuple(hardware),
-        skipped=tuple(log.skipped),
-        warnings=tuple(log.warnings),
+        checks=checks,
+        feedback=None,
+        hardware=(),
+        skipped=(),
+        warnings=(),
         files=data.files,
         unreadable=data.unreadable,
         unexplained={name: one.share for name, one in found.fitted.fits.items()},
@@ -144,11 +95,53 @@ def analyse(
         left_out=tuple(left_out),
         late_channels=late,
         reported=submission.typed,
-        assumptions=list_assumptions(submission, data=data, fit=fit, checks=checks),
+        assumptions=list_assumptions(submission, data=data, fit=found.fit, checks=checks),
     )
+    return _with_loops(analysis, submission, design=design, progress=progress, log=log)
+
+
+def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Intervention, ...]]:
+    """Return what the files hold, and where a force that was not measured moved a cart."""
+    data = read_data(submission)
+    for name, reason in data.unreadable.items():
+        log.skip(Stage.READING, reason, run=name)
+    log.warn(reading_remarks(data, unit=submission.system.bench.units.position))
+    interventions = find_interventions(data.records)
+    log.warn(hand_remarks(interventions, records=data.records))
+    return data, interventions
 
 
 # ----------------------------------------------- what rests on the carts
+
+
+def _with_loops(
+    analysis: Analysis, submission: Submission, *, design: bool, progress: Progress, log: Log
+) -> Analysis:
+    """Return the analysis with the designed loop and those that ran, and all that the log holds."""
+    fit, feedback, checks = analysis.fit, None, list(analysis.checks)
+    if design:
+        progress("state feedback")
+    if design and submission.design is None:
+        log.skip(Stage.STATE_FEEDBACK, _WORDS.text("no_goal"), missing=_WORDS.text("goal"))
+    elif design:
+        design_loop = partial(reference_design, submission, fit)
+        feedback = log.attempt(Stage.STATE_FEEDBACK, design_loop)
+    if feedback and fit:
+        margins = log.attempt(Stage.MARGINS, partial(design_margins, fit.chain, feedback))
+        feedback = replace(feedback, margins=margins)
+        checks.append(verify_design(fit.chain, feedback))
+        if not any(check.kind == "input" for check in checks):
+            log.warn(turn_of_the_gains(analysis.records))
+    progress("hardware against model")
+    hardware = _hardware(submission, analysis, log=log)
+    return replace(
+        analysis,
+        checks=(*checks, *check_loops(hardware)),
+        feedback=feedback,
+        hardware=tuple(hardware),
+        skipped=tuple(log.skipped),
+        warnings=tuple(log.warnings),
+    )
 
 
 def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDesign:
@@ -159,47 +152,30 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
     DataError : they are not identified well enough to design for.
     """
     if fit is None:
-        raise DataError("the carts are not identified")
+        raise DataError(_WORDS.text("no_carts"))
     if not fit.converged:
         raise DataError(f"the fit of the carts did not converge: {fit.message}")
     task = submission.design or Design(cart=submission.system.carts)
-    return design_feedback(fit.chain, **dict(task))
+    return design_feedback(fit.chain, task)
 
 
-def _design(submission: Submission, fit: ChainFit | None, *, log: Log) -> FeedbackDesign | None:
-    if submission.design is None:
-        log.skip(
-            "state feedback",
-            "no goal is stated: add a [design] table to submission.toml",
-            missing="a [design] table with the goal of the controller",
-        )
-        return None
-    return log.attempt("state feedback", reference_design, submission, fit)
-
-
-def _hardware(
-    submission: Submission,
-    records: Sequence[Record],
-    fit: ChainFit | None,
-    *,
-    left_out: Sequence[LeftOut],
-    log: Log,
-) -> list[HardwareCheck]:
-    runs = {record.id: record for record in records if record.kind == "closed_loop"}
-    if not runs or fit is None:
-        if runs:
-            log.skip("hardware check", "the carts are not identified")
-        else:
-            reason = "no closed-loop run was recorded"
-            log.skip("hardware check", reason, missing="a closed-loop run")
+def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[HardwareCheck]:
+    """Return how the loops that ran compare with the carts."""
+    fit = analysis.fit
+    runs = {record.id: record for record in analysis.records if record.kind == "closed_loop"}
+    if not runs:
+        log.skip(Stage.HARDWARE_CHECK, _WORDS.text("no_loop"), missing=_WORDS.text("loop"))
         return []
-    for one in left_out:
+    if fit is None:
+        log.skip(Stage.HARDWARE_CHECK, _WORDS.text("no_carts"))
+        return []
+    for one in analysis.left_out:
         if runs.pop(one.experiment, None):
-            log.skip(f"hardware check, {one.experiment}", f"it is left out: {one.reason}")
+            reason = _WORDS.text("left_out", reason=one.reason)
+            log.skip(Stage.HARDWARE_CHECK, reason, run=one.experiment)
     checks: list[HardwareCheck] = []
     for experiment in [one for one in submission.experiments if one.id in runs]:
-        found = log.attempt(
-            f"hardware check, {experiment.id}",
+        compare_run = partial(
             check_hardware,
             runs[experiment.id],
             fit.chain,
@@ -207,7 +183,7 @@ def _hardware(
             controlled_cart=experiment.controlled_cart,
             input_limit=submission.design.input_limit if submission.design else None,
         )
-        checks += found or ()
+        checks += log.attempt(Stage.HARDWARE_CHECK, compare_run, of=experiment.id) or ()
     log.warn(
         by_note((f"{c.experiment}, cart {c.cart}", c.note) for c in checks if not c.contradicted)
     )

@@ -201,6 +201,7 @@
       class: 'stage', tabindex: 0, role: 'group',
       'aria-label': 'Interactive figure: arrow keys read values, plus and minus zoom, 0 shows all',
     });
+    const all = button('All', 'Show all', () => reset());
     let active = panels[0], at = null, start = null;
 
     const zoom = (panel, across, up) => {
@@ -222,11 +223,14 @@
         p.y.view = [0, 1];
         p.redraw();
       }
+      if (document.activeElement === all) stage.focus({ preventScroll: true });
       read();
     };
 
     function read() {
+      all.hidden = panels.every((p) => p.whole);
       cursor.replaceChildren();
+      values.hidden = !at;
       if (!at) return;
       const snap = active.series.find((s) => s.points && s.x.length);
       const value = snap ? snap.x[snap.nearest(active, at)] : active.x.value(active.x.under(at.x));
@@ -316,13 +320,16 @@
       read();
     });
 
-    svg.before(stage);
+    stage.addEventListener('blur', () => { at = null; read(); });
+
+    // Buttons stand on the figure, values over its caption: neither takes room of its own.
+    const plot = make('div', { class: 'plot' }, stage, make('div', { class: 'tools' },
+      make('span', { class: 'hint' }, 'Point for values, drag to zoom'), all,
+      button('+', 'Zoom in', () => scale(0.5)), button('−', 'Zoom out', () => scale(2))), values);
+    svg.before(plot);
     stage.append(svg);
     svg.append(marquee, cursor);
-    const hint = make('span', { class: 'hint' }, 'Point for values, drag to zoom.');
-    stage.after(make('div', { class: 'tools' },
-      button('+', 'Zoom in', () => scale(0.5)), button('−', 'Zoom out', () => scale(2)),
-      button('All', 'Show all', reset), hint, values));
+    read();
   }
 
   document.querySelectorAll('figure').forEach(explore);

@@ -3,8 +3,6 @@
   'use strict';
   const WINDOW = 10; // s shown
   const COUNTERS = ['lines', 'lost', 'garbled', 'late', 'resets', 'stuck'];
-  const COLOURS = ['--f-model', '--f-second', '--f-third', '--f-mark'];
-  const DASH = [6, 4];
   const $ = (id) => document.getElementById(id);
   const make = (tag, text = '', name = '') => {
     const element = document.createElement(tag);
@@ -46,7 +44,7 @@
     const again = state.offered.includes('repeat');
     for (const button of document.querySelectorAll('[data-wish]'))
       if (button.id !== 'stop') button.disabled = !state.offered.includes(button.dataset.wish);
-    $('stop').disabled = state.phase === 'over';
+    if (state.phase === 'over') showEnd();
     $('confirm').hidden = again;
     if (asked) {
       $('ask').hidden = !state.instruction;
@@ -58,6 +56,15 @@
     if (rekeyed) listKeys();
     $('told').hidden = state.remarks.length === 0;
     $('remarks').replaceChildren(...state.remarks.map((text) => make('li', text)));
+  };
+  // Nothing can be pressed any more; at the desk, links lead to what came of it.
+  const showEnd = () => {
+    for (const button of document.querySelectorAll('[data-wish]')) {
+      button.disabled = true;
+      button.hidden = button.id !== 'stop';
+    }
+    $('stop').textContent = 'Session over';
+    document.querySelector('.controls').append(...($('after')?.children ?? []));
   };
   // Of an exploration: why it records what it records, and its diary, which the desk shows below.
   let thoughts = 0;
@@ -75,13 +82,29 @@
     diary.closest('section').hidden = false;
     diary.src = `${diary.dataset.page}?${number}#errors`;
   };
+  const listEntry = (entry, word = entry.state) => {
+    const item = make('li', '', entry.state);
+    item.append(make('span', word, 'state'), make('b', entry.id), make('span', entry.what, 'what'));
+    if (entry.why) item.append(make('span', entry.why, 'why'));
+    return item;
+  };
+  // What is recorded is folded, so that the run at hand and the next are in sight.
   const listPlan = () => {
-    $('plan').replaceChildren(...state.plan.map((entry) => {
-      const item = make('li', '', entry.state);
-      item.append(make('span', entry.state, 'state'), make('b', entry.id), make('span', entry.what, 'what'));
-      if (entry.why) item.append(make('span', entry.why, 'why'));
-      return item;
-    }));
+    const done = state.plan.filter((entry) => entry.state === 'done');
+    const left = state.plan.filter((entry) => entry.state !== 'done');
+    const next = left.find((entry) => entry.state !== 'now');
+    const items = left.map((entry) => listEntry(entry, entry === next ? `next${entry.why ? ', again' : ''}` : entry.state));
+    if (done.length) {
+      const fold = make('details');
+      const list = make('ol');
+      fold.open = $('plan').querySelector('details')?.open ?? false;
+      list.append(...done.map((entry) => listEntry(entry)));
+      fold.append(make('summary', `${done.length} recorded`), list);
+      const item = make('li', '', 'fold');
+      item.append(fold);
+      items.unshift(item);
+    }
+    $('plan').replaceChildren(...items);
     const now = $('plan').querySelector('.now');
     if (now) $('plan').scrollTop = now.offsetTop - $('plan').clientHeight / 3;
   };
@@ -113,26 +136,27 @@
 
   // ------------------------------------------------------------------ plots
 
-  // What a plot draws: column of a point, name, colour, whether it is dashed.
+  // What a plot draws: column of a point, name, colour, and where its strokes and gaps are told.
   const series = (id) => {
-    const target = { column: 2, name: 'target', colour: '--f-axis', dashed: true };
+    const target = { column: 2, name: 'target', colour: '--f-axis', dash: '--target-dash', width: 1.5 };
     if (id === 'inputs') {
-      const input = { column: 1, name: 'input', colour: COLOURS[0] };
+      const input = { column: 1, name: 'input', colour: '--f-model', dash: '--cart-1-dash' };
       return state.closed ? [input] : [target, input];
     }
-    const carts = Array.from({ length: state.carts }, (_, i) => ({ column: 3 + i, name: `cart ${i + 1}`, colour: COLOURS[i] }));
+    const carts = Array.from({ length: state.carts }, (_, i) => (
+      { column: 3 + i, name: `cart ${i + 1}`, colour: `--cart-${i + 1}`, dash: `--cart-${i + 1}-dash` }));
     return state.closed ? [target, ...carts] : carts;
   };
   const SVG = 'http://www.w3.org/2000/svg';
   const listKeys = () => {
     for (const id of ['positions', 'inputs']) {
-      $(id).closest('figure').querySelector('.keys').replaceChildren(...series(id).map(({ name, colour, dashed }) => {
+      $(id).closest('figure').querySelector('.keys').replaceChildren(...series(id).map(({ name, colour, dash }) => {
         const item = make('li');
         const svg = document.createElementNS(SVG, 'svg');
         const line = document.createElementNS(SVG, 'line');
         for (const [key, value] of Object.entries({ x1: 0, x2: '100%', y1: '50%', y2: '50%', stroke: `var(${colour})` }))
           line.setAttribute(key, value);
-        if (dashed) line.setAttribute('stroke-dasharray', DASH.join(' '));
+        line.style.strokeDasharray = `var(${dash})`;
         svg.setAttribute('aria-hidden', 'true');
         svg.append(line);
         item.append(svg, make('span', name), ' ', make('span', '–', 'value'));
@@ -202,8 +226,8 @@
     pen.lineJoin = 'round';
     for (const line of lines) {
       pen.strokeStyle = colour(line.colour);
-      pen.lineWidth = line.dashed ? 1.5 : 2;
-      pen.setLineDash(line.dashed ? DASH : []);
+      pen.lineWidth = line.width ?? 2;
+      pen.setLineDash(colour(line.dash).trim().split(' ').map(Number));
       pen.beginPath();
       shown.forEach((p, i) => (i ? pen.lineTo(x(p[0]), y(p[line.column])) : pen.moveTo(x(p[0]), y(p[line.column]))));
       pen.stroke();

@@ -43,13 +43,14 @@ settings.load_profile("cartlab")
 CHROMIUM = shutil.which("chromium")
 _BENCHES = "benches"  # the group of the files that wait for them most of their time
 _WITH_BENCHES = {
-    "bench/test_acquire", "bench/test_mistakes", "bench/test_safety", "bench/test_emulator",
-    "system/test_live_page",
+    "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
+    "simulated/emulator/test_server", "system/test_live_page",
 }  # fmt: skip
 _LONGEST = {  # which end long after the others where they begin last
-    "bench/test_explore", "desk/test_grades", "desk/test_student", "gap/test_explain",
+    "experiments/exploring/test_explore", "desk/test_grades", "desk/test_student",
+    "gap/test_explain",
     "grading/mistakes/test_faults", "grading/test_class", "report/test_report",
-    "statistics/test_gap", "synthesis/test_hidden", "system/test_desk_rooms",
+    "statistics/test_gap", "simulated/test_hidden", "system/test_desk_rooms",
     "system/test_report_pages",
 }  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
@@ -138,7 +139,7 @@ def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Desks do their work in this process, not in others."""
     from tests.helpers.desks import WorkerHere
 
-    monkeypatch.setattr("pipeline.desk.jobs.LineProcess", WorkerHere)
+    monkeypatch.setattr("pipeline.desk.jobs.Supervisor", WorkerHere)
 
 
 @pytest.fixture(scope="module")

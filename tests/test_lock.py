@@ -60,7 +60,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 def test_a_lock_that_is_none_is_said(tmp_path):
     """A file of that name that is no lock is no reason to go on."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
-    with pytest.raises(ConfigError, match="not a database"), alone_in(tmp_path):
+    with pytest.raises(ConfigError, match="no lock of cartlab"), alone_in(tmp_path):
         pass
 
 

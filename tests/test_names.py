@@ -5,6 +5,7 @@ import pytest
 from pipeline.names import gain_name, own_omega, own_zeta, parameter_names, read_name
 from pipeline.plant.linear.laws import brackets, orders
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.set_up import PAPER_UNITS
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
@@ -23,7 +24,7 @@ def test_every_name_is_read_back(n):
 def test_a_rigid_body_has_a_damping_but_no_ratio():
     """Its two names have units of their own."""
     mass, damping = map(read_name, parameter_names(1, rigid=True))
-    assert mass.unit(position="cm", input="V") == "V s^2/cm"
+    assert mass.unit(PAPER_UNITS) == "V s^2/cm"
     assert damping.is_damping
     assert not damping.is_ratio
 

@@ -15,9 +15,9 @@ from scipy.optimize import linear_sum_assignment
 
 import pipeline
 from pipeline.errors import ConfigError, DataError, SubmissionError
+from pipeline.json_files import json_text, plain
 from pipeline.notebook import Lab, analyse
 from pipeline.resources import EXAMPLES
-from pipeline.results_json import results_dict, results_text
 from tests.helpers.examples import analysed
 from tests.helpers.places import ROOT
 from tests.report.test_report import Page
@@ -33,7 +33,7 @@ def lab() -> Lab:
 def test_analyse_is_the_packages_own(lab):
     """`from pipeline import analyse` is this function, and gives the very results of a report."""
     assert pipeline.analyse is analyse
-    assert results_text(lab.results) == results_text(analysed("two-cart"))
+    assert json_text(lab.results) == json_text(analysed("two-cart"))
 
 
 def test_nothing_heavy_is_loaded_until_it_is_asked_for():
@@ -90,7 +90,7 @@ def test_the_closed_loop_is_the_designed_one(lab):
 
 def test_tables_have_the_names_of_the_results(lab):
     """One row a parameter, check, decay, step and dwell; units in the attributes."""
-    results = results_dict(lab.results)
+    results = plain(lab.results, digits=17)
     for frame, rows in (
         (lab.parameters, results["parameters"]),
         (lab.checks, results["checks"]),

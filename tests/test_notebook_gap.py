@@ -7,14 +7,16 @@ from numpy.testing import assert_allclose
 
 import pipeline
 from pipeline.errors import ConfigError
-from pipeline.notebook import Explained, explain
+from pipeline.notebook import ExplainedGap, explain
+from pipeline.report.plots.runs import compare_runs
+from pipeline.words.progress import silent
 from tests.helpers.commandline import cartlab_here
 
 FORCE, LAG = 0.004, 0.02  # V, s
 
 
 @pytest.fixture(scope="module")
-def gap(tmp_path_factory) -> Explained:
+def gap(tmp_path_factory) -> ExplainedGap:
     """One cart with dry friction and a drive that lags."""
     folder = tmp_path_factory.mktemp("explained") / "lab"
     hide = ["--hide", f"coulomb_friction:cart=1,force={FORCE}"]
@@ -81,3 +83,20 @@ def test_the_force_left_is_a_table(gap):
     assert set(gap.residual["experiment"]) <= set(gap.records)
     assert gap.residual.attrs["units"]["velocity"] == "cm/s"
     assert gap.residual["force"].std() < 0.2 * FORCE
+
+
+def test_the_plots_show_what_the_gap_found(gap):
+    """Held-out runs by the model with effects: the same lines, and the errors of `gap.json`."""
+    runs = {run.id: run for run in compare_runs(gap.analysis, gap=gap.results, progress=silent)}
+    held = [row for row in gap.results.by_record if row.held_out]
+    assert {runs[row.experiment].kind for row in held} >= {"decay", "step"}
+
+    for row in held:
+        (cart,) = runs[row.experiment].carts
+        (found,) = [one for one in cart.models if one.model == "effects"]
+        frame = gap.simulate(row.experiment)
+        shown = found.y[-len(frame) :]
+        swing = np.ptp(cart.measured)
+        # The start of each run is fitted anew, within the noise of some readings.
+        assert_allclose(shown, frame["with_effects", "x1"], atol=2 * row.noise_floor * swing)
+        assert found.nrmse < max(1.2 * row.final, 1.1 * row.noise_floor)

@@ -1,12 +1,14 @@
 """results.json: the documented form, plain numbers only, the same bytes every time."""
 
 import json
+import re
 
 import pytest
 
+from pipeline.json_files import json_text
 from pipeline.resources import EXAMPLES
-from pipeline.results_json import results_text
 from tests.helpers.examples import analysed
+from tests.helpers.places import ROOT
 
 
 @pytest.fixture(scope="module")
@@ -14,31 +16,15 @@ def results():
     def refuse(token):
         raise AssertionError(f"{token} is not JSON")
 
-    text = results_text(analysed("two-cart"))
+    text = json_text(analysed("two-cart"))
     return json.loads(text, parse_constant=refuse)
 
 
 def test_it_has_every_documented_key(results):
     """All top-level keys are there, in their order, under the schema's name."""
     assert results["schema"] == "cartlab-results/1"
-    assert list(results) == [
-        "schema",
-        "submission",
-        "parameters",
-        "chain",
-        "state_space",
-        "fit",
-        "log_decrements",
-        "step_gains",
-        "frequency_response",
-        "checks",
-        "feedback",
-        "hardware",
-        "assumptions",
-        "skipped",
-        "warnings",
-        "provenance",
-    ]
+    page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").split("\n## ")[0]
+    assert list(results) == re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
 
 
 def test_parameters_follow_the_papers_table(results):

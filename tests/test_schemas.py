@@ -9,11 +9,9 @@ import jsonschema
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.gap.stored import gap_text
+from pipeline.json_files import DIALECT, file_model, json_text
 from pipeline.report.solution.expected import solution_text
-from pipeline.results_json import results_text
-from pipeline.schemas.base import DIALECT
-from pipeline.schemas.export import MODELS, schema_text
+from pipeline.schemas import MODELS, schema_text
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
 from tests.helpers.grades import write_class
@@ -27,7 +25,7 @@ def assert_fits(name: str, text: str) -> None:
     """Insist that a file obeys the shipped schema, and that the model knows each of its keys."""
     shipped = json.loads((DOCS / f"{name}.schema.json").read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator(shipped).validate(json.loads(text))
-    back = MODELS[name].model_validate_json(text).model_dump_json(by_alias=True)
+    back = file_model(MODELS[name]).model_validate_json(text).model_dump_json(by_alias=True)
     assert json.loads(back) == json.loads(text)
 
 
@@ -48,7 +46,7 @@ def example(request):
 
 def test_real_results_obey_the_schema(example):
     """Results and reference of every shipped example fit, with no key that the schema lacks."""
-    assert_fits("results", results_text(example))
+    assert_fits("results", json_text(example))
     assert_fits("solution", solution_text(example))
 
 
@@ -57,7 +55,7 @@ def test_results_with_gaps_obey_the_schema(carts):
     """What could not be had is null, and allowed to be."""
     analysis = make_analysis(carts)
     for poorer in (analysis, replace(analysis, fit=None, rows=(), feedback=None, hardware=())):
-        assert_fits("results", results_text(poorer))
+        assert_fits("results", json_text(poorer))
         assert_fits("solution", solution_text(poorer))
 
 
@@ -65,7 +63,7 @@ def test_results_with_gaps_obey_the_schema(carts):
 def test_gaps_obey_the_schema(verdict):
     """Every verdict's file fits, effects, rivals and windows included."""
     keys = () if verdict == "none" else ("coulomb_friction", "cubic_spring")
-    assert_fits("gap", gap_text(make_gap(verdict, keys), make_analysis(2)))
+    assert_fits("gap", json_text(make_gap(verdict, keys)))
 
 
 def test_grades_obey_the_schema(tmp_path):
@@ -80,7 +78,7 @@ def test_a_broken_file_does_not_obey():
     """The schema refuses an unknown outcome, a text for a number and a missing key."""
     schema = json.loads(schema_text("results"))
     validator = jsonschema.Draft202012Validator(schema)
-    good = json.loads(results_text(make_analysis(1)))
+    good = json.loads(json_text(make_analysis(1)))
     validator.validate(good)
     for change in (
         {"checks": [{**good["checks"][0], "outcome": "maybe"}]},

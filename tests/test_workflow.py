@@ -7,9 +7,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.estimation.chain.follow import follow
+from pipeline.json_files import json_text
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.resources import EXAMPLES
-from pipeline.results_json import results_text
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse, reference_design
 from tests.helpers.examples import analysed
@@ -48,7 +48,7 @@ def test_examples_pass_every_check_and_skip_nothing(analyses, name):
 def test_same_input_gives_same_bytes(analyses):
     """Analysing the same folder again gives the same results.json."""
     again = analyse(load_submission(EXAMPLES / "two-cart"))
-    assert results_text(again) == results_text(analyses["two-cart"])
+    assert json_text(again) == json_text(analyses["two-cart"])
 
 
 def test_how_the_records_follow_is_handed_on(analyses):
@@ -87,7 +87,7 @@ def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
 ):
     """Without one kind of experiment its stage is skipped; the carts are still identified."""
     analysis = analyse(_without(tmp_path, kinds=[kind]))
-    assert stage in {skip.stage for skip in analysis.skipped}
+    assert stage in {skip.name for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
     # Without dwells the fit rests on steps and a sweep of encoder counts: percents, not per mille.
     assert analysis.chain is not None
@@ -112,7 +112,7 @@ def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
     stages = {skip.stage for skip in analysis.skipped}
     assert {"final estimates", "state feedback", "hardware check"} <= stages
     assert "fit.identified" in {check.id for check in analysis.checks if check.outcome == "fail"}
-    assert "null" in results_text(analysis)
+    assert "null" in json_text(analysis)
     initial = {row.name: row.initial.value for row in analysis.rows if row.initial}
     assert math.isclose(initial["omega_2"], 32.926, rel_tol=1e-3)
 

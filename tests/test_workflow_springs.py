@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.arrays import Array
+from pipeline.json_files import json_text
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.report.draft.content import build_document
@@ -18,9 +19,9 @@ from pipeline.report.sections.parameters import parameter_table
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis
-from pipeline.results_json import results_text
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse
 
 COUNT = 0.00227  # cm, the encoder step
@@ -82,7 +83,7 @@ def assert_body_found(analysis: Analysis) -> None:
         assert estimate.std is not None
         assert estimate.std < 0.03 * truth
         assert abs(estimate.value - truth) < SIGMAS * estimate.std
-    assert "null" in results_text(analysis)
+    assert "null" in json_text(analysis)
 
 
 @pytest.mark.parametrize(
@@ -94,7 +95,7 @@ def test_carts_on_some_springs_are_found(tmp_path, k):
     """Whichever wall has no spring, every named parameter is the bench's own."""
     m, c = np.array([3e-4, 2.5e-4, 2e-4]), np.array([1.2e-3, 8e-4, 6e-4])
     chain = Chain(m=m[: len(k) - 1], c=c[: len(k) - 1], k=np.array(k))
-    write_submission(tmp_path / "bench", chain=chain, seed=len(k), compact=True)
+    write_submission(tmp_path / "bench", SimulatedBench(chain=chain), seed=len(k), compact=True)
     analysis = analyse(load_submission(tmp_path / "bench"))
     assert analysis.fit is not None
     assert analysis.fit.converged
@@ -158,7 +159,7 @@ def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs)
 
     assert analysis.fit is None
     assert "springs stated right?" in terminal_summary(analysis).partition("What to do next")[2]
-    (model,) = (s for s in build_document(analysis, progress=None).sections if s.id == "model")
+    (model,) = (s for s in build_document(analysis).sections if s.id == "model")
     kinds = [block.kind for block in model.blocks]
     assert "heading" not in [kinds[-1], *(a for a, b in pairwise(kinds) if a == b)]
-    assert len(parameter_table(Page.of(analysis)).head) == 4
+    assert len(parameter_table(Page(analysis)).head) == 4

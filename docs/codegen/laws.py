@@ -11,8 +11,14 @@ from typing import Any
 import sympy
 from sympy.printing.pycode import PythonCodePrinter
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Contact, Force, Friction, Hysteresis, Input
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import (
+    ContactLaw,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
+)
 
 Expr = Any  # sympy's own annotations are partial
 
@@ -77,7 +83,12 @@ def _parameter(symbol: str) -> sympy.Symbol:
 def text_of(effect: Effect) -> str:
     """Return the expression of a law, "" for one that is built in."""
     match effect.law:
-        case Force(force=text) | Contact(force=text) | Friction(size=text) | Input(arrives=text):
+        case (
+            ForceLaw(force=text)
+            | ContactLaw(force=text)
+            | FrictionLaw(size=text)
+            | InputLaw(arrives=text)
+        ):
             return text
     return ""
 
@@ -100,7 +111,7 @@ def in_table(expr: Expr, effect: Effect) -> Expr:
     return expr.subs({symbol: sympy.Symbol(cell, real=True) for symbol, cell in places.items()})
 
 
-def _cell(effect: Effect, parameter: Parameter) -> str:
+def _cell(effect: Effect, parameter: EffectParameter) -> str:
     return _AT[effect.place].format(f"{_TABLES[effect.place]}.{effect.column_name(parameter)}")
 
 
@@ -108,7 +119,7 @@ def _gate(effect: Effect) -> str:
     """Return the condition under which an effect is there."""
     sizes = [p for p in effect.parameters if p.neutral == 0.0]
     first = _cell(effect, (sizes or effect.parameters)[0])
-    if isinstance(effect.law, Friction) and effect.law.beyond:
+    if isinstance(effect.law, FrictionLaw) and effect.law.beyond:
         held = in_table(parse(effect.law.at_rest or effect.law.size, effect), effect)
         return f"{code(held)} > {first}"
     return f"{first} != 0.0"
@@ -184,7 +195,7 @@ def terms_source(catalogue: Sequence[Effect]) -> str:
 
 def _is_linear(effect: Effect) -> bool:
     """Whether a force belongs to the linear chain's matrices."""
-    if not isinstance(effect.law, Force) or effect.place == "input":
+    if not isinstance(effect.law, ForceLaw) or effect.place == "input":
         return False
     force = parse(effect.law.force, effect)
     slopes = [sympy.diff(force, q) for q in (x, v, d, rate)]
@@ -201,7 +212,7 @@ def _forces(
     force, slopes = [], []
     for effect in catalogue:
         law = effect.law
-        if effect.place != place or not isinstance(law, Force) or law.on_motor != on_motor:
+        if effect.place != place or not isinstance(law, ForceLaw) or law.on_motor != on_motor:
             continue
         if _is_linear(effect):
             continue
@@ -243,7 +254,7 @@ def _matrix(catalogue: Iterable[Effect], place: str) -> Iterator[str]:
 def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
     constant, dropping, slope = [], [], []
     for effect in catalogue:
-        if not isinstance(effect.law, Friction):
+        if not isinstance(effect.law, FrictionLaw):
             continue
         size = _own_size(effect, catalogue)
         still, moving = size.as_independent(v, as_Add=True)
@@ -270,7 +281,7 @@ def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
 def _own_size(effect: Effect, catalogue: Iterable[Effect]) -> Expr:
     """Return the size of a friction without that of the one within."""
     law = effect.law
-    assert isinstance(law, Friction)
+    assert isinstance(law, FrictionLaw)
     size = parse(law.size, effect)
     if law.beyond:
         within = next(e for e in catalogue if e.key == law.beyond)
@@ -281,7 +292,7 @@ def _own_size(effect: Effect, catalogue: Iterable[Effect]) -> Expr:
 def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
     """Return the force against z, where z tends to at a velocity, and at which pace (1/s)."""
     law = effect.law
-    assert isinstance(law, Hysteresis)
+    assert isinstance(law, HysteresisLaw)
     rate = parse(law.rate, effect)
     pace = sympy.simplify(-sympy.diff(rate, z))
     target = sympy.simplify(rate.subs(z, 0) / pace).subs(v / sympy.Abs(v), sympy.sign(v))
@@ -289,7 +300,7 @@ def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
 
 
 def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
-    mine = [effect for effect in catalogue if isinstance(effect.law, Hysteresis)]
+    mine = [effect for effect in catalogue if isinstance(effect.law, HysteresisLaw)]
     yield "\n@inlined\ndef settling(cart, i, v):"
     yield '    """Return the most that hysteresis holds, where its state tends to, how fast."""'
     for effect in mine:
@@ -308,7 +319,7 @@ def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
 def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
     stops, slacks = [], []
     for effect in catalogue:
-        if not isinstance(effect.law, Contact):
+        if not isinstance(effect.law, ContactLaw):
             continue
         force, at = parse(effect.law.force, effect), parse(effect.law.past, effect)
         if effect.place == "cart":
@@ -333,7 +344,7 @@ def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield "\n@inlined\ndef arriving(drive, u):"
     yield '    """Return what dead zone, saturation and the like leave of an input."""'
     for effect in catalogue:
-        if isinstance(effect.law, Input):
+        if isinstance(effect.law, InputLaw):
             yield f"    if {_gate(effect)}:"
             yield f"        u = {code(in_table(parse(effect.law.arrives, effect), effect))}"
     yield "    return u\n"
@@ -352,7 +363,7 @@ def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
         indent = "        " if place in loops else "    "
         lines = []
         for effect in catalogue:
-            force = isinstance(effect.law, Force) and not _is_linear(effect)
+            force = isinstance(effect.law, ForceLaw) and not _is_linear(effect)
             step = effect.law.step
             if effect.place != place or not (force or isfinite(step)):
                 continue
@@ -369,7 +380,7 @@ def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
 def followed(effect: Effect, catalogue: Iterable[Effect]) -> tuple[Expr, list[sympy.Symbol]]:
     """Return the law in its coordinates, and those."""
     growth = effect.grown
-    law = _own_size(effect, catalogue) if isinstance(effect.law, Friction) else None
+    law = _own_size(effect, catalogue) if isinstance(effect.law, FrictionLaw) else None
     expr = parse(text_of(effect), effect) if law is None else law
     values = {_parameter(s): parse(text, effect) for s, text in growth.parameters.items()}
     # All at once: a coordinate may have the symbol of a parameter.
@@ -386,11 +397,11 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     yield "\n\n# By kind: which coordinates vanish with the effect; the others are its shape."
     yield f"COEFFICIENTS = {tuple(shapes)!r}"
     on_spring = [e.key for e in catalogue if e.place == "spring"]
-    friction = [e.key for e in catalogue if isinstance(e.law, Friction)]
-    bristles = [e.key for e in catalogue if isinstance(e.law, Hysteresis)]
+    friction = [e.key for e in catalogue if isinstance(e.law, FrictionLaw)]
+    bristles = [e.key for e in catalogue if isinstance(e.law, HysteresisLaw)]
     for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction), ("HYSTERESIS", bristles)):
         yield f"{name} = ({''.join(f'Kind.{key.upper()}, ' for key in keys)})"
-    sizes = [(isinstance(e.law, Hysteresis), len(e.grown.coordinates)) for e in catalogue]
+    sizes = [(isinstance(e.law, HysteresisLaw), len(e.grown.coordinates)) for e in catalogue]
     yield "# How many numbers `terms` or `settle` fills, at most."
     yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
     yield "\n@jit\ndef terms(kind, p, o, x, v, k, u, on, out):"
@@ -400,7 +411,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     yield '    """'
     branch = "if"
     for effect in catalogue:
-        if not isinstance(effect.law, Force | Friction | Contact):
+        if not isinstance(effect.law, ForceLaw | FrictionLaw | ContactLaw):
             continue
         yield f"    {branch} kind == Kind.{effect.key.upper()}:"
         branch = "elif"
@@ -409,7 +420,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     yield '    """Fill `out` with `settling`, its slopes, and its three by each coordinate."""'
     branch = "if"
     for effect in catalogue:
-        if isinstance(effect.law, Hysteresis):
+        if isinstance(effect.law, HysteresisLaw):
             yield f"    {branch} kind == Kind.{effect.key.upper()}:"
             branch = "elif"
             yield from _settling_of(effect)
@@ -435,7 +446,7 @@ def _terms_of(effect: Effect, catalogue: Sequence[Effect]) -> Iterator[str]:
     for name, value in shared:
         yield f"{indent}{name} = {code(value)}"
     law = effect.law
-    if isinstance(law, Contact):
+    if isinstance(law, ContactLaw):
         past = code(parse(law.past, effect).subs(values))
         pushes = "" if law.pulls else f" and ({code(wanted[0])}) * {past} <= 0.0"
         yield f"{indent}if (x - {past}) * {past} > 0.0{pushes}:"
@@ -447,7 +458,7 @@ def _terms_of(effect: Effect, catalogue: Sequence[Effect]) -> Iterator[str]:
 
 def _coefficients(effect: Effect, catalogue: Sequence[Effect]) -> tuple[int, ...]:
     """Return which coordinates a law is proportional to; of one that is built in, the first."""
-    if not isinstance(effect.law, Force | Friction | Contact):
+    if not isinstance(effect.law, ForceLaw | FrictionLaw | ContactLaw):
         return (0,)
     expr, coordinates = followed(effect, catalogue)
     mine: list[sympy.Symbol] = []

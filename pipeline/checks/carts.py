@@ -1,32 +1,36 @@
 """Checks of the fitted carts: does the fit explain the data, and is its chain a real one."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 
 import numpy as np
 
-from pipeline.checks import limits
 from pipeline.names import gain_name, read_name, toml_flags
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.laws import brackets
 from pipeline.plant.linear.recovery import recover_from_parameters
-from pipeline.results import EXPLAINED, ChainFit, Check
-from pipeline.stages.limits import SIGMA_LIMIT
+from pipeline.results import EXPLAINED, ChainFit, Check, passed
+from pipeline.set_up import Bench
+from pipeline.stages.compare import SIGMA_LIMIT
 
-VANISHING = "vanishing"  # then the mass, damping or spring: "k_3"
+_REDUNDANCY = 1e-9  # two routes to one number through unrounded values
+_BELOW_ZERO = 2.0  # standard errors that a mass, damping or spring may be below it
+# Share of its larger neighbour: no bench's masses, dampers or springs differ fifty times. Where
+# there is no spring, dry friction and loose screws feign one of up to 1 % of the next.
+NEGLIGIBLE = 0.02
 
 
-def check_carts(fit: ChainFit | None, *, springs: Sequence[bool]) -> list[Check]:
+def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
     """Check the fit, and its chain against the laws of a real one: signs, redundancies, orders."""
     if fit is None:
         message = "No model was identified: the reasons are among what was skipped."
-        return [Check.of("fit.identified", False, message)]
+        return [Check(kind="fit", part="identified", outcome="fail", message=message)]
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
-    checks = [*_fit_checks(fit), _sign_check(fit, springs=springs)]
-    checks += check_vanishing(fit, springs=springs)
-    if chain.n in (2, 3) and "omega_a" in values and all(springs[1:-1]):
+    checks = [*_fit_checks(fit), _sign_check(fit, bench=bench)]
+    checks += check_vanishing(fit, bench=bench)
+    if chain.n in (2, 3) and "omega_a" in values and all(bench.springs[1:-1]):
         checks += _redundancy_checks(values)
     if chain.n >= 2 and "omega_a" in values:
         checks.append(_gain_order_check(values, chain=chain))
@@ -41,24 +45,27 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
         else "leave more than the noise; look where model and measurement part."
     )
     return [
-        Check.of(
-            "fit.converged",
-            fit.converged,
-            "The fit converged." if fit.converged else f"The fit failed: {fit.message}.",
+        Check(
+            kind="fit",
+            part="converged",
+            outcome=passed(fit.converged),
+            message="The fit converged." if fit.converged else f"The fit failed: {fit.message}.",
         ),
-        Check.of(
-            "fit.explains_data",
-            fit.explains_data,
-            f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: the linear carts {found}",
+        Check(
+            kind="fit",
+            part="explains_data",
+            outcome=passed(fit.explains_data),
+            message=f"χ² per degree of freedom is {fit.chi_square_per_dof:.3g}: "
+            f"the linear carts {found}",
             value=fit.chi_square_per_dof,
             limit=EXPLAINED,
         ),
     ]
 
 
-def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
+def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
     """No mass, damping or spring may be negative by more than its standard error allows."""
-    values, std = physical_values(fit.chain, springs=springs), fit.std
+    values, std = physical_values(fit.chain, bench=bench), fit.std
     below = {
         name: -value / std[name] if std.get(name) else np.inf
         for name, value in values.items()
@@ -71,24 +78,25 @@ def _sign_check(fit: ChainFit, *, springs: Sequence[bool]) -> Check:
         if below
         else "No mass, damping or spring is below zero."
     )
-    value = worst if np.isfinite(worst) else None
-    good = worst <= limits.BELOW_ZERO
-    return Check.of("physical.signs", good, message, value=value, limit=limits.BELOW_ZERO)
+    return Check(
+        kind="physical",
+        part="signs",
+        outcome=passed(worst <= _BELOW_ZERO),
+        value=worst if np.isfinite(worst) else None,
+        limit=_BELOW_ZERO,
+        message=message,
+    )
 
 
-def physical_values(chain: Chain, *, springs: Sequence[bool]) -> dict[str, float]:
-    """Return the masses, dampings and springs that are said to be there, by name.
-
-    One cart has one stiffness, the sum of its two.
-    """
-    present = [any(springs), False] if chain.n == 1 else springs
+def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
+    """Return the masses, dampings and springs that are said to be there, by name."""
     values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
     values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
-    springs_there = zip(chain.k, present, strict=True)
-    return values | {f"k_{i}": float(k) for i, (k, there) in enumerate(springs_there, 1) if there}
+    springs = enumerate(zip(chain.k, bench.stiff, strict=True), start=1)
+    return values | {f"k_{i}": float(k) for i, (k, there) in springs if there}
 
 
-def check_vanishing(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
+def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
     """Fail for each mass, damping or spring that may as well not be there.
 
     It is zero within its error, or negligible beside the larger of its neighbours of the same
@@ -96,7 +104,7 @@ def check_vanishing(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
     """
     if not fit.converged:
         return []
-    values, std = physical_values(fit.chain, springs=springs), fit.std
+    values, std = physical_values(fit.chain, bench=bench), fit.std
     checks = []
     for name, value in values.items():
         sigmas = value / std[name] if std.get(name) else None
@@ -107,14 +115,20 @@ def check_vanishing(fit: ChainFit, *, springs: Sequence[bool]) -> list[Check]:
             if sigmas:
                 found = f"{name} = {value:.2g} ± {std[name]:.1g} is zero within its error"
             measured, limit = sigmas, SIGMA_LIMIT
-        elif 0 < share < limits.NEGLIGIBLE:
+        elif 0 < share < NEGLIGIBLE:
             found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, next to nothing"
-            measured, limit = share, limits.NEGLIGIBLE
+            measured, limit = share, NEGLIGIBLE
         else:
             continue
-        message = f"{found}. {_ask_if_there(name, springs=springs)}"
         checks.append(
-            Check.of(f"{VANISHING}.{name}", False, message, value=measured or 0.0, limit=limit)
+            Check(
+                kind="vanishing",
+                parameter=name,
+                outcome="fail",
+                value=measured or 0.0,
+                limit=limit,
+                message=f"{found}. {_ask_if_there(name, bench=bench)}",
+            )
         )
     return checks
 
@@ -127,9 +141,9 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
     return max((o for o in beside if values.get(o, 0.0) > 0), key=lambda o: values[o], default="")
 
 
-def _ask_if_there(name: str, *, springs: Sequence[bool]) -> str:
+def _ask_if_there(name: str, *, bench: Bench) -> str:
     """Return the question that a vanishing parameter raises, and the line to change."""
-    read, n = read_name(name), len(springs) - 1
+    read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
     if read.symbol == "c":
@@ -155,7 +169,7 @@ def _ask_if_there(name: str, *, springs: Sequence[bool]) -> str:
             f"{i}: write carts = {i - 1} in submission.toml."
         )
     ends = f"wall-{i}" if i == 1 else f"{n}-wall"
-    fewer = [flag and j != i for j, flag in enumerate(springs, start=1)]
+    fewer = [flag and j != i for j, flag in enumerate(bench.springs, start=1)]
     return (
         f"Is there a spring {ends}? If not, write springs = {toml_flags(fewer)} in submission.toml."
     )
@@ -164,12 +178,13 @@ def _ask_if_there(name: str, *, springs: Sequence[bool]) -> str:
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
     meaning = "two routes through the transfer functions to one physical number agree"
     return [
-        Check.of(
-            f"redundancy.{name}",
-            residual <= limits.REDUNDANCY,
-            f"Redundancy {name} ({meaning}): relative difference {residual:.1e}.",
+        Check(
+            kind="redundancy",
+            parameter=name,
+            outcome=passed(residual <= _REDUNDANCY),
             value=float(residual),
-            limit=limits.REDUNDANCY,
+            limit=_REDUNDANCY,
+            message=f"Redundancy {name} ({meaning}): relative difference {residual:.1e}.",
         )
         for name, residual in recover_from_parameters(values).residuals.items()
     ]
@@ -181,10 +196,15 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
     gains = [values[name] for name in names]
     # Equal gains are right where no spring holds the far end: rounding then decides the sign.
     rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
-    good = rise <= limits.REDUNDANCY and min(gains) >= 0
-    said = f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {_yes(good)}."
-    value = max(float(rise), 0.0)
-    return Check.of("order.gains", good, said, value=value, limit=limits.REDUNDANCY)
+    good = rise <= _REDUNDANCY and min(gains) >= 0
+    return Check(
+        kind="order",
+        part="gains",
+        outcome=passed(good),
+        value=max(float(rise), 0.0),
+        limit=_REDUNDANCY,
+        message=f"Static gains fall along the chain ({' ≥ '.join(names)} > 0): {_yes(good)}.",
+    )
 
 
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
@@ -194,12 +214,14 @@ def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Chec
     for low, middle, high, _ in brackets(n):
         # How far outside the bracket, in percent of the value.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
-        good = excess <= limits.REDUNDANCY
+        good = excess <= _REDUNDANCY
         reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""
-        ends = f"_in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else ""
+        ends = f"in_{read_name(low).suffix}{read_name(high).suffix}" if n == 3 else ""
         checks.append(
             Check(
-                id=f"order.{middle}{ends}",
+                kind="order",
+                parameter=middle,
+                part=ends,
                 outcome="pass" if good else ("skip" if damped else "fail"),
                 value=100 * max(float(excess), 0.0),
                 limit=0.0,

@@ -2,9 +2,19 @@
 
 from collections.abc import Sequence
 
-from pipeline.names import listed, read_name
-from pipeline.results import Check, CheckOutcome, LogDecrement, ParameterRow, Record, StepGain
+from pipeline.names import read_name
+from pipeline.results import (
+    Check,
+    CheckOutcome,
+    LogDecrement,
+    ParameterRow,
+    Record,
+    StepGain,
+    passed,
+)
+from pipeline.set_up import Bench
 from pipeline.stages.compare import change_limit
+from pipeline.words.numbers import abridge
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
@@ -25,7 +35,8 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
         same = "" if row.independent is not False else " Both rest on the same recordings."
         checks.append(
             Check(
-                id=f"initial_final.{row.name}",
+                kind="initial_final",
+                parameter=row.name,
                 outcome=outcome,
                 value=abs(row.change_percent),
                 limit=limit,
@@ -61,7 +72,7 @@ def _advice(row: ParameterRow) -> str:
     }
     if name.is_gain:
         looks["frequency_response"] = "the points at the lowest frequencies"
-    look = looks.get(before.source, "{runs}").format(runs=listed(before.experiments))
+    look = looks.get(before.source, "{runs}").format(runs=abridge(before.experiments))
     beside = (
         ", and at the points of the response near this frequency"
         if response and name.is_frequency
@@ -72,7 +83,7 @@ def _advice(row: ParameterRow) -> str:
 
 
 def check_decays(
-    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), position_unit: str
+    decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Bench
 ) -> list[Check]:
     """Ask of every decay whether viscous damping alone explains it."""
     checks, kinds = [], {record.id: record.kind for record in records}
@@ -81,8 +92,8 @@ def check_decays(
             continue
         found = (
             "is not exponential: dry friction can hold the cart within "
-            f"±{test.drop:.3g} {position_unit} of its rest. The envelope's ζ = {decay.zeta:.3g} is "
-            f"biased; ζ = {test.zeta:.3g} once friction is taken out."
+            f"±{test.drop:.3g} {bench.units.position} of its rest. The envelope's ζ = "
+            f"{decay.zeta:.3g} is biased; ζ = {test.zeta:.3g} once friction is taken out."
             if test.present
             else "is exponential as far as its noise can show "
             f"(F = {test.f_statistic:.1f}; dry friction would show above {test.threshold:.1f})."
@@ -91,20 +102,22 @@ def check_decays(
         if kinds.get(decay.experiment) == "step":
             what = f"the ringing of cart {decay.cart} after the step"
         checks.append(
-            Check.of(
-                f"decay.{decay.experiment}.cart_{decay.cart}"
-                + (f".{decay.number}" if decay.number else ""),
-                not test.present,
-                f"{decay.name}: {what} {found}",
+            Check(
+                kind="decay",
+                run=decay.experiment,
+                cart=decay.cart,
+                part=str(decay.number or ""),
+                outcome=passed(not test.present),
                 value=test.f_statistic,
                 limit=test.threshold,
+                message=f"{decay.name}: {what} {found}",
             )
         )
     return checks
 
 
 def check_steps(
-    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), gain_unit: str
+    steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Bench
 ) -> list[Check]:
     """Ask whether every step has one gain: a cart that sticks has at least an interval of them.
 
@@ -119,10 +132,10 @@ def check_steps(
     for step in steps:
         if step.interval:
             rubs.setdefault(step.cart, []).append(step.experiment)
-    return [_step_check(step, shown=rubs.get(step.cart, ()), gain_unit=gain_unit) for step in steps]
+    return [_step_check(step, shown=rubs.get(step.cart, ()), bench=bench) for step in steps]
 
 
-def _step_check(step: StepGain, *, shown: Sequence[str], gain_unit: str) -> Check:
+def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
     outcome: CheckOutcome
     edges, width = len(step.edges), None
     if step.interval:
@@ -132,11 +145,11 @@ def _step_check(step: StepGain, *, shown: Sequence[str], gain_unit: str) -> Chec
             "fail",
             (  # the rest points show the least that friction can hold
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
-                f"{gain_unit}, and it may be farther off."
+                f"{bench.units.gain}, and it may be farther off."
             ),
         )
     elif shown:
-        runs = listed(list(dict.fromkeys(shown)))
+        runs = abridge(list(dict.fromkeys(shown)))
         outcome, found = (
             "skip",
             (
@@ -156,7 +169,9 @@ def _step_check(step: StepGain, *, shown: Sequence[str], gain_unit: str) -> Chec
         back = "" if step.rest_shift is None else ", and it returns to its first rest"
         outcome, found = "pass", f"shows one gain at all {edges} edges of the input{back}."
     return Check(
-        id=f"step.{step.experiment}.cart_{step.cart}",
+        kind="step",
+        run=step.experiment,
+        cart=step.cart,
         outcome=outcome,
         value=width,
         limit=None,

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.arrays import Array
-from pipeline.checks import limits
 from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import Margins, closed_loop, stability_margins
@@ -15,6 +14,10 @@ from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 
 if TYPE_CHECKING:
     import control
+
+# Of the coefficients of a loop's polynomial, which are of the size of their binomials. Rounding
+# leaves 1e-13 of them on plants that a bench can be; the other programs' gains up to 1e-8.
+_SAME_LOOP = 1e-6
 
 
 def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
@@ -48,9 +51,9 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))))
     if not np.isfinite(value):
         return _check("fail", None, "the designed loop has no finite polynomial: do not run it")
-    if value > limits.SAME_LOOP:
+    if value > _SAME_LOOP:
         return _check("fail", value, f"{names} give another loop: do not run these gains")
-    if np.abs(theirs - wanted).max() > limits.SAME_LOOP:
+    if np.abs(theirs - wanted).max() > _SAME_LOOP:
         return _check("skip", value, f"{names} miss the poles asked for; these gains do not")
     return _check("pass", value, f"{names} give the same loop")
 
@@ -62,14 +65,19 @@ def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
         if check.contradicted:
             notes.setdefault(check.experiment, []).extend([check.note] if check.note else [])
     return [
-        Check.of(f"hardware.{run}", False, f"{run}: {'; '.join(said)}.")
+        Check(kind="hardware", run=run, outcome="fail", message=f"{run}: {'; '.join(said)}.")
         for run, said in notes.items()
     ]
 
 
 def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
     return Check(
-        id="feedback.gains", outcome=outcome, value=value, limit=limits.SAME_LOOP, message=message
+        kind="feedback",
+        part="gains",
+        outcome=outcome,
+        value=value,
+        limit=_SAME_LOOP,
+        message=message,
     )
 
 

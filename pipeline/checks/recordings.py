@@ -1,154 +1,131 @@
 """Checks of the recordings: were they read, are they what is stated of them, which are left out."""
 
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
+from itertools import groupby
 
 import numpy as np
 
-from pipeline.checks import limits
-from pipeline.estimation.units_and_clocks import TIME_UNITS
-from pipeline.ingest.columns import (
-    conversion,
-    input_units,
-    is_count,
-    is_known,
-    position_units,
-)
+from pipeline.ingest.columns import input_units, is_count, is_known, position_units
 from pipeline.ingest.input_sign import FEW_NAMES, Signs
-from pipeline.names import listed
-from pipeline.results import SIGN, Check, LeftOut, Record, SinePoint
-from pipeline.results_of_runs import HeadingUnit
-from pipeline.submission import System
+from pipeline.ingest.read import Ingested
+from pipeline.results import Check, CheckKind, HeadingUnit, LateChannel, LeftOut, Record, SinePoint
+from pipeline.set_up import Bench
+from pipeline.soundness.fault import sound_ones
+from pipeline.soundness.late_channels import late_fault
+from pipeline.soundness.stated import (
+    LEAST_SHARE,
+    OTHER_DWELL,
+    find_loose_holds,
+    find_other_scales,
+    find_wrong_setups,
+    swings,
+    why_other_frequency,
+)
+from pipeline.words.numbers import abridge
+from pipeline.words.phrases import phrases
 
-SCALES = POSITION_SCALE, INPUT_SCALE = "position_scale", "input_scale"  # then the record's id
-_DWELL_FACTORS = {
-    2 * np.pi: "the stated ones look to be in rad/s, and `frequency` is in Hz",
-    1 / (2 * np.pi): "the stated ones look to be divided by 2π",
-} | {
-    factor: f"the time columns look to be in {unit}; head them `time [{short}]`"
-    for factor, (unit, short) in TIME_UNITS.items()
-}
-_DWELLS_NAMED = 3
+_WORDS = phrases("checks")
 _SPELT_OUT = 3  # records of one kind, if all of it; more are told by their number
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
+
+
+def check_recordings(
+    data: Ingested,
+    *,
+    left_out: Sequence[LeftOut],
+    sines: Sequence[SinePoint],
+    late: Sequence[LateChannel],
+    bench: Bench,
+) -> list[Check]:
+    """Return every check of the recordings as such, what spoils most numbers first."""
+    return [
+        *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
+        *check_files(data.unreadable),
+        *check_units(data.records, bench=bench),
+        *check_scales(sound_ones(data.records, left_out), bench=bench),
+        *check_left_out(left_out, records=data.records),
+        *check_setup(data.records),
+        *check_held(data.records),
+        *check_dwells(data.records, sines),
+        *check_channels(late),
+    ]
 
 
 def check_files(unreadable: Mapping[str, str]) -> list[Check]:
     """Fail for each experiment whose file could not be read."""
     return [
-        Check.of(
-            f"data.{name}", False, f"{name} could not be read, so all else is without it: {reason}"
+        Check(
+            kind="data",
+            run=name,
+            outcome="fail",
+            message=_WORDS.text("unreadable", run=name, reason=reason),
         )
         for name, reason in unreadable.items()
     ]
 
 
-def check_units(records: Sequence[Record], *, system: System) -> list[Check]:
+def check_units(records: Sequence[Record], *, bench: Bench) -> list[Check]:
     """Fail where a unit is unknown, or is not the one that headings or the numbers speak of."""
-    position, drive = system.position.unit, system.input.unit
-    fractions = [
-        record.id for record in records if is_count(position) and _has_fractions_of_a_count(record)
-    ]
+    counted = is_count(bench.units.position)
+    fractions = [r.id for r in records if counted and _has_fractions_of_a_count(r)]
     checks = []
-    for role, unit, known in (
-        ("position", position, position_units()),
-        ("input", drive, input_units()),
-    ):
+    sides: tuple[tuple[str, CheckKind, str, Sequence[str]], ...] = (
+        ("position", "position_unit", bench.units.position, position_units()),
+        ("input", "input_unit", bench.units.input, input_units()),
+    )
+    for role, kind, unit, known in sides:
         headed: dict[str, HeadingUnit] = {}
         for record in records:
             for other in record.heading_units:
                 if other.role == role and not other.converts:
                     headed.setdefault(record.id, other)
         if not is_known(unit, known):
-            checks.append(_unit_check(role, _unknown(unit, role=role, known=known)))
+            checks.append(_unit_check(kind, _unknown(unit, role=role, known=known)))
         elif headed:
-            runs, other = list(headed), next(iter(headed.values()))
-            checks.append(
-                _unit_check(
-                    role,
-                    f"{listed(runs)}: {other.heading!r} is taken to be in {unit}, the unit in "
-                    f"submission.toml. Is it in {other.unit}? If so, change {role} = "
-                    f'{{ unit = "{other.unit}" }}; if not, change the heading.',
-                    n=len(runs),
-                )
+            other = next(iter(headed.values()))
+            message = _WORDS.text(
+                "other_heading",
+                runs=abridge(list(headed)),
+                heading=repr(other.heading),
+                unit=unit,
+                other=other.unit,
+                role=role,
             )
+            checks.append(_unit_check(kind, message, n=len(headed)))
         elif role == "position" and fractions:
-            checks.append(
-                _unit_check(
-                    role,
-                    f"{listed(fractions)}: the positions hold fractions, and a count has none. In "
-                    "which unit are they? No heading says it, so every static gain is said to be "
-                    f"in {position}/{drive}. If they are in cm, write in submission.toml "
-                    'position = { unit = "cm" }.',
-                    n=len(fractions),
-                )
-            )
+            runs = abridge(fractions)
+            message = _WORDS.text("fractions", runs=runs, gain_unit=bench.units.gain)
+            checks.append(_unit_check(kind, message, n=len(fractions)))
     return checks
 
 
-def _unit_check(role: str, message: str, *, n: int | None = None) -> Check:
+def _unit_check(kind: CheckKind, message: str, *, n: int | None = None) -> Check:
     value, limit = (None, None) if n is None else (float(n), 0.0)
-    return Check.of(f"{role}_unit", False, message, value=value, limit=limit)
+    return Check(kind=kind, outcome="fail", value=value, limit=limit, message=message)
 
 
 def _unknown(unit: str, *, role: str, known: Sequence[str]) -> str:
     """Return the question what an unknown unit is."""
-    meant = next((one for one in known if one.casefold() == unit.casefold()), "")
-    hint = f"did you mean {meant!r}?" if meant else f"known: {', '.join(known)}"
-    return (
-        f"The {role} unit {unit!r} is not known ({hint}), and every static gain is in it. Is it "
-        f"right? If not, write {role} = {{ unit = … }} in submission.toml."
+    meant = next((one for one in known if one.casefold() == unit.casefold()), None)
+    hint = (
+        _WORDS.text("did_you_mean", unit=repr(meant))
+        if meant
+        else _WORDS.text("known_units", units=", ".join(known))
     )
+    return _WORDS.text("unknown_unit", role=role, unit=repr(unit), hint=hint)
 
 
 def _has_fractions_of_a_count(record: Record) -> bool:
     return record.position_scale == 1.0 and not np.array_equal(record.y, np.round(record.y))
 
 
-def check_scales(records: Sequence[Record], *, system: System) -> list[Check]:
-    """Fail where positions or inputs reach further than any bench: they are in another unit.
-
-    Counts for a length, millivolts for volts: the carts that such records give explain them as
-    well as the right ones, and only every gain is off.
-    """
-    checks = []
-    unit, metres = system.position.unit, conversion(system.position.unit, "m")
-    travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
-    whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
-    if metres and travel > (limit := (limits.LONGEST_WHOLE if whole else limits.LONGEST) / metres):
-        why = "in whole numbers only" if whole else "further than a bench is long"
-        message = (
-            f"{run}: the positions run through {travel:.4g} {unit}, {why}: these "
-            "look like encoder counts, and every static gain is in them. Multiply them by the "
-            "length of a count; or head the columns `Encoder 1 Pos` … and state position = "
-            f"{{ unit = {unit!r}, per_count = … }}; or state position = {{ unit = 'count' }}."
-        )
-        checks.append(
-            Check.of(f"{POSITION_SCALE}.{run}", False, message, value=travel, limit=limit)
-        )
-    unit, volts = system.input.unit, conversion(system.input.unit, "V")
-    # Under feedback a bench may log another signal as its input.
-    driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
-    largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
-    if volts and largest * volts > limits.LARGEST:
-        message = (
-            f"{run}: the input reaches {largest:.4g} {unit}, more than a bench's amplifier "
-            "gives, and every static gain is off as much: is it in mV, or in counts? Head the "
-            f"column `input [mV]`, or state input = {{ unit = {unit!r}, per_count = … }}."
-        )
-        checks.append(
-            Check.of(
-                f"{INPUT_SCALE}.{run}", False, message, value=largest, limit=limits.LARGEST / volts
-            )
-        )
-    return checks
-
-
-def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
-    """Return how far two kinds of experiment reach, and where: one alone may be a slip."""
-    by_kind: dict[str, tuple[float, str]] = {}
-    for record, reach in reaches:
-        by_kind[record.kind] = max(by_kind.get(record.kind, (0.0, "")), (reach, record.id))
-    return sorted(by_kind.values())[-2:][0] if by_kind else (0.0, "")
+def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
+    """Fail where positions or inputs reach further than any bench: they are in another unit."""
+    kinds: Mapping[str, CheckKind] = {
+        "position_scale": "position_scale",
+        "input_scale": "input_scale",
+    }
+    return [fault.check(kinds[fault.code]) for fault in find_other_scales(records, bench=bench)]
 
 
 def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
@@ -166,16 +143,23 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
         ]
         contrary = [name for name in told if signs.found[name] == -sign]
         if contrary and 2 * len(contrary) >= len(told):
-            those = "all" if contrary == told else f"{len(contrary)} of the {len(told)}"
-            says.append(
-                f"sign = {sign} of the input contradicts the data, which say {-sign:+d} in "
-                f"{listed(contrary, most=FEW_NAMES)} ({those} that tell it): set sign = {-sign} "
-                "there, or leave it out."
+            message = _WORDS.text(
+                "sign",
+                stated=sign,
+                found=f"{-sign:+d}",
+                found_plain=-sign,
+                runs=abridge(contrary, most=FEW_NAMES),
+                those="all" if contrary == told else f"{len(contrary)} of the {len(told)}",
             )
+            says.append(message)
             wrong += len(contrary)
     if not says:
         return []
-    return [Check.of(SIGN, False, " ".join(says), value=float(wrong), limit=0.0)]
+    message = " ".join(says)
+    value = float(wrong)
+    return [
+        Check(kind="input", part="sign", outcome="fail", value=value, limit=0.0, message=message)
+    ]
 
 
 def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) -> list[Check]:
@@ -184,12 +168,18 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
     for one in left_out:
         runs.setdefault(one.reason, []).append(one.experiment)
     return [
-        Check.of(
-            f"record.{names[0]}",
-            False,
-            f"Left out {'is' if len(names) == 1 else 'are'} {_named(names, records)}: {reason}.",
+        Check(
+            kind="record",
+            run=names[0],
+            outcome="fail",
             value=float(len(names)),
             limit=0.0,
+            message=_WORDS.text(
+                "left_out",
+                are="is" if len(names) == 1 else "are",
+                runs=_named(names, records),
+                reason=reason,
+            ),
         )
         for reason, names in sorted(runs.items(), key=lambda item: -len(item[1]))
     ]
@@ -208,53 +198,54 @@ def _named(names: Sequence[str], records: Sequence[Record]) -> str:
 
 def check_setup(records: Sequence[Record]) -> list[Check]:
     """Ask whether the carts that should be free are those that move (where all were measured)."""
+    wrong = {fault.run: fault for fault in find_wrong_setups(records)}
     checks = []
     for record in records:
-        swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
-        free = max((swing[cart] for cart in record.carts if cart in record.free), default=0.0)
-        held = {cart: swing[cart] for cart in record.carts if cart not in record.free}
-        if not held or not any(cart in record.free for cart in record.carts):
-            continue
-        mover = max(held, key=lambda cart: held[cart])
-        good = free >= limits.HELD_SHARE * held[mover]
-        named = ", ".join(map(str, record.free))
-        found = (
-            f"the carts said to be free ({named}) are those that move."
-            if good
-            else f"cart {mover} moves and cart {named} does not, but cart {named} is said "
-            "to be free: is `carts` right, and is each cart in its column?"
-        )
-        ratio = held[mover] / free if free > 0 else None
-        message = f"{record.id}: {found}"
-        checks.append(
-            Check.of(f"setup.{record.id}", good, message, value=ratio, limit=1 / limits.HELD_SHARE)
-        )
+        free, held = swings(record)
+        if record.id in wrong:
+            checks.append(wrong[record.id].check("setup"))
+        elif held:
+            named = ", ".join(map(str, record.free))
+            check = Check(
+                kind="setup",
+                run=record.id,
+                outcome="pass",
+                value=max(held.values()) / free if free > 0 else None,
+                limit=1 / LEAST_SHARE,
+                message=_WORDS.text("setup_right", run=record.id, free=named),
+            )
+            checks.append(check)
     return checks
 
 
 def check_held(records: Sequence[Record]) -> list[Check]:
     """Fail for each record in which a cart that should be held moves much beside the free ones."""
+    return [fault.check("held") for fault in find_loose_holds(records)]
+
+
+def check_channels(late: Sequence[LateChannel]) -> list[Check]:
+    """Fail for each cart whose channel is late."""
+    kinds = {
+        "sine": "the dwells",
+        "step": "the steps",
+        "sweep": "the sweeps",
+        "decay": "the decays",
+        "closed_loop": "closed loop",
+    }
     checks = []
-    for record in records:
-        swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
-        free = max((swing[cart] for cart in record.carts if cart in record.free), default=0.0)
-        for cart in (cart for cart in record.carts if cart not in record.free):
-            if limits.HELD_FIRMLY * free < swing[cart] <= free:
-                share = swing[cart] / free
-                message = (
-                    f"{record.id}: cart {cart} is said to be held, but it moves by "
-                    f"{100 * share:.0f} % of what the free carts do: clamp it, for it drives its "
-                    "neighbours"
-                )
-                checks.append(
-                    Check.of(
-                        f"held.{record.id}.cart_{cart}",
-                        False,
-                        message,
-                        value=share,
-                        limit=limits.HELD_FIRMLY,
-                    )
-                )
+    for cart, of_cart in groupby(sorted(late, key=lambda one: one.cart), key=lambda one: one.cart):
+        alike = list(of_cart)
+        surest = min(alike, key=lambda one: (one.than, one.limit))
+        said = abridge([kinds[one.kind] for one in alike])
+        check = Check(
+            kind="late_channel",
+            cart=cart,
+            outcome="fail",
+            value=surest.delay,
+            limit=surest.limit,
+            message=_WORDS.text("late_channel", late=late_fault(surest).reason, kinds=said),
+        )
+        checks.append(check)
     return checks
 
 
@@ -266,25 +257,26 @@ def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list
         for point in points
         if point.experiment in stated
     }
-    off = {name: r for name, r in ratios.items() if abs(np.log(r)) > limits.OTHER_DWELL}
+    off = {name: r for name, r in ratios.items() if abs(np.log(r)) > OTHER_DWELL}
     if not off:
         return []
     ratio = float(np.median(list(off.values())))
-    why = why_other_frequency(ratio)
-    alike = all(abs(r / ratio - 1) < limits.OTHER_DWELL for r in off.values())
-    told = f", {ratio:.4g} times: {why}" if why and alike else ""
-    named = ", ".join(list(off)[:_DWELLS_NAMED]) + (" …" if len(off) > _DWELLS_NAMED else "")
-    message = (
-        f"{len(off)} of {len(ratios)} dwells ({named}) do not swing at the frequency stated{told}."
+    look = why_other_frequency(ratio)
+    alike = all(abs(r / ratio - 1) < OTHER_DWELL for r in off.values())
+    message = _WORDS.text(
+        "dwells",
+        off=len(off),
+        all=len(ratios),
+        runs=", ".join(list(off)[:3]) + (" …" if len(off) > 3 else ""),
+        why=_WORDS.text("dwells_why", ratio=f"{ratio:.4g}", look=look) if look and alike else "",
     )
-    return [Check.of("dwells.frequency", False, message, value=ratio, limit=1.0)]
-
-
-def why_other_frequency(ratio: float) -> str:
-    """Return what a dwell stated at so many times its frequency looks to be, or ""."""
-    close = (
-        why
-        for factor, why in _DWELL_FACTORS.items()
-        if abs(ratio / factor - 1) < limits.OTHER_DWELL
-    )
-    return next(close, "")
+    return [
+        Check(
+            kind="dwells",
+            part="frequency",
+            outcome="fail",
+            value=ratio,
+            limit=1.0,
+            message=message,
+        )
+    ]

@@ -81,7 +81,7 @@ def watching(
     if not web:
         yield [terminal], None
         return
-    from pipeline.bench.live.page import LivePage
+    from pipeline.bench.live.live_page import LivePage
 
     with LivePage(folder) as page:
         terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")

@@ -8,7 +8,7 @@ import errno
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
 from pathlib import Path
@@ -18,8 +18,10 @@ import typer
 from typer.exceptions import TyperException
 
 from pipeline import __version__
+from pipeline.cli.stopping import ctrl_c_says
 from pipeline.errors import PipelineError, lacks_room, lies_in_the_file
 from pipeline.garbage import collect_seldom
+from pipeline.words.progress import Progress
 
 app = typer.Typer(
     name="cartlab",
@@ -89,34 +91,37 @@ def say(text: str) -> None:
 
 
 @contextmanager
-def progress_line() -> Iterator[Callable[[str], None]]:
+def progress_line() -> Iterator[Progress]:
     """Show what is being done while it is done, and say so where Ctrl-C ends it."""
-    try:
+    with ctrl_c_says(lambda: say("stopped; the same command begins anew")) as look:
         with _shown_line() as show:
-            yield show
-    except KeyboardInterrupt:
-        say("stopped; the same command begins anew")
-        raise
+
+            def look_and_show(text: str) -> None:
+                look()
+                show(text)
+
+            yield look_and_show
 
 
 @contextmanager
-def _shown_line() -> Iterator[Callable[[str], None]]:
+def _shown_line() -> Iterator[Progress]:
     if not sys.stderr.isatty():
         with said_now_and_then() as show:
             yield show
         return
+    from rich import progress
     from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    text_column = TextColumn("{task.description}", markup=False)  # a record may be called "[b]"
-    columns = SpinnerColumn(), text_column, TimeElapsedColumn()
-    with Progress(*columns, console=Console(stderr=True), transient=True) as shown:
+    # A record may be called "[b]", which is no markup.
+    text_column = progress.TextColumn("{task.description}", markup=False)
+    columns = progress.SpinnerColumn(), text_column, progress.TimeElapsedColumn()
+    with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
         task = shown.add_task("starting", total=None)
         yield lambda text: shown.update(task, description=text)
 
 
 @contextmanager
-def said_now_and_then() -> Iterator[Callable[[str], None]]:
+def said_now_and_then() -> Iterator[Progress]:
     """Say what is being done after 2 s, and again after twice as long each time, up to a minute.
 
     For a log, where no line can change: short work says nothing, long work never falls silent.

@@ -22,13 +22,14 @@ def demo(
 ) -> None:
     """Run the whole job: a shipped example, a class of three, a bench that hides friction."""
     from pipeline.output import named_folder
+    from pipeline.report.draft.write import Files
     from pipeline.resources import EXAMPLES
-    from pipeline.synthesis.classroom import PLANTED, PRESET, write_class
+    from pipeline.simulated.classroom import PLANTED, PRESET, write_class
 
     out = named_folder(out)
     with search_beside(out) as beside:
         say("1 of 3: the report of three carts")
-        run_report(EXAMPLES / "three-cart", out=out / "report", pdf=True)
+        run_report(EXAMPLES / "three-cart", out=out / "report", files=Files())
         say("2 of 3: a class, graded")
         teams = out / "class"
         if not teams.exists():

@@ -9,8 +9,6 @@ import typer
 from pipeline.cli.common import app, say
 from pipeline.errors import ConfigError
 
-_GLANCE = 0.5  # s between looks whether it is still served
-
 
 @app.command()
 def desk(
@@ -44,6 +42,6 @@ def desk(
         say(f"ready: {server.url}")
         if browser and host is None:
             webbrowser.open(server.url)
-        while not ending.asked.wait(_GLANCE):
+        while not ending.asked.wait(0.5):  # s
             if not server.runs:
                 raise ConfigError(f"the desk's server ended by itself ({ending.log} says more)")

@@ -39,13 +39,12 @@ def emulate(
     ] = False,
 ) -> None:
     """Run a virtual bench that speaks the serial protocol; its address is said on stderr."""
-    from pipeline.bench.emulator.assemble import open_bench
-    from pipeline.synthesis.hidden import prepare_bench, refuse_endless
+    from pipeline.simulated.emulator.announce import RunningBench, announced
+    from pipeline.simulated.emulator.server import EmulatorOptions, Server
+    from pipeline.simulated.hidden import prepare_bench
 
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
-    refuse_endless(bench)
-    server = open_bench(
-        bench,
+    options = EmulatorOptions(
         port=port,
         remote=remote,
         speed=speed,
@@ -53,8 +52,8 @@ def emulate(
         stock=stock,
         faults=fault or (),
         seed=seed,
-        tell=lambda event: say(json.dumps(event)),
     )
+    server = Server(bench, options, tell=lambda event: say(json.dumps(event)))
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -65,8 +64,9 @@ def emulate(
         f"a duty count is {said.input_per_count:.4g} {said.input_unit}, "
         f"an encoder count {said.position_per_count:.4g} {said.position_unit}"
     )
-    say(f"ready: {server.address}")
     try:
-        server.serve(until=stop.is_set)
+        with announced(RunningBench(name=bench.name, address=server.address)):
+            say(f"ready: {server.address}")
+            server.serve(until=stop.is_set)
     finally:
         server.close()

@@ -34,12 +34,12 @@ def explore(
     ] = False,
 ) -> None:
     """Record, identify, look for the gap, choose the next recording, again, until it is known."""
-    from pipeline.bench.explore.at_bench import explore_bench
-    from pipeline.bench.explore.wish import read_time, read_wish
     from pipeline.bench.live.terminal import Terminal
-    from pipeline.report.exploration.page import NAME
+    from pipeline.experiments.exploring.at_bench import explore_bench
+    from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
+    from pipeline.report.exploration.diary import NAME
 
-    wish, seconds = read_wish(until), read_time(limit)
+    goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():
         raise ConfigError("--ask: nobody is at the keyboard")
     with (
@@ -53,7 +53,7 @@ def explore(
                 port=port,
                 observers=observers,
                 buttons=buttons,
-                wish=wish,
+                goal=goal,
                 seconds=seconds,
                 vetoes=terminal.vetoes if ask else lambda recording: False,
             )

@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,15 +11,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pipeline.cli import INTERRUPTED
 from pipeline.cli.common import AsJson, app, said_now_and_then, say
+from pipeline.cli.stopping import ctrl_c_says
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
+    from pipeline.grading.batch.grade_class import Summary
     from pipeline.grading.gradebook.book import Gradebook
-
-_MOST_TOLD = 20  # changes since the class list before
 
 
 @app.command()
@@ -54,30 +52,39 @@ def grade(
     ] = None,
 ) -> None:
     """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
-    from pipeline.grading.batch.grade_class import grade_class
-    from pipeline.grading.batch.runner import Limits
+    from pipeline.grading.batch.grade_class import Options, grade_class
 
-    with _stopping(out), _batch_progress() as progress:
-        done = grade_class(
-            paths,
-            rubric_file=rubric,
-            out=out,
-            jobs=jobs,
-            cluster=cluster,
-            limits=Limits(time=time_limit, memory=round(memory_limit * 1e9)),
-            figures=figures,
-            progress=progress,
-            anonymous=anonymous,
-            gradebook=gradebook,
-            lateness=lateness,
-        )
+    options = Options(
+        jobs=jobs,
+        cluster=cluster,
+        time_limit=time_limit,
+        memory_limit=round(memory_limit * 1e9),
+        figures=figures,
+        anonymous=anonymous,
+        gradebook=gradebook,
+        lateness=lateness,
+    )
+    kept = f"stopped; what is graded is kept in {out}, and the same command goes on from there"
+    with ctrl_c_says(lambda: say(kept)) as look, _batch_progress() as show:
+
+        def progress(done: int, total: int, last: str) -> None:
+            look()
+            show(done, total, last)
+
+        done = grade_class(paths, rubric_file=rubric, out=out, options=options, progress=progress)
+    _say_what_came_of_it(done, out=out, rubric=rubric)
+    if done.failed:
+        raise typer.Exit(1)
+
+
+def _say_what_came_of_it(done: "Summary", *, out: Path, rubric: Path) -> None:
     for remark in done.remarks:
         say(remark)
     if done.changes:
         say("since the class list before:")
-        for change in done.changes[:_MOST_TOLD]:
+        for change in done.changes[:20]:
             say(f"  {change}")
-        if (more := len(done.changes) - _MOST_TOLD) > 0:
+        if (more := len(done.changes) - 20) > 0:
             say(f"  and {more} more; cartlab history tells each")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
@@ -89,30 +96,6 @@ def grade(
     if len(done.failed) == done.total > 1 and not done.unsettled:
         say(f"not one could be graded: is {rubric} the rubric for these submissions?")
     say(f"{done.counted}; wrote {out}")
-    if done.failed:
-        raise typer.Exit(1)
-
-
-@contextmanager
-def _stopping(out: Path) -> Iterator[None]:
-    """Say how to go on where Ctrl-C ends a run, whatever it was doing just then."""
-    pressed = False
-
-    def stop(*_: object) -> None:
-        nonlocal pressed
-        pressed = True
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGINT, stop)
-    try:
-        yield
-    except BaseException:  # a library that is interrupted may end in an error of its own
-        if not pressed:
-            raise
-        say(f"stopped; what is graded is kept in {out}, and the same command goes on from there")
-        raise typer.Exit(INTERRUPTED) from None
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextmanager

@@ -4,19 +4,20 @@ import json
 import os
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 
 from pipeline.cli.reports import explain
+from pipeline.words.progress import Progress, silent
 
 
-def find_hidden(out: Path, *, progress: Callable[[str], None]) -> list[str]:
+def find_hidden(out: Path, *, progress: Progress) -> list[str]:
     """Write a bench that hides friction and what explains it; return what is to be said."""
-    from pipeline.synthesis.hidden import prepare_bench, write_bench
+    from pipeline.simulated.hidden import prepare_bench
+    from pipeline.simulated.submission import write_submission
 
     hidden, folder = prepare_bench(preset="throne-2dof", hide=["coulomb_friction"]), out / "bench"
     if not (folder / "submission.toml").exists():
-        write_bench(folder, hidden, seed=0)
+        write_submission(folder, hidden, seed=0)
     _, told = explain(folder, out=out / "gap", progress=progress)
     return [*(f"hidden: {sentence}" for sentence in hidden.told), *told]
 
@@ -28,4 +29,4 @@ def _end_with_the_first() -> None:
 
 if __name__ == "__main__":
     threading.Thread(target=_end_with_the_first, daemon=True).start()
-    json.dump(find_hidden(Path(sys.argv[1]), progress=lambda _: None), sys.stdout)
+    json.dump(find_hidden(Path(sys.argv[1]), progress=silent), sys.stdout)

@@ -22,7 +22,8 @@ def simulate(
 ) -> None:
     """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
     from pipeline.output import new_folder
-    from pipeline.synthesis.hidden import prepare_bench, write_bench
+    from pipeline.simulated.hidden import prepare_bench
+    from pipeline.simulated.submission import write_submission
 
     new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
@@ -30,7 +31,7 @@ def simulate(
         say(f"hidden: {sentence}")
     with progress_line() as progress:
         progress("simulating the experiments")
-        write_bench(out, bench, seed=seed, reported=reported)
+        write_submission(out, bench, seed=seed, reported=reported)
     say(f"wrote {out}: try `cartlab report {out}`")
 
 
@@ -46,12 +47,12 @@ def effects(
 ) -> None:
     """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
     from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
-    from pipeline.report.effects.words import catalogue_data, catalogue_text
+    from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
 
     chosen = [find_effect(name)] if name else CATALOGUE
     if out:
         from pipeline.output import named_folder
-        from pipeline.report.effects.page import render_effects
+        from pipeline.report.effects.gallery import render_effects
 
         with progress_line() as progress:
             render_effects(chosen, named_folder(out), progress=progress)
@@ -65,10 +66,10 @@ def effects(
 @app.command()
 def schema(
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="results, gap, solution or grade.")
+        str, typer.Argument(metavar="NAME", help="results, gap, solution, grade or check.")
     ] = "results",
 ) -> None:
-    """Print the JSON Schema of results.json, gap.json, solution.json or grade.json."""
-    from pipeline.schemas.export import schema_text
+    """Print the JSON Schema of results.json, gap.json, solution.json, grade.json or a check."""
+    from pipeline.schemas import schema_text
 
     typer.echo(schema_text(name), nl=False)

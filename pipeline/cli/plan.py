@@ -30,23 +30,26 @@ def plan(
     as_json: AsJson = False,
 ) -> None:
     """Propose the experiments to record: write plan.toml, or add to it what the data allow."""
-    from pipeline.bench.design.goal import WORST
-    from pipeline.bench.design.next_plan import plan_next
-    from pipeline.bench.planning.plan_words import plan_data, plan_table
-    from pipeline.bench.planning.propose import make_plan
-    from pipeline.report.words import with_symbols
+    from pipeline.bench.host.raw import known_commands
+    from pipeline.experiments.goal import WORST
+    from pipeline.experiments.next_recordings import plan_next
+    from pipeline.experiments.plan_words import plan_data, plan_table
+    from pipeline.experiments.propose import current_plan, make_plan
     from pipeline.submission import load_submission
+    from pipeline.words.text import with_symbols
 
     if goal and number is None:
         raise ConfigError("--for says what the next experiments are for: it goes with --next N")
     submission = load_submission(folder)
+    before = {recording.id for recording in current_plan(submission).recordings}
     with progress_line() as progress:
         if number is None:
             made = make_plan(submission, stock=stock, progress=progress)
             words, further = [made.trouble, made.said], {}
         else:
+            commands = frozenset[str]() if stock else known_commands(folder)
             made = plan_next(
-                submission, n=number, goal=goal or WORST, stock=stock, progress=progress
+                submission, n=number, goal=goal or WORST, commands=commands, progress=progress
             )
             words = [made.wrote, *map(with_symbols, made.sentences)]
             further = {
@@ -59,10 +62,11 @@ def plan(
                     "planned": made.planned,
                 }
             }
+    new = {recording.id for recording in made.plan.recordings} - before
     if as_json:
-        data = plan_data(made.plan, submission) | further
+        data = plan_data(made.plan, submission, new=new) | further
         typer.echo(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        typer.echo(plan_table(made.plan, submission))
+        typer.echo(plan_table(made.plan, submission, new=new))
     for sentence in filter(None, words):
         say(sentence)

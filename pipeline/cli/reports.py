@@ -10,9 +10,11 @@ import typer
 
 from pipeline.cli.common import AsJson, Folder, app, progress_line, say
 from pipeline.errors import PipelineError
+from pipeline.words.progress import Progress
 
 if TYPE_CHECKING:
     from pipeline.report.draft.changes import DraftChanges
+    from pipeline.report.draft.write import Files
     from pipeline.results import Analysis
     from pipeline.submission import Submission
 
@@ -124,14 +126,21 @@ def report(
     tables: Annotated[
         bool, typer.Option("--tables", help="Write tables/*.csv and, for MATLAB, results.mat too.")
     ] = False,
+    plots: Annotated[
+        bool,
+        typer.Option("--plots", help="Write compare.html too: runs and models over each other."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Identify the carts, design the controller, check the hardware, write the report."""
-    analysis = run_report(folder, out=out, pdf=pdf, compare=compare, tables=tables)
-    if as_json:
-        from pipeline.results_json import results_text
+    from pipeline.report.draft.write import Files
 
-        typer.echo(results_text(analysis), nl=False)
+    files = Files(pdf=pdf, tables=tables, plots=plots)
+    analysis = run_report(folder, out=out, files=files, compare=compare)
+    if as_json:
+        from pipeline.json_files import json_text
+
+        typer.echo(json_text(analysis), nl=False)
     if analysis.failed_checks:
         raise typer.Exit(1)
 
@@ -140,9 +149,8 @@ def run_report(
     folder: Path,
     *,
     out: Path | None,
-    pdf: bool,
+    files: "Files",
     compare: Path | None = None,
-    tables: bool = False,
 ) -> "Analysis":
     """Write the report of a submission and say in a few lines what it found."""
     from pipeline.output import named_folder, own_folder
@@ -150,20 +158,22 @@ def run_report(
     from pipeline.report.draft.write import make_report
     from pipeline.report.sections.questions import open_line
     from pipeline.report.sections.summary import terminal_summary
-    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
+    from pipeline.words.text import with_symbols
 
     submission = load_submission(folder)
     out = named_folder(out) if out else own_folder(submission.folder, "report")
     compared = _comparison(compare, submission)
     with progress_line() as progress:
         analysis, changes = make_report(
-            submission, out, compared=compared, pdf=pdf, tables=tables, progress=progress
+            submission, out, compared=compared, files=files, progress=progress
         )
     said = (changes and with_symbols(changes_line(changes)), open_line(analysis))
     for line in (terminal_summary(analysis), *_unreadable(analysis), *filter(None, said)):
         say(line)
-    say(_wrote(out, "report", pdf=pdf))
+    say(_wrote(out, "report", pdf=files.pdf))
+    if files.plots:
+        say(f"wrote {out / 'compare.html'}")
     return analysis
 
 
@@ -182,14 +192,36 @@ def _comparison(
         return lambda analysis: None
     from pipeline.report.draft.changes import check_comparable, compare_drafts, read_results
 
-    before, system = read_results(earlier), submission.system
-    check_comparable(
-        before,
-        carts=system.carts,
-        position_unit=system.position.unit,
-        input_unit=system.input.unit,
-    )
+    before = read_results(earlier)
+    check_comparable(before, bench=submission.system.bench)
     return partial(compare_drafts, before)
+
+
+@app.command()
+def check(
+    folder: Folder,
+    rubric: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Whose tolerances hold: a rubric, or a shipped name."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which of your numbers disagree with your recordings; asked again, where to look.
+
+    It never says the value. How often it was asked is in DIR/checks.jsonl, which is handed in.
+    """
+    from pipeline.grading.rubric_file import load_rubric
+    from pipeline.grading.self_check.check import check_numbers
+    from pipeline.grading.self_check.log import answer_line
+    from pipeline.grading.self_check.words import answer_lines
+    from pipeline.submission import load_submission
+
+    asked = load_rubric(rubric) if rubric else None
+    with progress_line() as progress:
+        answer = check_numbers(load_submission(folder), rubric=asked, progress=progress)
+    typer.echo(answer_line(answer) if as_json else "\n".join(answer_lines(answer)), nl=not as_json)
+    if answer.disagree:
+        raise typer.Exit(1)
 
 
 @app.command()
@@ -210,8 +242,8 @@ def solution(
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
-    from pipeline.report.words import with_symbols
     from pipeline.submission import load_submission
+    from pipeline.words.text import with_symbols
 
     submission, asked = load_submission(folder), load_rubric(rubric) if rubric else None
     out = named_folder(out) if out else own_folder(submission.folder, "solution")
@@ -259,27 +291,27 @@ def explain(
     out: Path | None,
     budget: float | None = None,
     pdf: bool = True,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[str, list[str]]:
     """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
-    from pipeline.gap.stored import gap_text
+    from pipeline.json_files import json_text
     from pipeline.output import named_folder, own_folder, write_file
-    from pipeline.report.gap.page import render_gap
-    from pipeline.report.gap.words import terminal_verdict
+    from pipeline.report.gap.story import render_gap
+    from pipeline.report.gap.verdict import terminal_verdict
     from pipeline.submission import load_submission
     from pipeline.workflow import analyse
 
     submission = load_submission(folder)
     out = named_folder(out) if out else own_folder(submission.folder, "gap")
     analysis = analyse(submission, design=False, progress=progress)
-    from pipeline.bench.design.discriminate import propose_for  # load the …
-    from pipeline.gap.investigate import investigate  # … compiled simulator
+    from pipeline.experiments.discriminate import propose_for  # load the …
+    from pipeline.gap.explain import investigate  # … compiled simulator
 
     found = investigate(analysis, budget=budget, progress=progress)
     progress("weighing what to record next")
     found = propose_for(found, submission)
     out.mkdir(parents=True, exist_ok=True)
-    write_file(out / "gap.json", text := gap_text(found, analysis))
+    write_file(out / "gap.json", text := json_text(found))
     render_gap(found, analysis, out, pdf=pdf, progress=progress)
     return text, [*_unreadable(analysis), terminal_verdict(found), _wrote(out, "gap", pdf=pdf)]
 

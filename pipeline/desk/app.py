@@ -2,7 +2,8 @@
 
 import asyncio
 import socket
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable
+from inspect import iscoroutinefunction
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,88 +15,156 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.routing import Route
 
-from pipeline.desk.bench import room as bench
-from pipeline.desk.doors import Guard, ProxyDoor, SecretDoor
-from pipeline.desk.grades import room as grades
-from pipeline.desk.grades import team
-from pipeline.desk.grades import work as whole
-from pipeline.desk.home import enter, open_place, show_home
-from pipeline.desk.instructor import room as instructor
-from pipeline.desk.instructor import rubrics
-from pipeline.desk.pages import static_file
+from pipeline.desk.ask import Ask, Desk, plain_error, prepare_pages
+from pipeline.desk.bench import bench_page
+from pipeline.desk.doors import PAGE_HEADERS, ProxyDoor, SecretDoor, limit_bodies
+from pipeline.desk.grades import (
+    class_actions,
+    class_table,
+    request_queue,
+    team_page,
+    together,
+)
+from pipeline.desk.home import enter, open_place, show_folders, show_home
+from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
 from pipeline.desk.scratch import clear_scratch
-from pipeline.desk.state import Ask, Desk, plain_error, prepare_pages
-from pipeline.desk.student import report as student_report
-from pipeline.desk.student import room as student
+from pipeline.desk.served_files import serve_file, serve_static
+from pipeline.desk.student import (
+    check_page,
+    own_feedback,
+    plots_page,
+    report_page,
+    submission_page,
+)
+from pipeline.desk.student.seeing import REFUSED, is_refused
 from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN
+from pipeline.web.guard import Guard
 from pipeline.web.server import Served
-from pipeline.web.strangers import Strangers, announced
 
-Handler = Callable[[Ask], Response]
-Listener = Callable[[Ask], Awaitable[Response]]
-_MOST_FIELDS = 5_000
-_FRAME = 0.2  # s between looks for news
-_ALIVE = 5.0  # s between signs of life where there is none
+Handler = Callable[[Ask], Any]  # a Response, or one that is awaited
+
+
+def _start(task: str, title: str, *, then: str = "") -> Handler:
+    """Return what begins a long task in the folder of the address."""
+
+    def start(ask: Ask) -> Response:
+        ask.start(task, title=title)
+        return ask.back(ask.here + then)
+
+    return start
+
+
+def _serve(inside: str) -> Handler:
+    """Return what serves a file of a folder inside the one of the address."""
+    return lambda ask: serve_file(ask.folder(), f"{inside}/{ask.request.path_params['name']}")
+
+
+def _stop(ask: Ask) -> Response:
+    """Stop what is under way in the folder of the address; what is done is kept."""
+    ask.stop(ask.folder())
+    return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
+
+
+async def _tell_news(ask: Ask) -> Response:
+    """Tell of the work in the place of the address."""
+    return StreamingResponse(_news(ask, ask.grades()), media_type="text/event-stream")
+
+
+async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
+    """Send a line for every stage; one a person has not read is not kept for them."""
+    seen, quiet, frame = -1, 0.0, 0.2  # s between looks for news
+    while (job := ask.desk.jobs.of(place)) is not None:
+        if job.news != seen:
+            seen, quiet = job.news, 0.0
+            said = " ".join(ask.user.told(job.said).split())
+            yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
+        elif quiet > 5.0:  # s
+            quiet = 0.0
+            yield ": still here\n\n"
+        if job.over:
+            return
+        await asyncio.sleep(frame)
+        quiet += frame
+    yield "event: end\ndata: \n\n"
+
 
 # Address, method, who answers. What changes anything is a POST of a form that needs no script.
+# Streams of news are coroutines and take no thread: those that answer would soon be used up.
 ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/", "GET", show_home),
+    ("/open", "GET", show_folders),
     ("/open", "POST", open_place),
-    ("/static/{name}", "GET", lambda ask: static_file(ask.request.path_params["name"])),
-    ("/student/{n:int}/", "GET", student.show),
-    ("/student/{n:int}/files", "POST", student.upload),
-    ("/student/{n:int}/fill", "POST", student.fill),
-    ("/student/{n:int}/aside", "POST", student.aside),
-    ("/student/{n:int}/save", "POST", student.save),
-    ("/student/{n:int}/experiments/{index:int}", "POST", student.save_experiment),
-    ("/student/{n:int}/make-report", "POST", student_report.start_report),
-    ("/student/{n:int}/make-gap", "POST", student_report.start_gap),
-    ("/student/{n:int}/gap/{name:path}", "GET", student_report.gap_file),
-    ("/student/{n:int}/stop", "POST", student_report.stop),
-    ("/student/{n:int}/report", "GET", student_report.show),
-    ("/student/{n:int}/report/{name:path}", "GET", student_report.report_file),
-    ("/student/{n:int}/answer", "POST", student_report.answer),
-    ("/student/{n:int}/hand-in", "GET", student.show_hand_in),
-    ("/student/{n:int}/hand-in", "POST", student.start_hand_in),
-    ("/student/{n:int}/hand-in.zip", "GET", student.packed),
-    ("/bench/{n:int}/", "GET", bench.show),
-    ("/bench/{n:int}/plan", "POST", bench.plan),
-    ("/bench/{n:int}/acquire", "POST", bench.start),
-    ("/bench/{n:int}/explore", "POST", bench.explore),
-    ("/bench/{n:int}/add", "POST", bench.add),
-    ("/bench/{n:int}/weigh", "GET", bench.weigh),
-    ("/bench/{n:int}/exploration.html", "GET", bench.diary),
-    ("/bench/{n:int}/press", "POST", bench.press),
-    ("/exercises/", "GET", instructor.show),
-    ("/exercises/picture.svg", "GET", instructor.picture),
-    ("/exercises/make", "POST", instructor.make),
-    ("/exercises/made", "GET", instructor.made),
-    ("/exercises/stop", "POST", instructor.stop),
-    ("/effects/", "GET", instructor.catalogue),
-    ("/rubric/", "GET", rubrics.show),
-    ("/rubric/check", "POST", rubrics.check),
-    ("/rubric/save", "POST", rubrics.save),
-    ("/solution/{n:int}/", "GET", instructor.show_solution),
-    ("/solution/{n:int}/make", "POST", instructor.make_solution),
-    ("/solution/{n:int}/{name:path}", "GET", instructor.solution_file),
-    ("/grades/{n:int}/", "GET", grades.show),
-    ("/grades/{n:int}/news", "GET", grades.news),
-    ("/grades/{n:int}/distribution.svg", "GET", grades.distribution),
-    ("/grades/{n:int}/class.html", "GET", grades.at_a_glance),
-    ("/grades/{n:int}/feedback/{name:path}/feedback.html", "GET", grades.feedback),
-    ("/grades/{n:int}/team", "GET", team.show),
-    ("/grades/{n:int}/team", "POST", team.act),
-    ("/grades/{n:int}/figure", "GET", team.figure),
-    ("/grades/{n:int}/import", "POST", whole.take_table),
-    ("/grades/{n:int}/export", "POST", whole.export_class),
-    ("/grades/{n:int}/publish", "POST", whole.publish),
-    ("/grades/{n:int}/regrade", "POST", whole.regrade),
-    ("/grades/{n:int}/stop", "POST", whole.stop),
+    ("/static/{name}", "GET", serve_static),
+    ("/student/{n:int}/", "GET", submission_page.show),
+    ("/student/{n:int}/files", "POST", submission_page.upload),
+    ("/student/{n:int}/fill", "POST", submission_page.fill),
+    ("/student/{n:int}/aside", "POST", submission_page.set_aside),
+    ("/student/{n:int}/save", "POST", submission_page.save),
+    ("/student/{n:int}/experiments/{index:int}", "POST", submission_page.save_experiment),
+    ("/student/{n:int}/make-report", "POST", _start("make_report", "The report", then="#report")),
+    ("/student/{n:int}/make-gap", "POST", _start("make_gap", "The gap", then="#report")),
+    ("/student/{n:int}/gap/{name:path}", "GET", _serve("gap")),
+    ("/student/{n:int}/stop", "POST", _stop),
+    ("/student/{n:int}/events", "GET", _tell_news),
+    ("/student/{n:int}/report", "GET", report_page.show),
+    ("/student/{n:int}/report/{name:path}", "GET", _serve("report")),
+    ("/student/{n:int}/questions", "GET", report_page.show_questions),
+    ("/student/{n:int}/compare", "GET", plots_page.show),
+    ("/student/{n:int}/compare", "POST", plots_page.make),
+    ("/student/{n:int}/answer", "POST", report_page.answer),
+    ("/student/{n:int}/check", "GET", check_page.show),
+    ("/student/{n:int}/check", "POST", check_page.begin),
+    ("/student/{n:int}/hand-in", "GET", submission_page.show_hand_in),
+    ("/student/{n:int}/hand-in", "POST", submission_page.start_hand_in),
+    ("/student/{n:int}/hand-in.zip", "GET", submission_page.download_hand_in),
+    ("/bench/{n:int}/", "GET", bench_page.show),
+    ("/bench/{n:int}/plan", "POST", bench_page.plan),
+    ("/bench/{n:int}/acquire", "POST", bench_page.acquire),
+    ("/bench/{n:int}/explore", "POST", bench_page.explore),
+    ("/bench/{n:int}/add", "POST", bench_page.add),
+    ("/bench/{n:int}/weigh", "GET", bench_page.weigh),
+    ("/bench/{n:int}/exploration.html", "GET", bench_page.show_diary),
+    ("/bench/{n:int}/press", "POST", bench_page.press),
+    ("/bench/{n:int}/events", "GET", bench_page.stream),
+    ("/exercises/", "GET", exercise_pages.show),
+    ("/exercises/picture.svg", "GET", exercise_pages.draw),
+    ("/exercises/make", "POST", exercise_pages.make),
+    ("/exercises/made", "GET", exercise_pages.show_made),
+    ("/exercises/stop", "POST", exercise_pages.stop),
+    ("/effects/", "GET", exercise_pages.show_catalogue),
+    ("/rubric/", "GET", rubric_editor.show),
+    ("/rubric/check", "POST", rubric_editor.check),
+    ("/rubric/save", "POST", rubric_editor.save),
+    ("/rubric/preview", "POST", rubric_preview_page.preview),
+    ("/rubric/preview.svg", "GET", rubric_preview_page.draw_preview),
+    ("/solution/{n:int}/", "GET", exercise_pages.show_solution),
+    ("/solution/{n:int}/make", "POST", _start("make_solution", "The solution")),
+    ("/solution/{n:int}/{name:path}", "GET", _serve("solution")),
+    ("/grades/{n:int}/", "GET", class_table.show),
+    ("/grades/{n:int}/events", "GET", _tell_news),
+    ("/grades/{n:int}/news", "GET", class_table.show_news),
+    ("/grades/{n:int}/distribution.svg", "GET", class_table.draw_distribution),
+    ("/grades/{n:int}/class.html", "GET", class_table.show_class_page),
+    ("/grades/{n:int}/feedback/{name:path}/feedback.html", "GET", class_table.show_feedback),
+    ("/grades/{n:int}/team", "GET", team_page.show),
+    ("/grades/{n:int}/team", "POST", team_page.act),
+    ("/grades/{n:int}/together", "GET", together.show),
+    ("/grades/{n:int}/together", "POST", together.apply),
+    ("/grades/{n:int}/figure", "GET", team_page.show_figure),
+    ("/grades/{n:int}/again", "GET", request_queue.show),
+    ("/grades/{n:int}/again", "POST", request_queue.act),
+    ("/grades/{n:int}/release", "POST", class_actions.release),
+    ("/feedback/{n:int}/", "GET", own_feedback.show),
+    ("/feedback/{n:int}/whole", "GET", own_feedback.show_whole),
+    ("/feedback/{n:int}/ask", "POST", own_feedback.send),
+    ("/grades/{n:int}/import", "POST", class_actions.take_table),
+    ("/grades/{n:int}/export", "POST", class_actions.export_class),
+    ("/grades/{n:int}/publish", "POST", _start("publish_grades", "Writing", then="#work")),
+    ("/grades/{n:int}/regrade", "POST", class_actions.regrade),
+    ("/grades/{n:int}/stop", "POST", _stop),
 )  # fmt: skip
-# A Stop does not wait for one of the threads in which all others are answered.
-STOPS = frozenset([student_report.stop, bench.press, instructor.stop, whole.stop])
 
 
 class DeskServer:
@@ -140,11 +209,8 @@ class DeskServer:
         self._desk = Desk()
         clear_scratch()
         prepare_pages()
-        strangers = Strangers()
-        guard = Guard(
-            app=application(self._desk), door=door, uploads=HAND_IN.total, strangers=strangers
-        )
-        self._served = Served(guard, listener, protocol=announced(strangers, shows=door.shows))
+        limited = limit_bodies(application(self._desk), uploads=HAND_IN.total)
+        self._served = Served(Guard(limited, door, headers=PAGE_HEADERS), listener)
 
     def __enter__(self) -> Self:
         if not self._served.start():
@@ -163,39 +229,34 @@ class DeskServer:
 
 def application(desk: Desk) -> Starlette:
     """Return what answers, where a guard has said who asks (`scope["user"]`)."""
-    routes = [
-        Route(path, _endpoint(desk, handler, room=_room(path)), methods=[method])
-        for path, method, handler in ROUTES
-    ]
-    events = [Route(path, _events(desk, news, room=_room(path))) for path, news in EVENTS.items()]
     return Starlette(
-        routes=[*routes, *events],
-        exception_handlers={HTTPException: _wrong(desk), Exception: _wrong(desk)},
+        routes=[
+            Route(path, _answer(desk, handler, path=path), methods=[method])
+            for path, method, handler in ROUTES
+        ],
+        exception_handlers={HTTPException: _explain(desk), Exception: _explain(desk)},
     )
 
 
-def _room(path: str) -> str:
-    return path.split("/")[1]
-
-
-def _admit(user: User, room: str) -> None:
-    if not user.may(room):
-        raise HTTPException(403, f"this room is not for a {user.role}")
-
-
-def _endpoint(
-    desk: Desk, handler: Handler, *, room: str
-) -> Callable[[Request], Awaitable[Response]]:
-    """Return what reads the form, answers in a thread, and tells a person what went wrong."""
+def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], Awaitable[Response]]:
+    """Return what reads the form, answers, and tells a person what went wrong."""
 
     async def answer(request: Request) -> Response:
-        _admit(request.scope["user"], room)
+        user, room = request.scope["user"], path.split("/")[1]
+        if not user.may(room):
+            raise HTTPException(403, f"this room is not for a {user.role}")
         form = FormData()
         if request.method == "POST":
-            form = await request.form(max_files=HAND_IN.members, max_fields=_MOST_FIELDS)
-        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=form)
+            form = await request.form(max_files=HAND_IN.members, max_fields=5_000)
+        ask = Ask(desk=desk, user=user, request=request, form=form)
+        if room == "student" and is_refused(ask, path):
+            raise HTTPException(403, REFUSED)
         try:
-            run = asyncio.to_thread if handler in STOPS else run_in_threadpool
+            if iscoroutinefunction(handler):
+                return await handler(ask)
+            # A Stop does not wait for one of the threads in which all others are answered.
+            at_once = path.endswith(("/stop", "/press"))
+            run = asyncio.to_thread if at_once else run_in_threadpool
             return await run(handler, ask)
         except PipelineError as error:
             return plain_error(ask, str(error), status=422)
@@ -209,7 +270,7 @@ def _endpoint(
     return answer
 
 
-def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
+def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:
     """Return what tells of an address that is none, and of a fault of our own."""
 
     def answer(request: Request, error: Exception) -> Response:
@@ -220,48 +281,3 @@ def _wrong(desk: Desk) -> Callable[[Request, Exception], Response]:
         return plain_error(ask, what, status=500)
 
     return answer
-
-
-def _events(desk: Desk, listen: Listener, *, room: str) -> Callable[[Request], Awaitable[Response]]:
-    """Return what tells news as they come, in the server's own loop."""
-
-    async def answer(request: Request) -> Response:
-        _admit(request.scope["user"], room)
-        ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())
-        return await listen(ask)
-
-    return answer
-
-
-async def _work_in_folder(ask: Ask) -> Response:
-    return StreamingResponse(_news(ask, ask.folder()), media_type="text/event-stream")
-
-
-async def _work_on_class(ask: Ask) -> Response:
-    return StreamingResponse(_news(ask, ask.grades()), media_type="text/event-stream")
-
-
-async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
-    """Send a line for every stage; one a person has not read is not kept for them."""
-    seen, quiet = -1, 0.0
-    while (job := ask.desk.jobs.of(place)) is not None:
-        if job.news != seen:
-            seen, quiet = job.news, 0.0
-            said = " ".join(ask.user.told(job.said).split())
-            yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
-        elif quiet > _ALIVE:
-            quiet = 0.0
-            yield ": still here\n\n"
-        if job.over:
-            return
-        await asyncio.sleep(_FRAME)
-        quiet += _FRAME
-    yield "event: end\ndata: \n\n"
-
-
-# Streams of news take no thread: those in which pages are answered would soon be used up.
-EVENTS: Mapping[str, Listener] = {
-    "/student/{n:int}/events": _work_in_folder,
-    "/grades/{n:int}/events": _work_on_class,
-    "/bench/{n:int}/events": bench.events,
-}

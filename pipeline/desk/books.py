@@ -3,32 +3,16 @@
 import getpass
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.class_lines import Line
-from pipeline.grading.gradebook.open_book import ClassNow, Listing, OpenBook, State
+from pipeline.grading.gradebook.open_book import ClassNow, Listing, State
+from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.publish.anonymous import anonymous_line, pseudonyms
 from pipeline.grading.rubric import Rubric
-
-
-@dataclass(frozen=True, kw_only=True)
-class Team:
-    """A line of the class as a page shows it.
-
-    Attributes
-    ----------
-    submission : its name in the gradebook, which an anonymous page does not show.
-    seen : who looked at it, or "".
-    """
-
-    line: Line
-    submission: str
-    listing: Listing
-    seen: str
 
 
 @dataclass(frozen=True)
@@ -48,27 +32,16 @@ class Class:
         """What stands in for the name of each submission, None where names are shown."""
         if not self.rubric.anonymous:
             return None
-        return pseudonyms({one.line.name: one.first_key for one in self.now.listings})
+        return pseudonyms({one.submission: one.first_key for one in self.now.listings})
 
     @cached_property
-    def teams(self) -> Mapping[str, Team]:
+    def teams(self) -> Mapping[str, Listing]:
         """All of it, by the names that are shown."""
-        lines = [
-            one.line if self.names is None else anonymous_line(one.line, self.names)
-            for one in self.now.listings
-        ]
-        teams = [
-            Team(
-                line=line,
-                submission=one.line.name,
-                listing=one,
-                seen=self.now.seen.get(one.grading, ""),
-            )
-            for line, one in zip(lines, self.now.listings, strict=True)
-        ]
+        teams = list(self.now.listings)
         if self.names is not None:  # the order of the names would tell
-            teams.sort(key=lambda team: team.line.name)
-        return {team.line.name: team for team in teams}
+            teams = [replace(one, line=anonymous_line(one.line, self.names)) for one in teams]
+            teams.sort(key=lambda team: team.line.submission)
+        return {team.line.submission: team for team in teams}
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
@@ -78,14 +51,14 @@ class Class:
         for name, team in self.teams.items():
             if team.line.status == "failed":  # as on the class page: nothing was lost
                 continue
-            judged = team.line.criteria
+            judged = team.line.judged
             for key, points in whole.items():
-                if key not in judged or judged[key][1] < points:
+                if key not in judged or judged[key]["points"] < points:
                     lost[key].add(name)
         return lost
 
 
-def _user() -> str:
+def _find_user() -> str:
     try:
         return getpass.getuser()
     except (OSError, KeyError):  # KeyError until Python 3.12: a system that does not know them
@@ -96,14 +69,14 @@ class Books:
     """Every gradebook is opened once, and a class read when something in it is another."""
 
     def __init__(self) -> None:
-        self.signed = _user()  # who changes points, where no proxy says it
+        self.signed = _find_user()  # who changes points, where no proxy says it
         self.asked: dict[Path | str, dict[str, str]] = {}  # what was graded again last, from where
-        self._books: dict[Path | str, OpenBook] = {}
+        self._books: dict[Path | str, RequestBook] = {}
         self._classes: dict[Path | str, Class] = {}
         self._drawn: dict[tuple[Path | str, str], tuple[State, Any]] = {}
         self._lock, self._drawing = threading.Lock(), threading.Lock()
 
-    def book(self, place: Path | str) -> OpenBook:
+    def book(self, place: Path | str) -> RequestBook:
         """Return an open gradebook.
 
         Raises
@@ -114,8 +87,20 @@ class Books:
             if isinstance(place, Path) and not place.is_dir():
                 raise ConfigError(f"{place.name}: there is no such folder any more")
             if place not in self._books:
-                self._books[place] = OpenBook(place)
+                self._books[place] = RequestBook(place)
             return self._books[place]
+
+    def n_waiting(self, place: Path | str) -> int:
+        """Return how many requests wait in a gradebook; 0 where that cannot be read now.
+
+        A database that nobody opened yet is not waited for: every page asks this.
+        """
+        if isinstance(place, str) and place not in self._books:
+            return 0
+        try:
+            return self.book(place).n_waiting()
+        except ConfigError:  # its own page says why
+            return 0
 
     def of(self, place: Path | str) -> Class:
         """Return the class as it is now."""

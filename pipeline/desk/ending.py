@@ -19,10 +19,6 @@ from pipeline.desk import watch
 from pipeline.errors import PipelineError
 from pipeline.output import OWNERS_FOLDER
 
-_MOST_LOG = 1_000_000  # bytes; a longer log starts again from nothing
-# Signals that a program can catch: Ctrl-C, kill, a terminal or session that closes.
-_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
-
 
 class Ending:
     """Hears of what ends the desk; a context, around all that is served.
@@ -39,7 +35,7 @@ class Ending:
 
     def __init__(self, *, say: Callable[[str], None]) -> None:
         self.asked = threading.Event()
-        self.log = log_file()
+        self.log = find_log()
         self._say, self._why = say, "no reason was given"
         # In a session of its own: what ends all of a terminal's programs does not end this one.
         self._watch = subprocess.Popen(
@@ -53,7 +49,8 @@ class Ending:
         assert self._watch.stdin is not None
         faulthandler.enable(file=self._watch.stdin)
         threading.excepthook = self._in_thread
-        for name in _SIGNALS:
+        # What a program can catch: Ctrl-C, kill, a terminal or session that closes.
+        for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
             number = getattr(signal, name, None)
             # nohup has a program ignore SIGHUP; it stays ignored.
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
@@ -100,7 +97,7 @@ class Ending:
             self.note("".join(traceback.format_exception(error)))
 
 
-def log_file() -> Path:
+def find_log() -> Path:
     """Return the file in which it is kept what ended desks; its folder is made where it can be."""
     defaults = {"win32": "~/AppData/Local", "darwin": "~/Library/Logs"}
     root = os.environ.get("XDG_STATE_HOME") or defaults.get(sys.platform, "~/.local/state")
@@ -110,7 +107,7 @@ def log_file() -> Path:
         log = Path(tempfile.gettempdir()) / "cartlab-desk.log"
     with suppress(OSError):  # a home that nobody may write to: stderr has what matters
         log.parent.mkdir(OWNERS_FOLDER, parents=True, exist_ok=True)
-        if log.stat().st_size > _MOST_LOG:
+        if log.stat().st_size > 1_000_000:  # bytes; it starts again from nothing
             log.unlink()
     return log
 

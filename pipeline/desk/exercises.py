@@ -6,87 +6,91 @@ A bench is what a form says of one: `preset`, or the `m`, `c` and `k` of an own 
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 from pipeline.errors import ConfigError
 from pipeline.output import new_folder, own_folder
-from pipeline.plant.nonlinear.effects import Parameter, find_effect
+from pipeline.plant.nonlinear.effects import EffectParameter, find_effect
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.hidden import default_values, prepare_bench, usual_term
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import HiddenBench, default_values, prepare_bench, usual_term
+from pipeline.words.progress import Progress
 
-Progress = Callable[[str], None]
-MOST_FOLDERS = 500
 SLIDE = 1.0  # decades that a slider goes to each side of the usual size
 
 _OWN = "own chain"
-_BETWEEN = re.compile(r"[\s,;]+")
 
 
-def exercise(
+def look_at_exercise(
     bench: Mapping[str, str], chosen: Sequence[Mapping[str, Any]], *, progress: Progress
 ) -> dict[str, Any]:
     """Return a bench with each chosen effect as a form shows it, and what is wrong with them."""
     try:
-        plain = _bench(bench)
+        plain = _prepare(bench)
     except ConfigError as error:
         return {"wrong": str(error), "effects": [], "told": []}
-    effects = [_shown(plain, entry) for entry in chosen]
+    effects = [_describe_effect(plain, entry) for entry in chosen]
     try:
-        told, wrong = _bench(bench, [one["hide"] for one in effects]).told, ""
+        told, wrong = _prepare(bench, [one["hide"] for one in effects]).told, ""
     except ConfigError as error:
         told, wrong = (), str(error)
     return {"wrong": wrong, "effects": effects, "told": list(told)}
 
 
-def effect_svg(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
+def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
     """Return the picture of an effect on a bench: its fingerprint, a run with and without it."""
-    from pipeline.report.effects.page import effect_picture
+    from pipeline.report.effects.gallery import effect_picture
     from pipeline.report.figures.style import drawing
     from pipeline.report.figures.svg import plain_svg
+    from pipeline.report.render.builder import PageBuilder
 
-    hidden = _bench(bench, [hide])
+    hidden = _prepare(bench, [hide])
     with drawing():
-        picture = effect_picture(hidden.effects[-1], hidden.chain, bench=hidden.name, number=1)
+        picture = effect_picture(PageBuilder(), hidden.effects[-1], hidden.chain, bench=hidden.name)
     return plain_svg(picture.svg)
 
 
-def simulate(
+def make_exercises(
     bench: Mapping[str, str],
     hide: Sequence[str],
     out: str,
-    folders: int,
-    seed: int,
+    seeds: Sequence[int],
     reported: bool,
     *,
     progress: Progress,
 ) -> list[str]:
-    """Write an exercise, or one in each of so many folders, seeds counting up; return them."""
-    from pipeline.synthesis.hidden import write_bench
+    """Write an exercise, of several seeds one in each of as many folders; return them."""
+    from pipeline.simulated.submission import write_submission
 
-    hidden, root = _bench(bench, hide), new_folder(Path(out))
-    width = len(str(folders))
-    made = [root / f"{i + 1:0{width}d}" for i in range(folders)] if folders > 1 else [root]
-    for i, folder in enumerate(made):
-        progress(f"exercise {i + 1} of {folders}")
-        write_bench(folder, hidden, seed=seed + i, reported=reported)
+    hidden, root = _prepare(bench, hide), new_folder(Path(out))
+    count = len(seeds)
+    made = [root / f"{i + 1:0{len(str(count))}d}" for i in range(count)] if count > 1 else [root]
+    for i, (folder, seed) in enumerate(zip(made, seeds, strict=True)):
+        progress(f"exercise {i + 1} of {count}")
+        write_submission(folder, hidden, seed=seed, reported=reported)
     return [str(folder) for folder in made]
 
 
-def solution(folder: str, *, progress: Progress) -> None:
+def tell_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:
+    """Return what is hidden in a bench, a sentence each."""
+    return list(_prepare(bench, hide).told)
+
+
+def make_solution(folder: str, *, progress: Progress) -> None:
     """Write the reference of a submission into its own folder."""
-    from pipeline.report.solution.write import make_solution
+    from pipeline.report.solution.write import make_solution as write_solution
 
     submission = load_submission(Path(folder))
-    make_solution(submission, own_folder(submission.folder, "solution"), progress=progress)
+    write_solution(submission, own_folder(submission.folder, "solution"), progress=progress)
 
 
-def _bench(bench: Mapping[str, str], hide: Sequence[str] = ()) -> HiddenBench:
+def _prepare(bench: Mapping[str, str], hide: Sequence[str] = ()) -> SimulatedBench:
     if preset := bench.get("preset"):
         return prepare_bench(preset=preset, hide=hide)
-    chain = {name: _numbers(name, bench.get(name, "")) for name in ("m", "c", "k")}
+    chain = {name: _read_numbers(name, bench.get(name, "")) for name in ("m", "c", "k")}
     with TemporaryDirectory() as folder:
         path = Path(folder) / _OWN
         path.write_text(json.dumps({"chain": chain}), encoding="utf-8")
@@ -96,14 +100,14 @@ def _bench(bench: Mapping[str, str], hide: Sequence[str] = ()) -> HiddenBench:
             raise ConfigError(str(error).replace(f"--model {path}", _OWN)) from None
 
 
-def _numbers(name: str, typed: str) -> list[float]:
+def _read_numbers(name: str, typed: str) -> list[float]:
     try:
-        return [float(text) for text in _BETWEEN.split(typed.strip()) if text]
+        return [float(text) for text in re.split(r"[\s,;]+", typed.strip()) if text]
     except ValueError:
         raise ConfigError(f"{_OWN}: {name} needs numbers with blanks between them") from None
 
 
-def _shown(bench: HiddenBench, entry: Mapping[str, Any]) -> dict[str, Any]:
+def _describe_effect(bench: SimulatedBench, entry: Mapping[str, Any]) -> dict[str, Any]:
     """Return an effect with its sizes: those typed, else those at which it shows."""
     effect, chain = find_effect(entry["key"]), bench.chain
     places = {
@@ -115,7 +119,7 @@ def _shown(bench: HiddenBench, entry: Mapping[str, Any]) -> dict[str, Any]:
     place = next((at for at in places if str(at) == entry["place"]), usual)
     sizes = default_values(effect, chain, place=place, travel=bench.travel)
     parameters = [
-        _size(p, sizes[p.name], entry["sizes"].get(p.name, {}), bench)
+        _describe_parameter(p, sizes[p.name], entry["sizes"].get(p.name, {}), bench)
         for p in effect.parameters
         if p.reported
     ]
@@ -133,17 +137,17 @@ def _shown(bench: HiddenBench, entry: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _size(
-    parameter: Parameter, usual: float, typed: Mapping[str, str], bench: HiddenBench
+def _describe_parameter(
+    parameter: EffectParameter, usual: float, typed: Mapping[str, str], bench: SimulatedBench
 ) -> dict[str, Any]:
     """Return one parameter: a slider that was moved counts, else what was typed, else the usual."""
     none = parameter.neutral or 0.0
     value = typed.get("value", "") if typed.get("value") != typed.get("usual") else ""
     if typed.get("slide", "") != typed.get("was", ""):
-        slide = _number(typed.get("slide", "")) or 0.0
+        slide = _read_number(typed.get("slide", "")) or 0.0
         value = f"{none + (usual - none) * 10 ** max(-SLIDE, min(SLIDE, slide)):.3g}"
     value = value or f"{usual:.3g}"
-    times = ((_number(value) or none) - none) / (usual - none)
+    times = ((_read_number(value) or none) - none) / (usual - none)
     slide = max(-SLIDE, min(SLIDE, math.log10(times))) if times > 0 else 0.0
     return {
         "name": parameter.name,
@@ -155,7 +159,7 @@ def _size(
     }
 
 
-def _number(text: str) -> float | None:
+def _read_number(text: str) -> float | None:
     try:
         value = float(text)
     except ValueError:

@@ -1,32 +1,68 @@
-"""The first page: what is open, and what to open."""
+"""The first page: what one can do, what is open and how far it is; and the folders to choose."""
 
 from pathlib import Path
+from typing import Any
 
 from starlette.responses import RedirectResponse, Response
 
-from pipeline.desk.state import Ask, Found
-from pipeline.desk.typed import typed_path
-from pipeline.desk.users import User
-from pipeline.errors import ConfigError
+from pipeline.desk.ask import Ask
+from pipeline.desk.browse import MOST, list_folders
+from pipeline.desk.jobs import Job
+from pipeline.desk.last_report import find_state
+from pipeline.desk.rooms import list_feedback
+from pipeline.desk.typed import read_path
+from pipeline.desk.users import Place, User, name_place
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.experiments.plan_file import NAME as PLAN
 from pipeline.grading.gradebook.schema import FILE
+from pipeline.submission.load import outside
+
+_MADE = 3  # exercises that the first page lists
+# What a folder can be chosen for: the room that shows it then.
+_ROOMS = ("student", "bench", "solution")
 
 
 def show_home(ask: Ask) -> Response:
-    """Show the rooms that somebody may enter; who has one only is led there."""
-    places = [*ask.user.folders, *ask.user.gradebooks]
-    if len(places) == 1 and not ask.user.owns:
-        room = "student" if ask.user.folders else "grades"
-        return RedirectResponse(f"/{room}/0/", status_code=303)
-    return ask.page("home", title="cartlab", start=Path.cwd())
+    """Show what somebody may do here; who has one place only is led there."""
+    user = ask.user
+    places = {"student": user.folders, "grades": user.gradebooks, "feedback": user.grades}
+    rooms = [room for room, listed in places.items() for _ in listed]
+    if len(rooms) == 1 and not user.owns:
+        return RedirectResponse(f"/{rooms[0]}/0/", status_code=303)
+    return ask.page(
+        "home",
+        title="cartlab",
+        submissions=[_describe_submission(ask, n, p) for n, p in enumerate(user.folders)],
+        classes=[_describe_class(ask, n, place) for n, place in enumerate(user.gradebooks)],
+        made=_list_made(ask),
+        feedback=list_feedback(user),
+        start=ask.desk.root,
+        to="",
+    )
+
+
+def show_folders(ask: Ask) -> Response:
+    """Show the folders of one to choose from, for what one wants to do."""
+    to, folders = ask.text("to"), list_folders(ask.desk.root, ask.text("in"))
+    return ask.page(
+        "folders",
+        title="Choose a folder",
+        folders=folders,
+        start=folders.here.path,
+        most=MOST,
+        to=to if to in _ROOMS else "",
+    )
 
 
 def open_place(ask: Ask) -> Response:
-    """Open what somebody named: a folder of this computer, or a database."""
-    typed = ask.text("folder")
+    """Open what somebody chose or named: a folder of this computer, or a database."""
+    typed, to = ask.text("folder"), ask.text("to")
     if "://" in typed:
         ask.desk.books.book(typed)
-        return RedirectResponse(_entered(typed, ask.user.gradebooks, "grades"), status_code=303)
-    address = enter(ask.user, typed_path(typed, wanted="name a folder"))
+        return RedirectResponse(_add_place(typed, ask.user.gradebooks, "grades"), status_code=303)
+    address = enter(ask.user, read_path(typed, wanted="name a folder"))
+    if to in _ROOMS and address.startswith("/student/"):
+        address = address.replace("student", to, 1)
     return RedirectResponse(address, status_code=303)
 
 
@@ -43,17 +79,60 @@ def enter(user: User, folder: Path) -> str:
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder}: is a file; name the folder that it lies in")
     if (folder / FILE).is_file():
-        return _entered(folder, user.gradebooks, "grades")
+        return _add_place(folder, user.gradebooks, "grades")
     if not folder.parent.is_dir():
         raise ConfigError(f"{folder}: there is no folder {folder.parent} to make it in")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be made ({error.strerror})") from None
-    return _entered(folder, user.folders, "student")
+    return _add_place(folder, user.folders, "student")
 
 
-def _entered(place: Found, places: list[Found], room: str) -> str:
+def _add_place(place: Place, places: list[Any], room: str) -> str:
     if place not in places:
         places.append(place)
     return f"/{room}/{places.index(place)}/"
+
+
+def _list_made(ask: Ask) -> list[Job]:
+    """Return the last exercises that were made, or are, of those that are theirs to see."""
+    shop, jobs = ask.user.workshop, ask.desk.jobs.list_of("make_exercises")
+    seen = [job for job in jobs if ask.user.owns or (shop and job.place.is_relative_to(shop))]
+    return seen[:_MADE]
+
+
+def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
+    """Return how far a submission is: its files, report, recordings and solution."""
+    session, data = ask.desk.benches.of(folder), folder / "data"
+    try:
+        # A link may lead to a whole disk.
+        files = 0 if data.is_symlink() else sum(1 for path in data.rglob("*") if path.is_file())
+        report = find_state(folder)
+    except OSError:  # the desk may not look into it, or its disk is gone
+        files, report = 0, "unreadable"
+    return {
+        "n": n,
+        "name": name_place(folder),
+        "folder": folder,
+        "files": files,
+        "report": report,
+        "is_recording": session is not None and not session.ended.is_set(),
+        "has_plan": outside(folder, PLAN) is None,
+        "has_solution": outside(folder, "solution/solution.html") is None,
+    }
+
+
+def _describe_class(ask: Ask, n: int, place: Place) -> dict[str, Any]:
+    """Return how many of a class somebody has looked at; both are 0 if it cannot be read."""
+    try:
+        teams = ask.desk.books.of(place).now.listings
+    except (PipelineError, OSError):
+        teams = ()
+    return {
+        "n": n,
+        "name": name_place(place),
+        "place": place,
+        "teams": len(teams),
+        "seen": sum(1 for team in teams if team.seen),
+    }

@@ -1,32 +1,23 @@
 """Work in processes of its own: told by stages, to be stopped, still there after a reload."""
 
-import json
 import os
 import queue
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.errors import PipelineError
-from pipeline.processes import LineProcess
+from pipeline.processes import Failed, Supervisor
 
-MEMORY = 4_000_000_000  # bytes of a process
-_WORKER = "pipeline.desk.worker"
-_GLANCE = 0.1  # s between looks at the clock, the memory and who wants it stopped
-_LONGEST = 1800.0  # s of a job
-_SHORT = 180.0  # s of a short task, the start of its process on a busy machine included
+_GLANCE = 0.1  # s between looks whether its turn has come, or who wants it stopped
 _HANDS = 3  # processes for short tasks, of 150 MB each
 _WAITING = 8  # requests about one folder; each keeps one of the server's 40 threads
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
-
-
-class Failed(PipelineError):
-    """A task came to nothing; the text says why."""
 
 
 class Busy(PipelineError):
@@ -45,14 +36,12 @@ class Job:
     news : goes up whenever that changes.
     """
 
-    id: str
     title: str
     place: Path
     asked: tuple[str, dict[str, Any]]
     state: State = "waiting"
     said: str = "waiting for its turn"
     news: int = 0
-    began: float = field(default_factory=time.monotonic)
     stop: threading.Event = field(default_factory=threading.Event)
 
     @property
@@ -72,7 +61,6 @@ class Jobs:
         self._jobs: dict[Path, Job] = {}
         self._lock = threading.Lock()
         self._turns = threading.Semaphore(os.cpu_count() or 1)
-        self._number = 0
 
     def start(self, task: str, *, title: str, place: Path, **given: Any) -> Job:
         """Begin a task; one that is under way with the same is not begun again.
@@ -91,15 +79,17 @@ class Jobs:
                         "end or stop it first"
                     )
                 return before
-            self._number += 1
-            id_ = str(self._number)
-            job = self._jobs[place] = Job(id=id_, title=title, place=place, asked=asked)
+            job = self._jobs[place] = Job(title=title, place=place, asked=asked)
         threading.Thread(target=self._run, args=(job,), daemon=True).start()
         return job
 
     def of(self, place: Path) -> Job | None:
         """Return the last job in a folder."""
         return self._jobs.get(place)
+
+    def list_of(self, task: str) -> list[Job]:
+        """Return the jobs of one task, the newest first."""
+        return [job for job in reversed(self._jobs.values()) if job.asked[0] == task]
 
     def close(self) -> None:
         """Stop all, and wait until their processes have ended."""
@@ -113,13 +103,11 @@ class Jobs:
             if job.stop.is_set():
                 return job.tell("stopped", "stopped before it began")
         job.tell("running", "starting")
-        process = None
+        process = _worker()
         try:
-            process = LineProcess(_WORKER)
-            answer = _work(
-                process,
-                *job.asked,
-                limit=_LONGEST,
+            answer = process.do(
+                job.asked,
+                limit=1800.0,
                 stop=job.stop,
                 tell=lambda stage: job.tell("running", stage),
             )
@@ -132,12 +120,11 @@ class Jobs:
             job.tell("failed", f"the desk itself failed ({type(error).__name__}: {error})")
             raise
         finally:
-            if process is not None:
-                process.close()
+            process.close()
             self._turns.release()
 
 
-class Hand:
+class WorkerPool:
     """Processes for short tasks, which look at files and fill in tables.
 
     The tasks of a folder are done one after the other: who has a slow file waits for it, and with
@@ -145,9 +132,9 @@ class Hand:
     """
 
     def __init__(self) -> None:
-        self._free: queue.LifoQueue[LineProcess | None] = queue.LifoQueue()
+        self._free: queue.LifoQueue[Supervisor] = queue.LifoQueue()
         for _ in range(_HANDS):
-            self._free.put(None)
+            self._free.put(_worker())
         self._closed = threading.Event()
         self._lock = threading.Lock()
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
@@ -165,9 +152,7 @@ class Hand:
             try:
                 if self._closed.is_set():
                     raise Failed("the desk is ending")
-                if process is None or not process.runs:
-                    process = LineProcess(_WORKER)
-                return _work(process, task, given, limit=_SHORT, stop=self._closed, tell=str)
+                return process.do((task, given), limit=180.0, stop=self._closed)
             finally:
                 self._free.put(process)
 
@@ -192,48 +177,9 @@ class Hand:
         self._closed.set()
         processes = [self._free.get() for _ in range(_HANDS)]
         for process in processes:
-            if process is not None:
-                process.close()
-            self._free.put(None)
+            process.close()
+            self._free.put(process)
 
 
-def _work(
-    process: LineProcess,
-    task: str,
-    given: dict[str, Any],
-    *,
-    limit: float,
-    stop: threading.Event,
-    tell: Callable[[str], object],
-) -> Any:
-    """Have a process do a task; one that passes a limit, or is to stop, is ended."""
-    end = time.monotonic() + limit
-    try:
-        process.send(json.dumps([task, given]).encode() + b"\n")
-        while True:
-            try:
-                line = process.line(timeout=_GLANCE)
-            except queue.Empty:
-                if stop.is_set():
-                    raise _ended(process, "stopped") from None
-                if time.monotonic() > end:
-                    raise _ended(process, f"stopped after {limit:g} s") from None
-                if process.memory > MEMORY:
-                    raise _ended(process, "needed more memory than allowed") from None
-                continue
-            if not line:
-                raise _ended(process, process.last_words())
-            answer = json.loads(line)
-            if "stage" in answer:
-                tell(answer["stage"])
-            elif "failed" in answer:
-                raise Failed(answer["failed"])
-            else:
-                return answer["done"]
-    except OSError as error:
-        raise _ended(process, f"the process ended ({error.strerror})") from None
-
-
-def _ended(process: LineProcess, why: str) -> Failed:
-    process.close()
-    return Failed(why)
+def _worker() -> Supervisor:
+    return Supervisor("pipeline.desk.tasks", memory=4_000_000_000)

@@ -9,64 +9,84 @@ from typing import Any
 
 from pipeline.errors import SubmissionError
 from pipeline.report.sections.answers import written_answer
-from pipeline.submission.load import MAX_NOTES_BYTES, NAME, outside
+from pipeline.submission.load import MAX_NOTES_BYTES, NAME, list_experiments, outside
 from pipeline.submission.toml_file import read_text
 
 ASKED = "questions.json"  # beside the report: what it asks, assumed, found, and is made of
 NOTES = "notes.md"
-_MOST_ASKED = 1_000_000  # bytes
+NOTHING_TOLD: Mapping[str, Any] = {
+    "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "",
+}  # fmt: skip
+PLOTS = "report/compare.html"
+PLOTS_OF = "report/plots.json"  # what the plots are made of
 
 
-def sources(folder: Path) -> dict[str, list[int]]:
+def stat_sources(folder: Path) -> dict[str, list[int]]:
     """Return the time and the size of every file that a report is made of.
 
     With all of them kept, a file that is gone, or was replaced by an older one, shows too.
     """
     data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
-    named = (str(table.get("file", "")) for table in _experiments(_document(folder)))
+    named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
     names = sorted({NAME, NOTES, "gap/gap.json", *data, *named})
     there = [name for name in names if outside(folder, name) is None]
     infos = {name: (folder / name).stat() for name in there}
     return {name: [info.st_mtime_ns, info.st_size] for name, info in infos.items()}
 
 
-def state(folder: Path) -> str:
+def find_state(folder: Path) -> str:
     """Return "none", "current", or "older" than what it is made of."""
     if outside(folder, "report/report.html") is not None:
         return "none"
-    return "current" if _read_asked(folder).get("made_of") == sources(folder) else "older"
+    return "current" if _read_asked(folder).get("made_of") == stat_sources(folder) else "older"
 
 
-def told(folder: Path) -> dict[str, Any]:
+def plots_are_current(folder: Path) -> bool:
+    """Tell whether there are plots, made of the files as they are now."""
+    if outside(folder, PLOTS) is not None:
+        return False
+    return _read_small(folder, PLOTS_OF).get("made_of") == stat_sources(folder)
+
+
+def read_told(folder: Path) -> dict[str, Any]:
     """Return what the last report said, asked and assumed, as far as its file can be read."""
     read = _read_asked(folder)
     try:
         return {
-            "questions": _texts(read["questions"], ("id", "text")),
-            "assumed": _texts(read.get("assumed", []), ("key", "about", "taken", "why")),
+            "questions": _pick_texts(read["questions"], ("id", "section", "text")),
+            "assumed": _pick_assumptions(read.get("assumed", [])),
+            "contradicted": _pick_assumptions(read.get("contradicted", [])),
             "failed": [str(one) for one in read["failed"]],
             "changes": str(read["changes"]),
         }
-    except (KeyError, TypeError):
-        return {"questions": [], "assumed": [], "failed": [], "changes": ""}
+    except (KeyError, TypeError, AttributeError):
+        return dict(NOTHING_TOLD)
 
 
-def _texts(found: Iterable[Mapping[str, Any]], keys: Sequence[str]) -> list[dict[str, str]]:
-    return [{key: str(one[key]) for key in keys} for one in found]
+def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return what was taken of the bench: as texts, and its `value` as it is."""
+    texts = _pick_texts(found, ("key", "about", "support", "taken", "why"))
+    return [{**one, "value": raw.get("value")} for one, raw in zip(texts, found, strict=True)]
 
 
-def unanswered(folder: Path) -> list[dict[str, str]]:
+def _pick_texts(found: Iterable[Mapping[str, Any]], keys: Sequence[str]) -> list[dict[str, str]]:
+    return [{key: str(one.get(key, "")) for key in keys} for one in found]
+
+
+def list_unanswered(folder: Path) -> list[dict[str, str]]:
     """Return the questions of the last report that have no answer yet."""
     try:
-        notes = written_notes(folder)
+        notes = read_notes(folder)
     except SubmissionError:  # the report's page says what is wrong with them
         notes = ""
     return [
-        one for one in told(folder)["questions"] if not written_answer(notes, one["id"]).strip()
+        one
+        for one in read_told(folder)["questions"]
+        if not written_answer(notes, one["id"]).strip()
     ]
 
 
-def written_notes(folder: Path) -> str:
+def read_notes(folder: Path) -> str:
     """Return the text of `notes.md`, "" if the file is missing.
 
     Raises
@@ -82,21 +102,20 @@ def written_notes(folder: Path) -> str:
 
 
 def _read_asked(folder: Path) -> dict[str, Any]:
-    name = f"report/{ASKED}"
-    if outside(folder, name) is None and (folder / name).stat().st_size <= _MOST_ASKED:
+    return _read_small(folder, f"report/{ASKED}")
+
+
+def _read_small(folder: Path, name: str) -> dict[str, Any]:
+    """Return what a JSON file of ours holds, {} where it cannot be read."""
+    if outside(folder, name) is None and (folder / name).stat().st_size <= 1_000_000:
         with suppress(ValueError, RecursionError):
             read = json.loads((folder / name).read_bytes())
             return read if isinstance(read, dict) else {}
     return {}
 
 
-def _document(folder: Path) -> dict[str, Any]:
+def _read_document(folder: Path) -> dict[str, Any]:
     if outside(folder, NAME) is None:
         with suppress(ValueError, RecursionError):  # the page says what is wrong with it
             return tomllib.loads((folder / NAME).read_bytes().decode())
     return {}
-
-
-def _experiments(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    tables = document.get("experiments")
-    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []

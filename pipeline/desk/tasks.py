@@ -1,8 +1,9 @@
-"""What the desk's worker does, by name: JSON in, JSON out."""
+"""What the desk has another process do, by name: files of strangers are read nowhere else."""
 
 import json
+import os
 import shutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -10,59 +11,104 @@ from typing import Any
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.desk.class_tasks import publish, regrade
-from pipeline.desk.exercises import effect_svg, exercise, simulate, solution
-from pipeline.desk.last_report import ASKED, sources
+from pipeline.desk.exercises import (
+    draw_effect,
+    look_at_exercise,
+    make_exercises,
+    make_solution,
+    tell_hidden,
+)
+from pipeline.desk.last_report import ASKED, PLOTS_OF, stat_sources
+from pipeline.desk.typed import read_path
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.identify.springs import fill as fill_folder
+from pipeline.identify.springs import find_springs
+from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import assign_columns
-from pipeline.ingest.fill import Found, data_files, has_fractions, look_at, passed_over
+from pipeline.ingest.fill import (
+    UNSURE,
+    Found,
+    data_files,
+    experiment_doubts,
+    hardly_moving,
+    has_fractions,
+    look_at,
+    passed_over,
+    system_doubts,
+)
 from pipeline.ingest.formats.recognise import read_table
+from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
 from pipeline.output import own_folder, write_file
-from pipeline.results import Analysis
+from pipeline.processes import serve
+from pipeline.results import Analysis, Assumption
 from pipeline.submission import load_submission
 from pipeline.submission.load import leaves
+from pipeline.words.progress import Progress
 
-Progress = Callable[[str], None]
 _ACROSS, _HIGH = 120, 32  # of a thumbnail
 
 
-def look(
+def look_at_file(
     folder: str, file: str, columns: dict[str, str | int], *, progress: Progress
 ) -> dict[str, Any]:
     """Return what a data file is, with a thumbnail; `columns` as `submission.toml` states them."""
     if leaves(Path(folder), file):
         raise SubmissionError(f"{file}: leaves the folder")
     found = look_at(Path(folder), file, columns=columns)
-    return {**_plain(found), "lines": thumbnail(Path(folder), found, columns=columns)}
+    return {**_describe(found), "lines": draw_thumbnail(Path(folder), found, columns=columns)}
 
 
-def files(folder: str, *, progress: Progress) -> list[str]:
+def list_files(folder: str, *, progress: Progress) -> list[str]:
     """Return the data files that there are."""
     return data_files(Path(folder))
 
 
-def not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
+def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
     """Return the files that are not looked into, with what to do; those `named` have a table."""
     found = passed_over(Path(folder), named=named)
     return [{"file": one.file, "reason": one.remarks[0], "advice": one.advice} for one in found]
 
 
-def fill(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
+def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
+    """Return what stands marked as unsure in `submission.toml`, and the springs that nothing tells.
+
+    `system` : the doubt by key of `[system]`; `springs` : their numbers, from 1; `experiments` :
+    the doubts of each table.
+    """
+    system = system_doubts(Path(folder))
+    asked = "springs" in system
+    return {
+        "system": {key: said.removeprefix(UNSURE) for key, said in system.items()},
+        "springs": find_springs(load_submission(Path(folder))).open if asked else (),
+        "experiments": experiment_doubts(Path(folder)),
+    }
+
+
+def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
     """Write the tables of the files in `data/`."""
-    return [_plain(found) for found in fill_folder(Path(folder)).files]
+    return [_describe(found) for found in fill_folder(Path(folder)).files]
 
 
-def report(folder: str, *, progress: Progress) -> dict[str, Any]:
+def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
     """Write the report into the submission's own folder, compared with the one that was there."""
     from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
-    from pipeline.report.draft.write import make_report
+    from pipeline.report.draft.write import make_report as write_report
     from pipeline.report.sections.housekeeping import taken_text
     from pipeline.report.sections.questions import ask
-    from pipeline.report.words import with_symbols
+    from pipeline.words.text import with_symbols
 
-    made_of = sources(Path(folder))  # before it is read: what changes meanwhile is not in it
+    def tell(one: Assumption) -> dict[str, Any]:
+        return {
+            "key": one.key,
+            "about": one.about,
+            "value": one.value,
+            "support": one.support,
+            "taken": taken_text(one),
+            "why": with_symbols(one.reason),
+        }
+
+    made_of = stat_sources(Path(folder))  # before it is read: what changes meanwhile is not in it
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
 
@@ -73,21 +119,16 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
             return None
 
     with alone_in(out):
-        analysis, changes = make_report(submission, out, compared=compared, progress=progress)
+        analysis, changes = write_report(submission, out, compared=compared, progress=progress)
         asked = [
-            {"id": question.id, "text": with_symbols(question.text)} for question in ask(analysis)
+            {"id": one.id, "section": one.section, "text": with_symbols(one.text)}
+            for one in ask(analysis)
         ]
         told = {
             "questions": asked,
-            "assumed": [
-                {
-                    "key": one.key,
-                    "about": one.about,
-                    "taken": taken_text(one),
-                    "why": with_symbols(one.reason),
-                }
-                for one in analysis.assumptions
-                if one.origin != "stated"
+            "assumed": [tell(one) for one in analysis.assumptions if one.origin != "stated"],
+            "contradicted": [
+                tell(one) for one in analysis.assumptions if one.support == "contradicted"
             ],
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
@@ -98,12 +139,12 @@ def report(folder: str, *, progress: Progress) -> dict[str, Any]:
     return told
 
 
-def gap(folder: str, *, progress: Progress) -> None:
+def make_gap(folder: str, *, progress: Progress) -> None:
     """Write what the linear model leaves out into the submission's own folder."""
-    from pipeline.bench.design.discriminate import propose_for
-    from pipeline.gap.investigate import investigate
-    from pipeline.gap.stored import gap_text
-    from pipeline.report.gap.page import render_gap
+    from pipeline.experiments.discriminate import propose_for
+    from pipeline.gap.explain import investigate
+    from pipeline.json_files import json_text
+    from pipeline.report.gap.story import render_gap
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
@@ -112,11 +153,37 @@ def gap(folder: str, *, progress: Progress) -> None:
         analysis = analyse(submission, design=False, progress=progress)
         found = investigate(analysis, progress=progress)
         found = propose_for(found, submission)
-        write_file(out / "gap.json", gap_text(found, analysis))
+        write_file(out / "gap.json", json_text(found))
         render_gap(found, analysis, out, progress=progress)
 
 
-def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
+def make_plots(folder: str, *, progress: Progress) -> None:
+    """Write the page of plots into the submission's own folder, beside its report."""
+    from pipeline.report.gap.section import with_gap
+    from pipeline.report.plots.page import write_plots
+    from pipeline.workflow import analyse
+
+    made_of = stat_sources(Path(folder))  # before it is read, as for a report
+    submission = load_submission(Path(folder))
+    out = own_folder(submission.folder, "report")
+    with alone_in(out):
+        analysis, gap = with_gap(
+            analyse(submission, design=False, progress=progress), submission.folder
+        )
+        write_plots(analysis, out, gap=gap, progress=progress)
+        write_file(submission.folder / PLOTS_OF, json.dumps({"made_of": made_of}))
+
+
+def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progress) -> None:
+    """Ask which numbers disagree, or where to look for some; the answer is in checks.jsonl."""
+    from pipeline.grading.rubric_file import load_rubric
+    from pipeline.grading.self_check.check import check_numbers as check
+
+    asked = load_rubric(Path(rubric)) if rubric else None
+    check(load_submission(Path(folder)), rubric=asked, where=where, progress=progress)
+
+
+def unpack_upload(archive: str, into: str, *, progress: Progress) -> list[str]:
     """Unpack what was uploaded, by the limits of a hand-in; return the files."""
     from pipeline.grading.intake.unpack import HAND_IN, unpack
 
@@ -127,23 +194,23 @@ def unpack(archive: str, into: str, *, progress: Progress) -> list[str]:
     return sorted(p.relative_to(target).as_posix() for p in target.rglob("*") if p.is_file())
 
 
-def plan(folder: str, stock: bool, *, progress: Progress) -> str:
+def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
     """Write plan.toml, or add to it what the data allow; return why they allow nothing."""
-    from pipeline.bench.planning.propose import make_plan
+    from pipeline.experiments.propose import make_plan
 
     made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
     return made.trouble or "done"
 
 
-def weigh(
+def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
     """Return what a recording would bring, beside the one that would be chosen."""
-    from pipeline.bench.design.next_plan import known_commands
-    from pipeline.bench.design.weigh import weigh as weighed
-    from pipeline.bench.planning.plan import Recording
-    from pipeline.bench.planning.plan_words import what_words
-    from pipeline.bench.planning.propose import current_plan
+    from pipeline.bench.host.raw import known_commands
+    from pipeline.experiments.plan import Recording
+    from pipeline.experiments.plan_words import what_words
+    from pipeline.experiments.propose import current_plan
+    from pipeline.experiments.weigh import weigh as weighed
     from pipeline.workflow import analyse
 
     submission = load_submission(Path(folder))
@@ -158,26 +225,94 @@ def weigh(
     return {**asdict(found), "chosen": chosen}
 
 
+def describe_exercise(
+    bench: dict[str, str], hide: list[str], folder: str, *, progress: Progress
+) -> dict[str, Any]:
+    """Return what an exercise is: what is hidden, its files, and the first record of each kind."""
+    submission = load_submission(Path(folder))
+    first = {record.kind: record for record in reversed(read_data(submission).records)}
+    return {
+        "told": tell_hidden(bench, hide),
+        "files": data_files(Path(folder)),
+        "records": [
+            {"id": record.id, "kind": record.kind, "lines": _draw_lines(list(record.y))}
+            for record in reversed(first.values())
+        ],
+    }
+
+
+def publish_grades(folder: str, *, progress: Progress) -> None:
+    """Write the class list of the gradebook in a folder."""
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.publish.outputs import write_outputs
+    from pipeline.lock import alone_in
+
+    out = Path(folder)
+    progress("pages and feedback")
+    with Gradebook(out) as book, alone_in(out):
+        write_outputs(book, out)
+
+
+def regrade_class(
+    folder: str,
+    paths: Sequence[str],
+    rubric: str,
+    lateness: str,
+    anonymous: bool,
+    *,
+    progress: Progress,
+) -> str:
+    """Grade a class into a folder; an anonymous one says nothing that could name a team."""
+    from pipeline.grading.batch.grade_class import Options, grade_class
+
+    try:
+        done = grade_class(
+            [read_path(path, wanted="name the submissions") for path in paths],
+            rubric_file=Path(rubric),
+            out=Path(folder),
+            options=Options(
+                jobs=os.cpu_count() or 1,
+                anonymous=anonymous,
+                lateness=Path(lateness) if lateness else None,
+            ),
+            progress=lambda done, total, last: progress(f"{done} of {total}"),
+        )
+    except ConfigError:
+        if anonymous:
+            raise ConfigError("it could not begin; cartlab grade in a terminal says why") from None
+        raise
+    return "; ".join([done.counted, *(() if anonymous else done.remarks)])
+
+
+def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
+    """Return what the text of a rubric would make of a graded class, see `RubricPreview`."""
+    from pipeline.grading.gradebook.book import Gradebook
+    from pipeline.grading.publish.rubric_preview import preview_rubric as preview
+    from pipeline.grading.rubric_file import parse_rubric
+
+    rubric = parse_rubric(text, where="the rubric")
+    with Gradebook(folder) as book:
+        return asdict(preview(book, rubric, progress=progress))
+
+
 TASKS: Mapping[str, Callable[..., Any]] = {
-    "look": look,
-    "files": files,
-    "not_read": not_read,
-    "fill": fill,
-    "report": report,
-    "gap": gap,
-    "unpack": unpack,
-    "plan": plan,
-    "weigh": weigh,
-    "exercise": exercise,
-    "effect_svg": effect_svg,
-    "simulate": simulate,
-    "solution": solution,
-    "publish": publish,
-    "regrade": regrade,
-}
+    task.__name__: task
+    for task in (
+        look_at_file, list_files, list_not_read, list_doubts, fill_tables, make_report, make_gap,
+        check_numbers, unpack_upload, propose_recordings, weigh_recording, publish_grades,
+        regrade_class, preview_rubric, look_at_exercise, draw_effect, make_exercises,
+        make_solution, describe_exercise, make_plots,
+    )
+}  # fmt: skip
 
 
-def _plain(found: Found) -> dict[str, Any]:
+def do(asked: tuple[str, Mapping[str, Any]], tell: Progress) -> Any:
+    """Return the answer to a task, given by its name with what it is about."""
+    name, given = asked
+    return TASKS[name](**given, progress=tell)
+
+
+def _describe(found: Found) -> dict[str, Any]:
     inspection = found.inspection
     return {
         "file": found.file,
@@ -185,13 +320,21 @@ def _plain(found: Found) -> dict[str, Any]:
         "kind": found.kind,
         "remarks": list(found.remarks),
         "unsure": list(found.unsure),
+        "hardly": hardly_moving(inspection) if inspection else (),
+        "still": {
+            cart: never_changes(column.name)
+            for cart, column in (inspection.positions if inspection else {}).items()
+            if column.low == column.high
+        },
+        "needs": inspection.needs if inspection else (),
+        "frequency": inspection.frequency if inspection else None,
         "fractions": has_fractions(found),
         "format": inspection.format if inspection else "",
         "duration": inspection.duration if inspection else None,
     }
 
 
-def thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | int]) -> list[str]:
+def draw_thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | int]) -> list[str]:
     """Return the positions of a record as the points of SVG lines, one a cart."""
     if found.inspection is None or found.kind == "bode":
         return []
@@ -200,17 +343,25 @@ def thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | int]) -
     explicit = stated or found.inspection.guessed
     assigned, _ = assign_columns(table, explicit=explicit, free=(1,))
     roles = sorted(role for role in assigned if role[0] == "x")
-    rows = [table.values[assigned[role].index] for role in roles]
+    return _draw_lines([table.values[assigned[role].index] for role in roles])
+
+
+def _draw_lines(rows: Sequence[Array]) -> list[str]:
+    """Return rows on one scale as the points of SVG lines."""
     low = min((float(row.min()) for row in rows), default=0.0)
     high = max((float(row.max()) for row in rows), default=0.0)
     if not np.isfinite(high - low) or high == low:
         return []
-    return [_points((row - low) / (high - low)) for row in rows]
+    return [_write_points((row - low) / (high - low)) for row in rows]
 
 
-def _points(row: Array) -> str:
+def _write_points(row: Array) -> str:
     """Return a row between 0 and 1 as points: least and most of every stretch, in turn."""
     stretches = np.array_split(row, min(row.size, _ACROSS))
     heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
     step = _ACROSS / max(len(heights) - 1, 1)
     return " ".join(f"{i * step:.1f},{_HIGH * (1 - h):.1f}" for i, h in enumerate(heights))
+
+
+if __name__ == "__main__":
+    serve(lambda: do)

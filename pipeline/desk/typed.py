@@ -6,7 +6,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 
 
-def typed_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
+def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
     """Return a path that was typed, from the root.
 
     Parameters
@@ -27,13 +27,13 @@ def typed_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
     except RuntimeError:
         raise ConfigError(f"{typed}: this computer knows nobody of that name") from None
     except OSError as error:  # a name too long, a folder that is closed to whoever runs the desk
-        raise ConfigError(f"{_clipped(typed, most=60)}: {error.strerror}; {wanted}") from None
+        raise ConfigError(f"{_clip(typed, most=60)}: {error.strerror}; {wanted}") from None
     if inside and not path.is_relative_to(inside):
         raise ConfigError(f"{typed}: leads out of {inside.name}, where yours is made")
     return path
 
 
-def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
+def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
     """Return a whole number that was typed.
 
     Raises
@@ -44,11 +44,13 @@ def whole_number(typed: str, *, name: str, least: int, most: int) -> int:
     # However many digits it has, no more are read than the largest has.
     if number and len(number) <= len(str(most)) and least <= int(number) <= most:
         return int(number)
-    found = _clipped(typed, most=20)
+    found = _clip(typed, most=20)
     raise ConfigError(f"{name}: expected a whole number from {least} to {most}, found {found!r}")
 
 
-def number(typed: str, *, name: str, above: float = -math.inf, below: float = math.inf) -> float:
+def read_number(
+    typed: str, *, name: str, above: float = -math.inf, below: float = math.inf
+) -> float:
     """Return a number that was typed, with a point or a comma; 0 where nothing was.
 
     Raises
@@ -63,8 +65,8 @@ def number(typed: str, *, name: str, above: float = -math.inf, below: float = ma
         return value
     bounds = f" above {above:g}" if above > -math.inf else ""
     bounds += f" and below {below:g}" if below < math.inf else ""
-    raise ConfigError(f"{name}: expected a number{bounds}, found {_clipped(typed, most=20)!r}")
+    raise ConfigError(f"{name}: expected a number{bounds}, found {_clip(typed, most=20)!r}")
 
 
-def _clipped(typed: str, *, most: int) -> str:
+def _clip(typed: str, *, most: int) -> str:
     return f"{typed[:most]}…" if len(typed) > most else typed

@@ -10,28 +10,47 @@ from typing import Annotated, Literal
 from urllib.parse import urlsplit
 
 from markupsafe import escape
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints, ValidationError
 
 from pipeline.errors import ConfigError
+from pipeline.grading.rubric_file import load_rubric
 from pipeline.submission.complaints import explain
+from pipeline.submission.models import TomlTable
 from pipeline.submission.toml_file import parse_toml, read_text
 
 Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]
-_MOST_BYTES = 1_000_000
+See = Literal["report", "check"]
 
 # The rooms that a role may enter, by the first part of their address. For who started the desk they
 # are about all of this computer, for others about what the key of the file lists, if anything.
 _ALL = frozenset({"", "static"})
 _ROOMS: dict[Role, frozenset[str]] = {
-    "student": _ALL | {"student"},
+    "student": _ALL | {"student", "feedback"},
     "ta": _ALL | {"grades"},
     "instructor": _ALL
     | {"student", "grades", "solution", "effects", "exercises", "rubric", "bench"},
 }
 _ROOMS["owner"] = _ROOMS["instructor"] | {"open"}
-_ROOM_OF = {"folders": "student", "gradebooks": "grades", "workshop": "exercises", "ports": "bench"}
+_ROOM_OF = {"folders": "student", "gradebooks": "grades", "workshop": "exercises", "ports": "bench",
+            "grades": "feedback"}  # fmt: skip
 _NEEDS = {"exercises": "workshop", "rubric": "workshop", "bench": "ports"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnGrade:
+    """Which grade is a student's.
+
+    Attributes
+    ----------
+    gradebook : the output of a grading, or the address of a database.
+    submission : its very name there.
+    assignment : whose class list it must be: a database may hold several; "": a folder's only one.
+    """
+
+    gradebook: Place
+    submission: str
+    assignment: str = ""
 
 
 @dataclass(kw_only=True)
@@ -43,16 +62,22 @@ class User:
     folders : the submissions that they see, addressed by their place in this list: of another's
         there is no address. An owner's list grows as they open folders.
     gradebooks : likewise, the outputs of gradings, or addresses of databases.
+    grades : likewise, the grades that are a student's own.
     workshop : the folder in which they make exercises and rubrics; an owner makes them anywhere.
     ports : the benches at which they acquire; an owner may name any.
+    rubric : of a student's lab, by whose tolerances the check judges.
+    see : what that rubric lets them see; None: what their submission says.
     """
 
     name: str
     role: Role
     folders: list[Path] = field(default_factory=list)
     gradebooks: list[Place] = field(default_factory=list)
+    grades: tuple[OwnGrade, ...] = ()
     workshop: Path | None = None
     ports: tuple[str, ...] = ()
+    rubric: Path | None = None
+    see: See | None = None
 
     def may(self, room: str) -> bool:
         """Whether they may enter a room; which of its places, their lists say."""
@@ -69,7 +94,8 @@ class User:
         """Return a text as they may read it: students and TAs learn no folder of the server."""
         if self.sees_places:
             return text
-        places = [place for place in (*self.folders, *self.gradebooks) if isinstance(place, Path)]
+        listed = (*self.folders, *self.gradebooks, *(own.gradebook for own in self.grades))
+        places = [place for place in listed if isinstance(place, Path)]
         above = {str(root) for place in places for root in (place.parent, place.resolve().parent)}
         for root in sorted(above, key=len, reverse=True):
             for written in (root, str(escape(root))):
@@ -82,14 +108,10 @@ class User:
         return self.role == "owner"
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
 _HEADER = r"^[A-Za-z0-9-]+$"
 
 
-class Proxy(_Model):
+class Proxy(TomlTable):
     """The reverse proxy in front, which knows who somebody is."""
 
     address: Annotated[str, Field(min_length=1)]  # of the proxy: nobody else may connect
@@ -102,18 +124,28 @@ class Proxy(_Model):
     ]
 
 
-class Listed(_Model):
+class ListedGrade(TomlTable):
+    """One grade of a student."""
+
+    gradebook: Annotated[str, Field(min_length=1)]
+    submission: Annotated[str, Field(min_length=1)]
+    assignment: str = ""
+
+
+class Listed(TomlTable):
     """One user of the file."""
 
     name: Annotated[str, Field(min_length=1)]
     role: Literal["student", "ta", "instructor"]
     folders: tuple[str, ...] = ()
     gradebooks: tuple[str, ...] = ()
+    grades: tuple[ListedGrade, ...] = ()
     workshop: str = ""
     ports: tuple[str, ...] = ()
+    rubric: str = ""  # of a student's lab; its [students] decides what they see
 
 
-class Users(_Model):
+class Users(TomlTable):
     """The file that `--users` names."""
 
     proxy: Proxy
@@ -127,18 +159,15 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
     ------
     ConfigError : one line with the file, the key, what was expected, what was found.
     """
-    text = read_text(path, where=str(path), limit=_MOST_BYTES, error=ConfigError)
+    text = read_text(path, where=str(path), limit=1_000_000, error=ConfigError)
     document = parse_toml(text, where=str(path), error=ConfigError)
     try:
         found = Users.model_validate(document)
     except ValidationError as error:
-        tables = {"proxy": Proxy, "users": Listed}
-        first = explain(
-            error.errors()[0], document, tables=tables, top_level=tuple(Users.model_fields)
-        )
+        first = explain(error.errors()[0], document, root=Users)
         raise ConfigError(f"{path}: {first}") from None
     root = path.resolve().parent
-    if wrong := next(_wrong(found, root), None):
+    if wrong := next(_find_wrong(found, root), None):
         raise ConfigError(f"{path}: {wrong}")
     if os.name == "posix":
         _refuse_open_to_all(path)
@@ -147,35 +176,42 @@ def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
             name=user.name,
             role=user.role,
             folders=[root / folder for folder in user.folders],
-            gradebooks=[one if "://" in one else root / one for one in user.gradebooks],
+            gradebooks=[_read_place(one, root) for one in user.gradebooks],
+            grades=tuple(
+                OwnGrade(
+                    gradebook=_read_place(own.gradebook, root),
+                    submission=own.submission,
+                    assignment=own.assignment,
+                )
+                for own in user.grades
+            ),
             workshop=(root / user.workshop).resolve() if user.workshop else None,
             ports=user.ports,
+            rubric=root / user.rubric if user.rubric else None,
+            see=load_rubric(root / user.rubric).students.see if user.rubric else None,
         )
         for user in found.users
     }
 
 
+def _read_place(typed: str, root: Path) -> Place:
+    return typed if "://" in typed else root / typed
+
+
 def _refuse_open_to_all(path: Path) -> None:
     """Refuse a file that everybody may read, or change, or put another in the place of."""
-    if path.stat().st_mode & stat.S_IROTH:
-        raise ConfigError(
-            f"{path}: everybody on this computer may read it, and the proxy's secret with it: "
-            "chmod o-r"
-        )
-    if path.stat().st_mode & stat.S_IWOTH:
-        raise ConfigError(
-            f"{path}: everybody on this computer may write it, and give themselves any role: "
-            "chmod o-w"
-        )
     folder = path.resolve().parent
-    mode = folder.stat().st_mode
-    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:  # in /tmp only the owner may
-        raise ConfigError(
-            f"{folder}: everybody on this computer may put another {path.name} there: chmod o-w"
-        )
+    mode, above = path.stat().st_mode, folder.stat().st_mode
+    everybody = "everybody on this computer may"
+    if mode & stat.S_IROTH:
+        raise ConfigError(f"{path}: {everybody} read it, and the proxy's secret with it: chmod o-r")
+    if mode & stat.S_IWOTH:
+        raise ConfigError(f"{path}: {everybody} write it, and give themselves any role: chmod o-w")
+    if above & stat.S_IWOTH and not above & stat.S_ISVTX:  # in /tmp only the owner may
+        raise ConfigError(f"{folder}: {everybody} put another {path.name} there: chmod o-w")
 
 
-def _wrong(found: Users, root: Path) -> Iterator[str]:
+def _find_wrong(found: Users, root: Path) -> Iterator[str]:
     """Yield what cannot be meant."""
     proxy, names = found.proxy, [user.name for user in found.users]
     try:
@@ -194,12 +230,21 @@ def _wrong(found: Users, root: Path) -> Iterator[str]:
         for key, room in _ROOM_OF.items():
             if getattr(user, key) and room not in _ROOMS[user.role]:
                 yield f"{where}: a {user.role} has no {key}; take it away, or give another role"
-        for place in (*user.folders, *user.gradebooks, user.workshop):
+        if user.rubric and user.role != "student":
+            yield f"{where}: a {user.role} has no rubric; take it away, or give another role"
+        books = [own.gradebook for own in user.grades]
+        for place in (*user.folders, *user.gradebooks, *books, user.workshop):
             if "://" not in place and not (root / place).is_dir():
                 yield f"{where}: there is no folder {root / place}"
+        for own in user.grades:
+            if "://" in own.gradebook and not own.assignment:
+                yield (
+                    f"{where}: a database may hold several classes; add assignment = the name of "
+                    "the rubric's file, without .toml"
+                )
 
 
-def place_name(place: Place) -> str:
+def name_place(place: Place) -> str:
     """Return what to call a place: of a database its name, never who opens it with which word."""
     if isinstance(place, str):
         try:

@@ -11,8 +11,6 @@ import sys
 from datetime import UTC, datetime
 
 SAID = "ends: "  # begins the line of the desk's own about its end
-_KILLED = "was killed: by kill -9, by a system short of memory, or by a library that ended it"
-_CRASHED = "crashed: the lines above say where"
 
 
 def main() -> None:
@@ -31,7 +29,9 @@ def main() -> None:
             _say(line)
             crashed = True
     if not said:
-        why = _CRASHED if crashed else _KILLED
+        why = "was killed: by kill -9, by a system short of memory, or by a library that ended it"
+        if crashed:
+            why = "crashed: the lines above say where"
         _log(path, process, why)
         _say(f"cartlab: the desk {why}. Files are whole: start it again. The log: {path}")
 

@@ -13,7 +13,6 @@ import numpy as np
 
 from pipeline.arrays import Array
 
-_MIN_LAGS = 8  # lags of the residual's correlation that are always looked at
 _LAGS_SHARE = 1 / 3  # of the samples; a rest after a step is correlated as long as it lasts
 
 
@@ -29,7 +28,8 @@ def colour(residual: Array, *, angle: float) -> float:
     Parzen's lag window; never below one, because the fit itself takes power out at `angle`.
     """
     n = residual.size
-    lags = min(max(_MIN_LAGS, int(np.sqrt(n))), n // 2)
+    # Lags of the residual's correlation that are always looked at.
+    lags = min(max(8, int(np.sqrt(n))), n // 2)
     power = float(residual @ residual)
     if power == 0 or lags < 2:
         return 1.0

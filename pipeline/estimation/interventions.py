@@ -17,7 +17,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import ForceLeft, forces_left
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
-from pipeline.results_of_runs import Intervention, Record
+from pipeline.results import Intervention, Record
 
 _BULK = 2.0  # standard deviations, as in the law's fit
 _FAR, _BEGINS = 4.0, 1.5  # times the bulk: of a burst, and where it begins and ends

@@ -17,23 +17,15 @@ from scipy.ndimage import maximum_filter1d
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
-from pipeline.results_of_runs import Record
+from pipeline.results import Record
 
-_HOP = 0.01  # s from window to window
 _WINDOW = 0.1  # s; the middle 0.04 s weigh most
-_FEWEST = 9  # samples in a window
-_AT_ONCE = 1000  # windows; more would need much memory in long recordings
-_MOVES = 3.0  # smallest changes in a window: with less the cart rests
 _LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
-_JUMP = 0.3  # of the input's range from one sample to the next
-_STATIC = 3.0  # times dry friction in motion: what may hold a cart at rest
 # Columns of the law: rest and gain of a record, positions, inputs; dampers, drag, braking; dry
 # friction, alone and in proportion to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
 _ROUNDS, _SETTLED = 30, 1e-3  # of weighing anew; relative change of the bulk that ends it
-_SINGULAR = 1e-12  # of the normal equations: what is less is nothing
-_PER_UNKNOWN = 3  # windows, at least
 _BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
 
 
@@ -116,7 +108,8 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
     parts = [(c[use], w.acceleration[use])
              for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
     unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
-    if sum(target.size for _, target in parts) < _PER_UNKNOWN * unknowns:
+    # Windows, at least.
+    if sum(target.size for _, target in parts) < 3 * unknowns:
         return [], 0.0
     laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
     found = []
@@ -124,7 +117,8 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
         asked = column[:, _SPRINGS] @ law[_SPRINGS]
         free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
         rubs, by_load = np.abs(law[_DRY])
-        holds = _STATIC * (rubs + by_load * np.abs(one.u[0]))
+        # Times dry friction in motion: what may hold a cart at rest.
+        holds = 3.0 * (rubs + by_load * np.abs(one.u[0]))
         at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
         offset, stiffness = law[0], -law[_POSITION]
         rest = offset / stiffness if stiffness * np.ptp(one.x[1]) > size else 0.0
@@ -149,7 +143,8 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     if any(c in record.free and c not in record.carts for c in neighbours):
         return None
     t, interval = record.t, record.sample_time
-    width = max(round(_WINDOW / interval) + 1, _FEWEST)
+    # Samples in a window.
+    width = max(round(_WINDOW / interval) + 1, 9)
     if width >= t.size:
         return None
     first = np.arange(0, t.size - width + 1, _hop(record))
@@ -157,13 +152,16 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     around = np.array([record.position(c) if c in record.carts else still for c in neighbours])
     y, u = around[1], still if record.u is None else record.u
     inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
-    parts = np.array_split(first, -(-first.size // _AT_ONCE))
+    # Windows; more would need much memory in long recordings.
+    parts = np.array_split(first, -(-first.size // 1000))
     means = np.hstack([_means(t, around, inputs, part[:, None] + np.arange(width))
                        for part in parts])  # fmt: skip
     step = grain(t, y, step=record.encoder_step(cart))
     reach = round(_LAGS[-1] / interval) + 1
-    jump = np.abs(np.diff(u, prepend=u[0])) > _JUMP * np.ptp(u)
+    # Of the input's range from one sample to the next.
+    jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
     lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
+    # Smallest changes in a window: with less the cart rests.
     return _Windows(
         record=record,
         t=means[0],
@@ -173,14 +171,15 @@ def _cut(record: Record, cart: int) -> _Windows | None:
         u=means[8:11],
         on=means[11],
         noise=float(np.median(means[12])) * step / np.sqrt(12.0),
-        moves=means[13] > _MOVES * step,
+        moves=means[13] > 3.0 * step,
         jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
     )
 
 
 def _hop(record: Record) -> int:
     """Return how many samples there are from window to window."""
-    return max(1, round(_HOP / record.sample_time))
+    # In s, from window to window.
+    return max(1, round(0.01 / record.sample_time))
 
 
 def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
@@ -229,7 +228,8 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
             weighed = columns.T * weight**2
             H[np.ix_(place, place)] += weighed @ columns
             b[place] += weighed @ target
-        law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=_SINGULAR)[0]
+        # Of the normal equations: what is less is nothing.
+        law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=1e-12)[0]
         left = [target - columns @ law[place]
                 for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip
         before = bulk

@@ -13,9 +13,6 @@ from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Record
 
 _STILL = 0.02  # of its range that a signal may vary while nothing happens
-_MIN_QUIET = 5  # samples at rest that show a rest
-_CLEARLY = 0.5  # of the misfit of a step from rest: what a start in motion must come down to
-_JUMP = 0.3  # of its range, within one sample: a step
 _MIN_STEP_SAMPLES = 10
 
 
@@ -85,7 +82,8 @@ class MeasuredRun:
         """
         n = self.record.t.size
         states = np.eye(2 * len(self.free))
-        columns = [self.forced(), *(self._ringing(state) for state in states)]
+        forced = self.forced() if self.driven else np.zeros_like(self.y)
+        columns = [forced, *(self._ringing(state) for state in states)]
         columns += [np.outer(cart, np.ones(n)) for cart in np.eye(len(self.free))]
         rows = np.array([column[self.seen].ravel() for column in columns])
         size = np.linalg.norm(rows, axis=1)
@@ -101,9 +99,8 @@ class MeasuredRun:
         if signal is None or not np.any(signal):
             return None
         # Before the record the signal was zero, so one that stands from the start steps there.
-        edges = np.flatnonzero(
-            np.abs(np.diff(signal, prepend=0.0)) > _JUMP * np.ptp([0.0, *signal])
-        )
+        # Of its range, within one sample: a step.
+        edges = np.flatnonzero(np.abs(np.diff(signal, prepend=0.0)) > 0.3 * np.ptp([0.0, *signal]))
         if edges.size == 0:
             return None
         stop = int(edges[1]) if edges.size > 1 else signal.size
@@ -144,6 +141,30 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
             f"{record.id}: the hardware check needs cart 1, which the motor drives, to be free, "
             f"found free {list(free)}"
         )
+    run = _begin(record, chain, free=free)
+    # Six deviations, or as many encoder steps, of a rest are more than chance.
+    at_rest = np.all(np.ptp(run.y[:, : run.quiet], axis=1) <= 6 * run.noise)
+    # Samples at rest that show a rest.
+    if not run.driven or (at_rest and run.quiet >= 5):
+        return run
+    moving = run.begun_in_motion()
+    usual = at_rest and record.kind in ("step", "closed_loop")
+    # Of the misfit of a step from rest: what a start in motion must come down to.
+    return run if usual and moving.best_misfit() > 0.5 * run.best_misfit() else moving
+
+
+def released_run(record: Record, chain: Chain) -> MeasuredRun:
+    """Return a run in free motion from its first sample, its rest and start fitted to all of it.
+
+    Raises
+    ------
+    DataError : no free cart was measured or moved.
+    """
+    return _begin(record, chain, free=tuple(sorted(set(record.free)))).begun_in_motion()
+
+
+def _begin(record: Record, chain: Chain, *, free: tuple[int, ...]) -> MeasuredRun:
+    """Return the run as if it began at rest."""
     t = record.t
     seen = np.array([cart in record.carts for cart in free])
     y = np.array([record.position(c) if c in record.carts else np.zeros(t.size) for c in free])
@@ -152,7 +173,7 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
     quiet = _quiet_samples(record)
     noise = [local_noise(t, y[i]) if s else 0.0 for i, s in enumerate(seen)]
     step = [record.encoder_step(c) if c in record.carts else 0.0 for c in free]
-    run = MeasuredRun(
+    return MeasuredRun(
         record=record,
         chain=chain,
         free=free,
@@ -163,13 +184,6 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
         rest=y[:, :quiet].mean(axis=1),
         x0=np.zeros(2 * len(free)),
     )
-    # Six deviations, or as many encoder steps, of a rest are more than chance.
-    at_rest = np.all(np.ptp(y[:, :quiet], axis=1) <= 6 * run.noise)
-    if not run.driven or (at_rest and quiet >= _MIN_QUIET):
-        return run
-    moving = run.begun_in_motion()
-    usual = at_rest and record.kind in ("step", "closed_loop")
-    return run if usual and moving.best_misfit() > _CLEARLY * run.best_misfit() else moving
 
 
 def _quiet_samples(record: Record) -> int:

@@ -12,25 +12,25 @@ T = TypeVar("T")
 
 
 def minimise(
-    at: Callable[[Array], T],
+    at: Callable[[Array], tuple[Array, Array]],
     start: Array,
     *,
-    residual: Callable[[T], Array],
-    jacobian: Callable[[T], Array],
     max_evaluations: int,
     bounds: tuple[Any, Any] = (-np.inf, np.inf),
     scale: float | Literal["jac"] = 1.0,
     tolerance: float = 1e-8,
 ) -> OptimizeResult:
-    """Minimise the sum of squares of residual(at(p)) from `start` (n_p,) on.
+    """Minimise the sum of squares of the residual from `start` (n_p,) on.
+
+    `at` returns the residual (n,) and the Jacobian (n, n_p) at p.
 
     `tolerance` is the relative change of the cost to stop at.
     """
     once = evaluated_once(at)
     return least_squares(
-        lambda p: residual(once(p)),
+        lambda p: once(p)[0],
         start,
-        jac=lambda p: jacobian(once(p)),  # pyright: ignore[reportArgumentType] - scipy's default is a string
+        jac=lambda p: once(p)[1],  # pyright: ignore[reportArgumentType] - scipy's default is a string
         bounds=bounds,
         x_scale=scale,
         ftol=tolerance,

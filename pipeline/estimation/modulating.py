@@ -4,7 +4,8 @@ The equation is multiplied by a bump that vanishes at both ends of a window with
 derivatives, and integrated by parts: the derivatives move from the data to the bump, which is
 known. What remains is linear in masses, dampings and springs.
 
-Reference: M. Shinbrot, Trans. ASME 79 (1957), 579-588.
+References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin,
+Computers & Chemical Engineering 17 (1993).
 """
 
 import numpy as np
@@ -16,6 +17,11 @@ def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
     """Return (s (1 - s))⁴ for s from 0 to 1 over `span` s, and two derivatives by time."""
     b, slope = s * (1 - s), 1 - 2 * s
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
+
+
+def motion_period(x: Array) -> float:
+    """Return the period, in samples, of a sine with the speed of this motion."""
+    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
 
 
 def bump_integral(s: Array) -> Array:

@@ -5,8 +5,6 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
 
-_FLAT_INPUT = 0.02  # of the input's range: smaller changes are noise of the logged input
-
 
 def extrema(y: Array, *, prominence: float) -> list[int]:
     """Return the indices of the turning points, maxima and minima in turn, ends included.
@@ -48,7 +46,8 @@ def plateaus(u: Array) -> list[tuple[int, int]]:
     stretches, a slow edge a few; how long a stretch must be, the caller knows.
     """
     noise = float(difference_noise(u, order=2)) if u.size > 2 else 0.0
-    tolerance = max(_FLAT_INPUT * float(np.ptp(u)), 6 * noise)
+    # Of the input's range: smaller changes are noise of the logged input.
+    tolerance = max(0.02 * float(np.ptp(u)), 6 * noise)
     found, start, held = [], 0, u[0]
     for i, value in enumerate(u.tolist()):
         if abs(value - held) > tolerance:

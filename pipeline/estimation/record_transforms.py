@@ -23,16 +23,10 @@ _LEAST_INPUT_SHARE = 0.01  # of its strongest line; below, the input does not ex
 # step on and off) whatever is not linear is divided by next to nothing.
 _LEAST_NEIGHBOUR_SHARE = 0.25
 _NEIGHBOURS = 2  # frequencies on each side
-_REST_SHARE = 0.1  # the part of a record at its end that must be at rest
-_REST_SWING = 0.01  # … to this share of the whole travel
 # A step at the first sample has moved its cart by u t²/2m after two: 3 % of the travel even with
 # samples as far apart as 9 ms and a mode at 20 rad/s.
 _START_SWING = 0.03
-_RING_GAIN = 10.0  # a swing r left at the end errs by up to r / 2ζ, here with ζ = 0.05
-_BAND_TOP = 0.4  # of the Nyquist frequency; above, aliases of the unfiltered encoders come in
 _HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines to each side, and degree, of the local polynomials
-_UNIFORM = 1e-3  # of an interval: what rounding leaves of a uniform time axis
-_RANK = 1e-9  # singular values below this share are rounding
 
 
 class TransferRatio(NamedTuple):
@@ -59,7 +53,8 @@ def visible_band(run: Record) -> float:
     floor = _noise(run)[:, None] * omega * np.sqrt(dt * duration)
     # Noise alone passes three sigma on a line in e^-9: too rarely to matter.
     visible = np.any(np.abs(np.fft.rfft(np.diff(run.y))) > 3 * floor, axis=0)
-    visible &= omega <= _BAND_TOP * np.pi / dt
+    # Of the Nyquist frequency; above, aliases of the unfiltered encoders come in.
+    visible &= omega <= 0.4 * np.pi / dt
     return float(np.max(omega[visible], initial=0.0))
 
 
@@ -87,10 +82,12 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     """Return FT(y')/FT(u') of a record that begins and ends at rest; None for any other."""
     travel = np.ptp(run.y, axis=1)
     noise = _noise(run)
-    tail = run.t >= run.t[-1] - _REST_SHARE * (run.t[-1] - run.t[0])
+    # The part of a record at its end that must be at rest.
+    tail = run.t >= run.t[-1] - 0.1 * (run.t[-1] - run.t[0])
     ring = np.ptp(run.y[:, tail], axis=1)
     quiet = np.maximum(8 * noise, 2 * run.resolution)  # peak to peak of a cart that stands still
-    moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, _REST_SWING * travel))
+    # At rest: to a hundredth of the whole travel.
+    moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, 0.01 * travel))
     starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, _START_SWING * travel))
     if moving or starts_moving:
         return None
@@ -99,9 +96,10 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     U, Y = _derivative_transforms(run, u, omega, u_before=float(u[0]) if waits else 0.0)
     excess = np.maximum(ring - quiet, 0.0) / 2
     duration = run.t[-1] - run.t[0]
+    # A swing r left at the end errs by up to r / 2ζ, here with ζ = 0.05.
     std = np.sqrt(
         noise[:, None] ** 2 * (2 + omega**2 * run.sample_time * duration) / 2
-        + (_RING_GAIN * excess[:, None]) ** 2
+        + (10.0 * excess[:, None]) ** 2
     )
     return _ratio(Y, U, std=std)
 
@@ -142,7 +140,8 @@ def _line_transforms(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return FT(u') and FT(y') at harmonics of the record length; by FFT where time is uniform."""
     dt, base = run.sample_time, 2 * np.pi / (run.t[-1] - run.t[0])
-    if np.max(np.abs(np.diff(run.t) - dt)) > _UNIFORM * dt:
+    # Of an interval: what rounding leaves of a uniform time axis.
+    if np.max(np.abs(np.diff(run.t) - dt)) > 1e-3 * dt:
         return _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
     smooth = 1.0 / np.sinc(lines * base * dt / (2 * np.pi))
     U, Y = np.fft.rfft(np.diff(u))[lines], np.fft.rfft(np.diff(run.y))[:, lines] * smooth
@@ -161,7 +160,8 @@ def _local_polynomials(
     away = (window + 1 - place[:, None]) / half
     powers = away[:, :, None] ** np.arange(_DEGREE + 1)
     regressors = np.concatenate([powers * U[window][:, :, None], powers], axis=2)
-    inverse = np.linalg.pinv(regressors, rcond=_RANK)
+    # Singular values below this share are rounding.
+    inverse = np.linalg.pinv(regressors, rcond=1e-9)
     measured = Y[:, window]  # (n_carts, n_w, width)
     found = np.einsum("wpj,cwj->cwp", inverse, measured)
     misfit = measured - np.einsum("wjp,cwp->cwj", regressors, found)

@@ -5,17 +5,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.document import gap_json
-from pipeline.gap.types import Gap
+from pipeline.gap.types import FoundEffect, Gap
+from pipeline.json_files import keys, plain
 from pipeline.results import Analysis
 
 if TYPE_CHECKING:
     import pandas as pd  # a fifth of a second: imported where it is used
 
-_EFFECT = (
-    "effect", "where", "parameters", "details", "confidence", "nrmse_before", "nrmse_after",
-    "rivals",
-)  # fmt: skip
 _PARAMETER = ("effect", "cart", "spring", "parameter", "value", "std", "unit")
 _LEFT = ("experiment", "time", "cart", "position", "velocity", "input", "force")
 
@@ -24,7 +20,7 @@ def effects(gap: Gap) -> "pd.DataFrame":
     """Return one row an effect, in the order found."""
     import pandas as pd
 
-    return pd.DataFrame(gap_json(gap)["effects"], columns=list(_EFFECT))
+    return pd.DataFrame(plain(gap.effects, digits=17), columns=keys(FoundEffect))
 
 
 def parameters(gap: Gap) -> "pd.DataFrame":
@@ -76,7 +72,7 @@ def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
         for one in gap.left_forces
     ]
     frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(_LEFT))
-    position, drive = analysis.position_unit, analysis.input_unit
+    position, drive = analysis.bench.units.position, analysis.bench.units.input
     driven = any(np.any(one.u) for one in gap.left_forces)
     force = drive if driven else f"{position}/s^2"  # the first mass is one
     frame.attrs["units"] = {

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.io import savemat
 
-from pipeline.exchange.frames import RESPONSE, record_series, tables
+from pipeline.exchange.frames import record_series, tables
+from pipeline.json_files import keys, plain
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.results import Analysis, Estimate, FrequencyResponse
-from pipeline.schemas.base import plain_json
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,7 +42,7 @@ def _csv(frame: "pd.DataFrame") -> str:
     units = frame.attrs["units"]
     head = [f"{name} [{units[name]}]" if name in units else name for name in frame.columns]
     rows = frame.astype(object).where(frame.notna(), None)
-    return csv_text(head, plain_json(rows.to_numpy().tolist()))
+    return csv_text(head, plain(rows.to_numpy().tolist()))
 
 
 def matlab_file(analysis: Analysis) -> bytes:
@@ -53,9 +53,9 @@ def matlab_file(analysis: Analysis) -> bytes:
     structure a cart in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A
     number that could not be had is NaN; what was not found at all is not there.
     """
-    chain, design = analysis.chain, analysis.feedback
+    chain, design, bench = analysis.chain, analysis.feedback, analysis.bench
     variables: dict[str, Any] = {
-        "units": {"position": analysis.position_unit, "input": analysis.input_unit, "time": "s"},
+        "units": {"position": bench.units.position, "input": bench.units.input, "time": "s"},
         "parameters": {
             "initial": {row.name: _value(row.initial) for row in analysis.rows},
             "initial_std": {row.name: _std(row.initial) for row in analysis.rows},
@@ -97,10 +97,10 @@ def _std(estimate: Estimate | None) -> float:
 
 def _responses(responses: Sequence[FrequencyResponse]) -> Any:
     """Return an array of structures (1, n), as MATLAB has them; a phase not known is empty."""
-    keys = RESPONSE[:-1]
-    array = np.empty((1, len(responses)), dtype=[(key, object) for key in keys])
+    names = keys(FrequencyResponse)[:-1]  # their source is no number
+    array = np.empty((1, len(responses)), dtype=[(name, object) for name in names])
     for i, response in enumerate(responses):
-        values = (getattr(response, key) for key in keys)
+        values = (getattr(response, name) for name in names)
         array[0, i] = tuple(np.zeros((0, 0)) if value is None else value for value in values)
     return array
 

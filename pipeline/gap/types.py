@@ -1,89 +1,89 @@
 """What the gap workflow finds."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
+from pydantic import ValidationError
+
 from pipeline.arrays import Array
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect
-from pipeline.results import LeftOut
-from pipeline.results_of_runs import Intervention
+from pipeline.errors import ConfigError
+from pipeline.json_files import Number, computed, read_json, result, written
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, find_effect
+from pipeline.results import ChainWithUnits, Intervention, LeftOut, Provenance
+from pipeline.set_up import Bench, Units
+from pipeline.submission.complaints import first_refusal, quote
 
+Quantity = Literal["position", "velocity", "input"]
 Verdict = Literal["named", "partial", "none", "ambiguous", "unexplained"]
+_WHERE = '{"cart": 1} or {"spring": 2}; empty: the input'
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class NamedValue:
-    """A parameter of an effect with its standard error (None where it could not be had)."""
+    """A parameter of an effect, with its standard error."""
 
-    value: float
-    std: float | None
-    unit: str
+    value: float = written()
+    std: float | None = written()
+    unit: str = written()
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class Rival:
-    """Another effect in the same role, fitted as fully; `where` as in `gap.json`.
+    """Another effect in the same role, fitted as fully."""
 
-    `confidence` is its weight among the models it is listed with.
-    """
-
-    effect: Effect
-    where: dict[str, int]
-    nrmse_after: float
-    confidence: float
+    effect: Effect = written("its name in the catalogue")
+    where: dict[str, int] = written(_WHERE)
+    nrmse_after: Number = written()
+    confidence: Number = written("weight among the models it is listed with")
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class FoundEffect:
-    """One effect in the order found; errors are on held-out runs, before and after adding it.
+    """One effect, in the order found; errors are on held-out runs."""
 
-    `confidence` is its weight by the Bayesian information criterion among all fitted models of
-    the same size. Parameters that only describe a contact are in `details`.
-    """
-
-    effect: Effect
-    where: dict[str, int]
-    parameters: dict[str, NamedValue]
-    details: dict[str, NamedValue]
-    confidence: float
-    nrmse_before: float
-    nrmse_after: float
-    rivals: tuple[Rival, ...]
+    effect: Effect = written("its name in the catalogue")
+    where: dict[str, int] = written(_WHERE)
+    parameters: dict[str, NamedValue] = written()
+    details: dict[str, NamedValue] = written("what only describes a contact")
+    confidence: Number = written(
+        "weight by the Bayesian information criterion among all fitted models of the same size"
+    )
+    nrmse_before: Number = written("before adding it")
+    nrmse_after: Number = written("after adding it")
+    rivals: tuple[Rival, ...] = written()
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class RecordGap:
     """Relative root-mean-square error of one cart in one run."""
 
-    experiment: str
-    cart: int
-    held_out: bool
-    baseline: float
-    final: float
-    noise_floor: float
+    experiment: str = written()
+    cart: int = written()
+    held_out: bool = written()
+    baseline: Number = written()
+    final: Number = written()
+    noise_floor: Number = written()
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class GapWindow:
-    """Where a run departs from a model most: the window, what happens, its share."""
+    """Where a run departs from a model most."""
 
-    experiment: str
-    cart: int
-    start: float
-    end: float
-    what: str
-    share: float
+    experiment: str = written()
+    cart: int = written()
+    start: float = written("s", key="from")
+    end: float = written("s", key="to")
+    what: str = written()
+    share: float = written("of the run's squared error")
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class FreeRun:
-    """Root-mean-square error (position unit) of one simulation of a whole record.
+    """One simulation of a whole record, started from its first readings."""
 
-    None where the carts run away.
-    """
-
-    experiment: str
-    error: float | None
+    experiment: str = written()
+    error: float | None = written("root mean square, position unit; null: the carts run away")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,68 +130,83 @@ class LeftForce:
         return (self.weight * values).sum(axis=1)
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class FormulaTerm:
-    """One term of a formula, "v|v|" say, with its coefficient."""
+    """One term of a formula, with its coefficient."""
 
-    term: str
-    coefficient: float
-    std: float
-    unit: str
+    term: str = written("in x, v and u of the cart, v|v| say")
+    coefficient: float = written()
+    std: float = written()
+    unit: str = written()
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class ForceFormula:
-    """The shortest formula for the force left; `explains` is the share that it takes of it."""
-
-    terms: tuple[FormulaTerm, ...]
-    explains: float
+    """The shortest formula for the force that is left, by regression over a library of terms."""
 
     @property
+    @computed()
     def text(self) -> str:
-        """The sum of the terms in words, "-0.0021 sqrt|v| sign v"."""
+        """The sum of the terms, for people: "-0.0021 sqrt|v| sign v"."""
         signed = " ".join(
             f"{'-' if one.coefficient < 0 else '+'} {abs(one.coefficient):.3g} {one.term}"
             for one in self.terms
         )
         return f"-{signed[2:]}" if signed[0] == "-" else signed[2:]
 
+    terms: tuple[FormulaTerm, ...] = written()
+    explains: float = written("share of the squared force")
+    in_catalogue: Literal[False] = written(
+        "a description of the data, not an effect of it", older=False, default=False
+    )
 
-@dataclass(frozen=True, kw_only=True)
+
+@result()
 class ForceAgainst:
-    """The force left against one quantity, bin by bin.
+    """The force that the model does not explain against one quantity, bin by bin."""
 
-    Attributes
-    ----------
-    quantity : "position", "velocity" or "input", with its `unit`.
-    at, force : means of each bin; `formula` the mean of what the formula says there.
-    spread : standard deviation between runs of a bin's mean, None where one run alone has it.
-    """
-
-    quantity: str
-    unit: str
-    at: tuple[float, ...]
-    force: tuple[float, ...]
-    spread: tuple[float | None, ...]
-    formula: tuple[float, ...] | None
+    quantity: Quantity = written()
+    unit: str = written()
+    at: tuple[float, ...] = written("mean of the quantity in each bin")
+    force: tuple[float, ...] = written("mean force")
+    spread: tuple[float | None, ...] = written(
+        "standard deviation between runs; null where one run alone has the bin"
+    )
+    formula: tuple[float, ...] | None = written("mean of what the formula says")
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class Residual:
-    """What is left on one cart: the force (in `unit`), and a formula where one fits."""
+    """What is left on one cart."""
 
-    cart: int
-    unit: str
-    against: tuple[ForceAgainst, ...]
-    formula: ForceFormula | None
+    cart: int = written()
+    unit: str = written("of the force")
+    against: tuple[ForceAgainst, ...] = written()
+    formula: ForceFormula | None = written("null where no term is better than none")
+
+
+@result(eq=False)
+class Contender(AugmentedChain):
+    """A model that may be the true one."""
+
+    weight: float = written("by the Bayesian criterion among the contenders")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Contender:
-    """A model that may be the true one; `weight` is its share by the Bayesian criterion."""
+class Prediction:
+    """What the contenders predict of the recording that is proposed.
 
-    model: AugmentedChain
-    weight: float
+    Attributes
+    ----------
+    pair : the two, from 0, that decided: by their weights it tells them apart best.
+    t, u : (n,) s and the input; `positions` (contenders, n) of `cart`.
+    """
+
+    pair: tuple[int, int]
+    cart: int
+    t: Array
+    u: Array
+    positions: Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -202,77 +217,213 @@ class Proposal:
     ----------
     recording : a table of plan.toml.
     limits : the plan's in which it was chosen, by name.
-    pair : the two contenders, from 0, that decided: by their weights it tells them apart best.
-    separation : root mean square of the difference between those two that no refit of the other
-        takes up, in noises.
-    t, u : (n,) s and the input; `predicted` (contenders, n) positions of `cart`.
+    separation : root mean square of the difference between the two that decided, as far as no
+        refit of the other takes it up, in noises.
+    prediction : None where it was read from a file.
     """
 
     recording: dict[str, Any]
     limits: dict[str, float]
-    pair: tuple[int, int]
     separation: float
-    cart: int
-    t: Array
-    u: Array
-    predicted: Array
+    prediction: Prediction | None = None
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
+class GapErrors:
+    """Relative root-mean-square errors, pooled over the held-out runs."""
+
+    baseline: Number = written("of the linear model")
+    final: Number = written("of the model with all effects found")
+    noise_floor: Number = written()
+
+
+@result()
+class GapSubmission:
+    """Which submission it is about."""
+
+    title: str = written()
+    carts: int = written()
+
+
+@result(eq=False)
 class Gap:
-    """Where simulation and measurement disagree, why, and what is left.
+    """What the linear model leaves out. A number that could not be had is null.
 
     Attributes
     ----------
-    effects : in the order found. Under `ambiguous` the last one's rivals explain as much; under
-        `partial` each lowers the error by a tenth or more, and more is left; under `unexplained`
-        they are suspects only.
-    baseline, final, noise_floor : relative errors pooled over the held-out runs.
-    repeatability : the same between runs with the same input, or None without repeats.
-    suspects : under `unexplained`, the single effects that help most, the best first.
-    left_forces : the force that the model does not explain, run by run; residual : what it is on
-        each cart, where more is left than a name may leave.
-    free_run : of each run, the error of one simulation from its first readings to its end.
-    where, left : where the linear model departs most; and the final one, unless it is enough.
-    complete : False where the time allowed ended the search: the best answer so far.
-    linear, model : the linear chain that fits best, and the chain with the effects.
-    chain_std : standard errors of the latter's "m_1", "c_1", "k_1", …; `chain_covariance` (n_p,
-        n_p) of the same, None where it could not be had or was read from a file.
-    training, held_out : ids of the runs.
-    left_out : recordings that the identification did not use, and why: no part of any figure here.
-    interventions : where a force that was not measured acts: no part of any fit or error.
-    spread : learnt run-to-run spread of the dry friction, per cart, where the runs show any.
-    notes : what a reader must know.
-    contenders : unless one leaves no more than noise: the models that may be true, the chosen
-        first, then the likeliest.
+    bench : what its numbers are about.
+    traces, left_forces : for the figures; not in a gap that was read from a file.
+    chain_covariance : (n_p, n_p) of what `chain_std` has the standard errors of, None where it
+        could not be had or was read from a file.
     proposal : what to record next, as a plan has it; None where nothing was weighed.
     """
 
-    verdict: Verdict
-    effects: tuple[FoundEffect, ...]
+    schema: Literal["cartlab-gap/1"] = written(default="cartlab-gap/1")
+    verdict: Verdict = written()
+    complete: bool = written(
+        "false: the time allowed ended the search, and this is the best answer so far; another "
+        "run may come further",
+        older=True,
+        default=True,
+    )
+    effects: tuple[FoundEffect, ...] = written(
+        "under `ambiguous` the last one's rivals explain as much; under `partial` each lowers the "
+        "error by a tenth or more, and more is left; under `unexplained` they are suspects only"
+    )
+    suspects: tuple[Rival, ...] = written(
+        "under `unexplained`, the single effects that help most, the best first", default=()
+    )
     baseline: float
     final: float
     noise_floor: float
-    repeatability: float | None
-    by_record: tuple[RecordGap, ...]
-    where: tuple[GapWindow, ...]
-    next_experiment: str
+
+    @property
+    @computed(key="gap")
+    def errors(self) -> GapErrors:
+        """Relative errors, pooled over the held-out runs."""
+        return GapErrors(baseline=self.baseline, final=self.final, noise_floor=self.noise_floor)
+
+    repeatability: float | None = written("between runs of the same input")
+    by_record: tuple[RecordGap, ...] = written()
+    free_run: tuple[FreeRun, ...] = written(
+        "of each run, how far one simulation strays", older=(), default=()
+    )
+    where: tuple[GapWindow, ...] = written("where the linear model fails most")
+    left: tuple[GapWindow, ...] = written(
+        "where the final model does, under `partial` and `unexplained`", older=(), default=()
+    )
+    residual: tuple[Residual, ...] = written(
+        "where more is left than a name may leave, the force left by cart", older=(), default=()
+    )
+    next_experiment: str = written()
+
+    @property
+    @computed(older=None)
+    def next_recording(self) -> dict[str, Any] | None:
+        """What tells the contenders apart best, as a table of plan.toml."""
+        return self.proposal and self.proposal.recording
+
+    @property
+    @computed(older=None)
+    def next_limits(self) -> dict[str, float] | None:
+        """The limits of plan.toml that it keeps."""
+        return self.proposal and self.proposal.limits
+
+    @property
+    @computed(older=None)
+    def separation(self) -> float | None:
+        """Of the two that decided, in noises that no refit takes up."""
+        return self.proposal and self.proposal.separation
+
+    training: tuple[str, ...] = written("ids of the runs")
+    held_out: tuple[str, ...] = written("ids of the runs")
+    left_out: tuple[LeftOut, ...] = written(
+        "recordings that the identification did not use: no part of any figure here",
+        older=(),
+        default=(),
+    )
+    interventions: tuple[Intervention, ...] = written(
+        "no part of any fit or error", older=(), default=()
+    )
+    spread: dict[int, float] = written(
+        "run-to-run spread of the dry friction, by cart",
+        key="friction_spread",
+        default_factory=dict,
+    )
+
+    @property
+    @computed()
+    def units(self) -> Units:
+        """The submission's own."""
+        return self.bench.units
+
+    @property
+    @computed(key="linear")
+    def linear_chain(self) -> Chain:
+        """The linear chain that fits best."""
+        return self.linear.chain
+
     linear: AugmentedChain
-    model: AugmentedChain
-    training: tuple[str, ...]
-    held_out: tuple[str, ...]
+    model: AugmentedChain = written("the chain with the effects")
+    contenders: tuple[Contender, ...] = written(
+        "unless only noise is left: models that may be true, the chosen first, then the likeliest",
+        older=(),
+        default=(),
+    )
+    notes: tuple[str, ...] = written("what a reader must know", default=())
+
+    @property
+    @computed()
+    def submission(self) -> GapSubmission:
+        """Which submission it is about."""
+        return GapSubmission(title=self.title, carts=self.bench.n)
+
+    @property
+    @computed()
+    def springs(self) -> tuple[bool, ...]:
+        """Wall-1, 1-2, …, n-wall."""
+        return self.bench.springs
+
+    @property
+    @computed()
+    def chain(self) -> ChainWithUnits:
+        """That of the model."""
+        return ChainWithUnits.of(self.model.chain, self.bench.units)
+
+    chain_std: dict[str, Number] = written(
+        "standard errors of its m_1, c_1, k_1, …", default_factory=dict
+    )
+    provenance: Provenance = written(default=Provenance(files={}))
+    title: str = ""
+    bench: Bench
     traces: tuple[Trace, ...]
-    chain_std: dict[str, float] = field(default_factory=dict)
-    chain_covariance: Array | None = None
-    spread: dict[int, float] = field(default_factory=dict)
-    suspects: tuple[Rival, ...] = ()
-    left: tuple[GapWindow, ...] = ()
-    free_run: tuple[FreeRun, ...] = ()
-    residual: tuple[Residual, ...] = ()
     left_forces: tuple[LeftForce, ...] = ()
-    complete: bool = True
-    notes: tuple[str, ...] = ()
-    left_out: tuple[LeftOut, ...] = ()
-    interventions: tuple[Intervention, ...] = ()
-    contenders: tuple[Contender, ...] = ()
+    chain_covariance: Array | None = None
     proposal: Proposal | None = None
+
+    @classmethod
+    def from_written(
+        cls,
+        *,
+        springs: tuple[bool, ...],
+        units: Units,
+        submission: GapSubmission,
+        errors: GapErrors,
+        linear_chain: Chain,
+        **own: Any,
+    ) -> "Gap":
+        """Return the gap that a file holds."""
+        recording, limits, separation = (
+            own.pop(name) for name in ("next_recording", "next_limits", "separation")
+        )
+        proposal = None
+        if recording is not None and separation is not None:
+            proposal = Proposal(recording=recording, limits=limits or {}, separation=separation)
+        del own["chain"]  # that of the model again
+        bench = Bench(springs=springs, units=units)
+        return cls(
+            bench=bench,
+            title=submission.title,
+            baseline=errors.baseline,
+            final=errors.final,
+            noise_floor=errors.noise_floor,
+            linear=AugmentedChain(chain=linear_chain),
+            proposal=proposal,
+            traces=(),
+            **own,
+        )
+
+
+def read_gap(text: str) -> Gap:
+    """Return the gap that a `gap.json` holds, without its traces.
+
+    Raises
+    ------
+    ConfigError : the text is no `gap.json`, or its model is not of this catalogue.
+    """
+    try:
+        return read_json(Gap, text, readers={Effect: find_effect})
+    except ValidationError as error:
+        raise ConfigError(f"not what cartlab gap writes: {first_refusal(error)}") from None
+    except (ValueError, KeyError, TypeError) as error:  # null where a number is needed, say
+        raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None

@@ -2,75 +2,37 @@
 
 import unicodedata
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Literal
 
-from pipeline.schemas.grade import Flag
-
-
-@dataclass(frozen=True, kw_only=True)
-class Grading:
-    """What one submission came to by itself, before it is compared with the others.
-
-    Attributes
-    ----------
-    submission : its id, unique in the batch.
-    key : hash of all that it depends on: the files as handed in, rubric, code, name, lateness;
-        behind a hyphen that of the files alone.
-    status : `failed` where it could not be graded, for the one-line `reason`.
-    settled : False where a limit or a crash ended it: another run tries again.
-    grade : `grade.json` without what other submissions add (shared data, overrides).
-    fingerprints : of its recordings, to find them in other submissions; see `shared.py`.
-    figures : (file name, SVG) for the feedback.
-    owner : who handed it in, as the learning platform calls them, or "".
-    detail : for whoever mends the grader: the traceback of an error of its own, or "".
-    lacks_room : the disk was full. It concerns this run alone: the gradebook does not keep it.
-    """
-
-    submission: str
-    authors: tuple[str, ...] = ()
-    key: str
-    status: Literal["graded", "failed"]
-    reason: str = ""
-    settled: bool = True
-    days_late: float = 0.0
-    grade: str
-    fingerprints: bytes = field(default=b"", repr=False)
-    figures: tuple[tuple[str, str], ...] = ()
-    owner: str = ""
-    detail: str = ""
-    lacks_room: bool = False
+from pipeline.grading.grade import Flag
 
 
 @dataclass(frozen=True, kw_only=True)
 class Member:
     """A submission of a class: whose it is, and the fingerprints of its recordings.
 
-    `key`, `owner` and `reason` are those of its grading, `grading` is its number in the gradebook;
-    `of_class` where it is of the assignment that is being graded.
+    Attributes
+    ----------
+    submission : its id, unique in the batch.
+    owner : who handed it in, as the learning platform calls them, or "".
+    key : hash of all that its grading depends on: the files as handed in, rubric, code, name,
+        lateness; behind a hyphen that of the files alone.
+    fingerprints : to find its recordings in other submissions; see `shared.py`.
+    reason : one line, why it could not be graded, or "".
+    grading : the number of its grading in the gradebook.
+    of_class : whether it is of the assignment that is being graded.
     """
 
     submission: str
-    authors: tuple[str, ...]
+    authors: tuple[str, ...] = ()
     owner: str = ""
     key: str = ""
     fingerprints: bytes = field(default=b"", repr=False)
     reason: str = ""
     grading: int = 0
     of_class: bool = False
-
-    @classmethod
-    def of(cls, grading: Grading) -> "Member":
-        """Return what a batch itself needs of a grading: all else stays in the book."""
-        return cls(
-            submission=grading.submission,
-            authors=grading.authors,
-            owner=grading.owner,
-            key=grading.key,
-            fingerprints=grading.fingerprints,
-            reason=grading.reason if grading.status == "failed" else "",
-        )
 
     @cached_property
     def people(self) -> set[str]:
@@ -83,9 +45,49 @@ class Member:
         return self.key.partition("-")[2]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Grading(Member):
+    """What one submission came to by itself, before it is compared with the others.
+
+    Attributes
+    ----------
+    status : `failed` where it could not be graded.
+    settled : False where a limit or a crash ended it: another run tries again.
+    grade : `grade.json` without what other submissions add (shared data, overrides).
+    findings : what the checks found, as `judge.reweigh` keeps it, "" where it failed.
+    figures : (file name, SVG) for the feedback.
+    detail : for whoever mends the grader: the traceback of an error of its own, or "".
+    lacks_room : the disk was full. It concerns this run alone: the gradebook does not keep it.
+    """
+
+    status: Literal["graded", "failed"]
+    settled: bool = True
+    days_late: float = 0.0
+    grade: str
+    findings: str = ""
+    figures: tuple[tuple[str, str], ...] = ()
+    detail: str = ""
+    lacks_room: bool = False
+
+    @property
+    def member(self) -> Member:
+        """What a batch itself needs of a grading: all else stays in the book."""
+        return Member(**{own.name: getattr(self, own.name) for own in fields(Member)})
+
+
 def person(author: str) -> str:
     """Return an author's id without what people type one way today and another tomorrow."""
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
+
+
+def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
+    """Whether what was given to some people still concerns a submission of these authors.
+
+    A submission that cannot be read names no authors: then its name decides.
+    """
+    if not authors or not given:
+        return True
+    return not set(map(person, authors)).isdisjoint(map(person, given))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ teams, the planted code for nine mistakes of ten and more (`tests/statistics/tes
 `benchmarks/grading.py`). Shares are relative, "high over low" is of a reference's bounds.
 """
 
-from decimal import Decimal
 from fractions import Fraction
 
 # ---------------------------------------- what the recordings say, and whether it is to be trusted
@@ -23,11 +22,6 @@ FITTED_TO_NOTHING = 10.0  # factor: … of a final gain, which is fitted to what
 SAME_STEP = 0.2  # relative: two steps that a bench treats alike
 BY_SIZE = 1.1  # factor: gains of steps of two sizes that differ so much are told by the size
 READ_BY_EYE = 1.1  # factor: a resonance or null read off the dwells
-# Friction and the like remain whatever the springs: of χ², a missing spring leaves many times more.
-SPRING_EXPLAINS = 10.0
-# A spring is there where it is so many standard errors from none, these as wide as what the fit
-# leaves, and such a share of the stiffest: a delay or friction is easily taken for a weak one.
-SPRING_SIGMAS, SPRING_SHARE = 10.0, 0.02
 
 # ------------------------------------------------ from where on a number is worth a remark, percent
 
@@ -39,10 +33,6 @@ OFF_EACH_OTHER = 25.0  # the sum of what the two tables may be off, and some mor
 CONFIRMED = 0.05  # share: the other table says the same
 SIGMAS = 3.0  # standard errors of the recordings' own number that are no mistake
 
-# An order may be broken by so much: fitted numbers are good to some percent, and first estimates of
-# resonances and nulls are read off a plot.
-ORDER_FINAL, ORDER_INITIAL = 1.1, 1.2
-
 # ---------------------------------------------- how near a mistake must come to a number, as share
 
 READ = 0.03  # of a gain or frequency: an honest reading after one slip
@@ -52,15 +42,11 @@ BLURRED = 0.05  # of a gain where the carts stick
 DAMPING = 0.2
 LOG10_DAMPING = 0.3  # beside which no other mistake of a damping lies as near
 UNMISTAKABLE, FAR = 0.1, 4.0  # by a factor that is nothing else's, from so much on
-EARLY = 0.06  # of a fit to early amplitudes: a student's weighs the points its own way
-EARLY_MET = 0.65  # of its numbers: a wrong response has no exact fit, so not every one is met
-EARLY_NEW, EARLY_NEW_DAMPING = 0.12, 0.5  # moved by less, the right number would be met as well
 NEAR, NEAR_BY_EYE = 0.1, 0.3  # an honest first estimate, with a mistake in it or without
 TURN_OFF = 0.06  # another extremum of the step as near to a gain as this says nothing
 
 VAGUE = 3.0  # high over low: what any mistake would meet tells of none
 BLURRED_DAMPING = 1.3  # … such a damping tells no story of a period miscounted
-OWN_FINAL = Decimal("1.5")  # … and no logarithm to base 10 nearer than so to its own final value
 SHARP = 1.05  # … a reference that friction does not blur
 
 # ------------------------------------------- which of several mistakes is believed: likelihoods
@@ -69,35 +55,14 @@ SHARP = 1.05  # … a reference that friction does not blur
 USUAL_GAIN, USUAL_FREQUENCY, USUAL_BY_EYE, USUAL_DAMPING = 0.01, 0.004, 0.06, 0.2
 ANYWHERE = 3.0  # e-folds in which a number lies that is off and nothing explains
 ONE_IN_OFF, ONE_IN_KNOWN = 20, 10  # numbers off with nothing to explain it; tables with a mistake
-MARGIN = 2.0  # e-folds: of two explanations the other is out where it is so much less likely
 ONE_OF_SEVERAL = 5  # who miscounts one decay miscounts the others; once in so many not
 ODD = 20  # a period miscounted for ω alone, where δ is of the same peaks: one in so many
-
-# ------------------------------------------------------- final estimates copied from the initial
-
-# How far an initial and a final estimate of one number usually lie apart: where the recordings
-# leave no doubt, and where they do.
-APART, APART_BLURRED = 0.003, 0.01
-APART_DAMPING, APART_DAMPING_BLURRED = 0.03, 0.15
-NO_DOUBT, NO_DOUBT_DAMPING = 1.01, 1.05  # high over low of a reference without doubt
-SLIPPED = 0.2  # a number measured further off is wrong by a slip, maybe in both tables
-SURPRISE = 3.0  # at most so much (e-folds) does the wrong number tell, as some fit badly
-NORMAL = 3.5  # one over the density of a normal difference at zero, √(4π)
-COINCIDENCE = 3e-3  # the chance of a table that a fit gave agreeing so
-COPIED = 0.75  # of the numbers in both tables
 
 # --------------------------------------------------------------------- the reduced table of ratios
 
 SAME_FREQUENCY = 0.02  # a row of the table is of this dwell
-RATIO = 0.06  # a ratio read off the right way, or by one slip
 MOST_ROWS, ENOUGH_ROWS = 0.8, 0.6  # met by a slip; met as they stand: right but for odd rows
-FEWEST_ROWS = 4  # fewer single nothing out
 LEAST_COUNTS = 20.0  # encoder steps: smaller amplitudes are not read well
-TABLE_OFF = 1.3  # factor, median over the rows: a table wrong by an unknown slip
-
-# ----------------------------------------------------------------------------------- recordings
-
-OTHER_RUN = 0.08  # a stated frequency further from that of the input is another run's
 
 # ------------------------------------------------------------------------------- the state model
 
@@ -115,15 +80,11 @@ HONEST, HONEST_DAMPING, HONEST_SIGMAS = 0.01, 0.1, 2.0
 # At most so much of a criterion is kept by a model or a controller that would break the bench, or
 # move it the wrong way: all its other numbers are of no use then.
 KEPT_IF_HARMFUL = Fraction(1, 4)
-# Growth per second over the largest eigenvalue: less is what a computer leaves of a free body.
-GROWS = 1e-6
 
 # -------------------------------------------------------------------------------- the controller
 
 # Where a controller is wrong rather than a matter of taste or of the model's error.
 OVERSHOOT, SETTLING = 20.0, 2.0  # percentage points above the goal; times the goal
 CLAIM_OVERSHOOT, CLAIM_SETTLING = 12.0, 1.6
-OTHER_GAINS = 2.5  # times: claims so far off are of other gains, whatever the prefilter
 PREFILTER, PREFILTER_BLURRED = 0.10, 0.20
 PREFILTER_SIGMAS = 2.0  # of the fitted static gains, which a prefilter may be off by
-SAME_GAINS = 0.02  # of the largest of its kind: typed again with fewer digits

@@ -2,14 +2,15 @@
 
 from decimal import Decimal
 from fnmatch import fnmatchcase
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, Field, create_model
 
+from pipeline.grading.grade import CODES, Code
 from pipeline.names import parameter_names
-from pipeline.results_of_runs import Kind
-from pipeline.schemas.grade import Code
-from pipeline.submission import Design, System
+from pipeline.results import Kind
+from pipeline.submission import Design, Students, System
+from pipeline.submission.models import TomlTable
 
 Points = Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)]
 Percent = Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)]
@@ -19,11 +20,7 @@ Step = Annotated[float, Field(ge=0.01, le=1000, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class RequiredRuns(_Model):
+class RequiredRuns(TomlTable):
     """So many experiments of a kind; `carts` are the carts free in it, default: all."""
 
     kind: Kind
@@ -31,7 +28,7 @@ class RequiredRuns(_Model):
     at_least: Count = 1
 
 
-class Required(_Model):
+class Required(TomlTable):
     """What must be handed in: runs, parameters (`K_*` is a pattern), the further tables."""
 
     experiments: tuple[RequiredRuns, ...] = ()
@@ -41,7 +38,7 @@ class Required(_Model):
     feedback: tuple[Literal["gains", "prefilter", "overshoot_percent", "settling_time"], ...] = ()
 
 
-class Late(_Model):
+class Late(TomlTable):
     """Points lost to lateness: `percent_per_day` of those earned, after the days of grace.
 
     `due` is the deadline, where the platform says when something was handed in.
@@ -53,7 +50,17 @@ class Late(_Model):
     most_percent: Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)] = 100.0
 
 
-class FlagCosts(_Model):
+class FlagCosts(
+    create_model(
+        "_Costs",
+        __base__=TomlTable,
+        **dict[str, Any](
+            (code, (Share, 0.5 if code == "wrong_state_space" else 0.0))
+            for code in CODES
+            if code != "shared_data"
+        ),
+    )
+):
     """By code, the least share of its criterion's points that a remark costs.
 
     The tolerances already weigh each wrong number. But one wrong entry among the many of A and B
@@ -61,31 +68,12 @@ class FlagCosts(_Model):
     `shared_data` is a copy is for a person to say, who gives the points by hand.
     """
 
-    hz_for_rad_s: Share = 0.0
-    peak_count: Share = 0.0
-    peak_for_steady_state: Share = 0.0
-    peak_to_peak: Share = 0.0
-    transient_used: Share = 0.0
-    carts_swapped: Share = 0.0
-    counts_for_length: Share = 0.0
-    log10_for_ln: Share = 0.0
-    no_fit_done: Share = 0.0
-    final_off: Share = 0.0
-    initial_off: Share = 0.0
-    initial_final_disagree: Share = 0.0
-    physically_impossible: Share = 0.0
-    wrong_state_space: Share = 0.5
-    wrong_gains: Share = 0.0
-    wrong_prefilter: Share = 0.0
-    missing: Share = 0.0
-    data_problem: Share = 0.0
-
     def of(self, code: Code) -> float:
         """Return what the remark of a code costs."""
         return getattr(self, code, 0.0)
 
 
-class _Criterion(_Model):
+class _Criterion(TomlTable):
     """What every criterion has; `requires` are criteria that must not have failed before it."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")]
@@ -215,7 +203,7 @@ Criterion = Annotated[
 ]
 
 
-class Rubric(_Model):
+class Rubric(TomlTable):
     """A validated rubric.
 
     Attributes
@@ -225,6 +213,7 @@ class Rubric(_Model):
     anonymous : names stay out of what is written unless asked for.
     examples : submission folders handed out with the task, from the rubric's own folder: their
         recordings may stand in anybody's submission.
+    students : what they see at the desk of a lab server, where its list of users names the rubric.
     """
 
     version: Literal[1]
@@ -237,12 +226,13 @@ class Rubric(_Model):
     flags: FlagCosts = FlagCosts()
     anonymous: bool = False
     examples: tuple[str, ...] = ()
+    students: Students = Students()
     criteria: tuple[Criterion, ...]
 
     @property
     def names(self) -> list[str]:
         """The parameters of the system, in the order of the paper's tables."""
-        return parameter_names(self.system.carts, rigid=self.system.rigid)
+        return parameter_names(self.system.carts, rigid=self.system.bench.rigid)
 
     @property
     def out_of(self) -> float:
@@ -253,8 +243,3 @@ class Rubric(_Model):
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
     """Return the names that fit one of the patterns, in their own order."""
     return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]
-
-
-def is_damping(name: str) -> bool:
-    """Whether a parameter is a damping, which no method measures as well as a frequency."""
-    return name.startswith(("zeta", "damping"))

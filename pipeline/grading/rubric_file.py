@@ -12,10 +12,10 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from pipeline import submission
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric
 from pipeline.grading.rubric import InitialFinal, Parameters, Rubric, matching
+from pipeline.names import read_name
 from pipeline.resources import RUBRICS
 from pipeline.submission.complaints import (
     Location,
@@ -34,17 +34,6 @@ _CHECKS: dict[str, type[BaseModel]] = {
     check: model
     for model in get_args(get_args(rubric.Criterion)[0])
     for check in get_args(model.model_fields["check"].annotation)
-}
-_TABLES: dict[str, type[BaseModel]] = {
-    "system": submission.System,
-    "system.input": submission.Input,
-    "system.position": submission.Position,
-    "design": submission.Design,
-    "required": rubric.Required,
-    "required.experiments": rubric.RequiredRuns,
-    "late": rubric.Late,
-    "flags": rubric.FlagCosts,
-    **{f"criteria.{check}": model for check, model in _CHECKS.items()},
 }
 _OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # the keys that every check has
 # Values that contradict nothing, for those that are wrong or missing.
@@ -68,6 +57,12 @@ def load_rubric(path: Path) -> Rubric:
         shipped = nearest(path.stem, sorted(p.stem for p in RUBRICS.glob("*.toml")))
         raise ConfigError(f"{path}: there is no such rubric{shipped}")
     return parse_rubric(rubric_source(path), where=path.name)
+
+
+def shipped_rubric(carts: int) -> Rubric | None:
+    """Return the shipped rubric for so many carts, if there is one."""
+    path = RUBRICS / f"throne-{carts}dof.toml"
+    return load_rubric(path) if path.is_file() else None
 
 
 def rubric_source(path: Path) -> str:
@@ -100,7 +95,7 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
     ------
     InvalidRubric : with every mistake, its line, its key and what was expected.
     """
-    read = read_toml(text, tables=_TABLES)
+    read = read_toml(text, root=Rubric)
     problems = list(read.slips)
     if read.document or not problems:
         lost = set(_ID.findall(text)) if problems else set()
@@ -201,7 +196,7 @@ def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
     """Return where a pydantic error is, without what is no key of the file, and what it says."""
     return _Complaint(
         at=without_tag(error["loc"], document),
-        what=explain(error, document, tables=_TABLES, top_level=tuple(Rubric.model_fields)),
+        what=explain(error, document, root=Rubric),
         missing=error["type"] == "missing",
     )
 
@@ -293,14 +288,14 @@ def _contradictions(
 
 def _nearest(pattern: str, names: Sequence[str]) -> str:
     """Return what may be meant: a pattern where one was typed, else a parameter."""
-    patterns = [f"{name.partition('_')[0]}_*" for name in names if "_" in name]
+    patterns = [f"{read.symbol}_*" for read in map(read_name, names) if read.suffix]
     return nearest(pattern, list(dict.fromkeys(patterns)) if "*" in pattern else names)
 
 
 def _line_of(text: str, at: Location) -> int:
     """Return the line of a key, or that of the nearest table around it."""
     best, line = 0, 1
-    for number, path in _paths(text):
+    for number, path in key_lines(text):
         depth = 0
         while depth < min(len(path), len(at)) and path[depth] == at[depth]:
             depth += 1
@@ -309,7 +304,7 @@ def _line_of(text: str, at: Location) -> int:
     return line
 
 
-def _paths(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
+def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
     """Yield (line, path) of every table heading and every key that begins a line."""
     table: tuple[int | str, ...] = ()
     counts: dict[str, int] = {}

@@ -7,9 +7,9 @@ from pipeline.grading.rubric import (
     Parameters,
     Required,
     Rubric,
-    is_damping,
     matching,
 )
+from pipeline.names import read_name
 from pipeline.report.render.html import render_text
 from pipeline.submission.load import spring_names
 
@@ -34,10 +34,10 @@ def rubric_text(rubric: Rubric) -> str:
         return matching(patterns, rubric.names)
 
     def dampings(criterion: Parameters | InitialFinal) -> bool:
-        return any(map(is_damping, named(criterion.parameters)))
+        return any(read_name(name).is_damping for name in named(criterion.parameters))
 
     def others(criterion: Parameters | InitialFinal) -> bool:
-        return not all(map(is_damping, named(criterion.parameters)))
+        return not all(read_name(name).is_damping for name in named(criterion.parameters))
 
     springs = zip(spring_names(rubric.system.carts), rubric.system.springs, strict=True)
     return render_text(

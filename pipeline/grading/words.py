@@ -1,6 +1,6 @@
 """The grading in words: `templates/words/grading.toml`, and how points are shown."""
 
-from pipeline.report.phrases import phrases
+from pipeline.words.phrases import phrases
 
 WORDS = phrases("grading")
 

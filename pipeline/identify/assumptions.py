@@ -5,13 +5,13 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.checks.carts import VANISHING, physical_values
+from pipeline.checks.carts import physical_values
 from pipeline.ingest.columns import is_count
 from pipeline.ingest.read import DUTY_COUNT, Ingested
-from pipeline.names import listed
-from pipeline.results import SIGN, Assumption, ChainFit, Check, Record
+from pipeline.results import Assumption, ChainFit, Check, Record
 from pipeline.submission import Submission, System
 from pipeline.submission.load import spring_names
+from pipeline.words.numbers import abridge
 
 Support = Literal["supported", "contradicted", "open"]
 
@@ -36,9 +36,9 @@ def _springs(
     n, names = system.carts, spring_names(system.carts)
     springs = [any(system.springs)] if n == 1 else system.springs
     abouts = [" and ".join(names)] if n == 1 else names  # of one cart the sum is known
-    values = physical_values(fit.chain, springs=system.springs) if fit else {}
-    vanishing = {check.about for check in failed if check.kind == VANISHING}
-    unit = f"{system.input.unit}/{system.position.unit}"
+    values = physical_values(fit.chain, bench=system.bench) if fit else {}
+    vanishing = {check.parameter for check in failed if check.kind == "vanishing"}
+    unit = system.bench.units.stiffness
     for i, (about, present) in enumerate(zip(abouts, springs, strict=True), start=1):
         name = f"k_{i}"
         value = values.get(name)
@@ -85,7 +85,7 @@ def _units(
         if doubt := doubts.get(f"{role}_unit") or doubts.get(f"{role}_scale"):
             support, reason = "contradicted", doubt
         elif headed:
-            support, reason = "supported", f"the headings of {listed(headed)} state a unit"
+            support, reason = "supported", f"the headings of {abridge(headed)} state a unit"
         elif role == "position" and is_count(side.unit) and records:
             support, reason = "supported", "the positions are whole numbers, as counts are"
         else:
@@ -130,13 +130,13 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     sign = stated or usual
     told = [name for name, found in data.signs.found.items() if found == sign]
     others = [name for name, found in data.signs.found.items() if found == -sign]
-    wrong = next((check.message for check in failed if check.id == SIGN), "")
+    wrong = next((check.message for check in failed if check.kind == "input"), "")
     support: Support = "open"
     if wrong:
         support, reason = "contradicted", wrong
     elif told:
-        but = f", but {listed(others)} {'count' if others[1:] else 'counts'} the other way"
-        support, reason = "supported", f"{listed(told)} tell it{but if others else ''}"
+        but = f", but {abridge(others)} {'count' if others[1:] else 'counts'} the other way"
+        support, reason = "supported", f"{abridge(told)} tell it{but if others else ''}"
     else:
         reason = "no recording tells it"
     yield Assumption(
@@ -155,7 +155,7 @@ def _free_carts(
     """Yield which carts were free, for all recordings of which the same is said."""
     if n == 1:
         return
-    wrong = {check.about for check in failed if check.kind == "setup"}
+    wrong = {check.run for check in failed if check.kind == "setup"}
     for free in dict.fromkeys(record.free for record in records):
         alike = [record for record in records if record.free == free]
         names = tuple(record.id for record in alike)
@@ -164,12 +164,12 @@ def _free_carts(
         still = [r.id for r in alike if any(_stands_still(r, c) for c in free if c in r.carts)]
         support: Support = "open"
         if contrary := [name for name in names if name in wrong]:
-            support, reason = "contradicted", f"in {listed(contrary)} another cart moves"
+            support, reason = "contradicted", f"in {abridge(contrary)} another cart moves"
         elif still:
-            reason = f"in {listed(still)} a cart said to be free stands still"
+            reason = f"in {abridge(still)} a cart said to be free stands still"
         elif unseen:
             what = "a held cart" if held else "a cart"
-            reason = f"in {listed(unseen)} {what} was not measured"
+            reason = f"in {abridge(unseen)} {what} was not measured"
         else:
             support = "supported"
             reason = "the held carts move little or not" if held else "all carts move"

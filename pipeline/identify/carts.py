@@ -2,28 +2,32 @@
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
-import numpy as np
-
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import between
-from pipeline.identify.fit import Fitted, fit_carts
-from pipeline.identify.log import Log, Progress
-from pipeline.identify.soundness.repeated_numbers import Repeats, compare_repeats
+from pipeline.identify.fit import Fitted, Runs, fit_carts
+from pipeline.identify.log import Log
 from pipeline.ingest.read import Ingested
-from pipeline.names import by_note, listed
+from pipeline.names import parameter_names
 from pipeline.results import (
     ChainFit,
     Estimate,
     FrequencyResponse,
+    Intervention,
     LogDecrement,
+    ParameterRow,
     Record,
     SinePoint,
+    Skipped,
+    Stage,
     StepGain,
 )
-from pipeline.results_of_runs import Intervention
+from pipeline.set_up import Bench
+from pipeline.soundness.repeated_numbers import Repeats, compare_repeats
+from pipeline.stages.compare import compare, why_open
 from pipeline.stages.frequency_response import (
     collect_dwells,
     dwell_fault,
@@ -34,9 +38,11 @@ from pipeline.stages.initial import estimate_initially
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.stages.sine import Dwell
 from pipeline.stages.step_gain import fit_step_gain
-from pipeline.submission import System
+from pipeline.words.numbers import abridge, by_note
+from pipeline.words.phrases import phrases
+from pipeline.words.progress import Progress
 
-UNTIED = "no spring ties the carts to a wall: they rest anywhere and have no static gain"
+_WORDS = phrases("skipped")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -63,7 +69,7 @@ def identify(
     *,
     interventions: Sequence[Intervention],
     without: Set[str],
-    system: System,
+    bench: Bench,
     progress: Progress,
     measured: dict[str, Any],
 ) -> Identified:
@@ -71,54 +77,37 @@ def identify(
 
     `measured` keeps what single records tell, for the next call with other records left out.
     """
-    n, springs, log = system.carts, system.springs, Log(measured=measured)
-    records = [record for record in data.records if record.id not in without]
-    out = [record for record in data.records if record.id in without]
-    driven = _driven(records, n=n, log=log)
+    log = Log(measured=measured)
+    used = [record for record in data.records if record.id not in without]
+    runs = Runs(
+        used=used,
+        left_out=[record for record in data.records if record.id in without],
+        driven=_driven(used, n=bench.n, log=log),
+    )
 
     progress("free decays: logarithmic decrement")
-    decays = _log_decrements(
-        records, out=out, springs=springs, interventions=interventions, log=log
-    )
+    decays = _log_decrements(runs, bench=bench, interventions=interventions, log=log)
     progress("steps: static gains")
-    gains = _step_gains(driven, out=out, system=system, log=log)
+    gains = _step_gains(runs, bench=bench, log=log)
     progress("sine dwells: steady state")
-    sines = _sine_points(records, log=log)
+    sines = _sine_points(used, log=log)
     # What a check says of a decay or a step in full is not said twice.
-    log.warn(
-        by_note(
-            [
-                *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
-                *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
-                *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
-            ]
-        )
-    )
+    notes = [
+        *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
+        *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
+        *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
+    ]
+    log.warn(by_note(notes))
     progress("frequency response")
-    responses = _frequency_response(data, sines=sines, driven=driven, out=out, log=log)
-    resonances = _resonances(responses, system=system, log=log)
-    alone = estimate_initially(carts=n, log_decrements=decays, step_gains=gains)
+    responses = _frequency_response(data, sines=sines, runs=runs, log=log)
+    resonances = _resonances(responses, bench=bench, log=log)
+    alone = estimate_initially(carts=bench.n, log_decrements=decays, step_gains=gains)
 
     progress("fitting all carts at once")
-    fitted = Fitted()
-    if _is_seen(n, records, responses):
-        fitted = fit_carts(
-            responses,
-            records=records,
-            beside=out,
-            driven=driven,
-            initial={**resonances, **alone},
-            n=n,
-            springs=springs,
-            log=log,
-        )
-    else:
-        log.skip("final estimates", f"cart {n} moves in no recording: is `carts = {n}` right?")
-    fit = fitted.fit
-    parameters = fit.parameters if fit and fit.converged else {}
-    repeats = compare_repeats(
-        decays, gains, carts=n, fitted=parameters, dwells=parameters if fitted.by_dwells else {}
-    )
+    fitted = fit_carts(responses, runs=runs, initial={**resonances, **alone}, bench=bench, log=log)
+    parameters = fitted.fit.parameters if fitted.fit and fitted.fit.converged else {}
+    dwells = parameters if fitted.by_dwells else {}
+    repeats = compare_repeats(decays, gains, carts=bench.n, fitted=parameters, dwells=dwells)
     agreed = {name: one for name, one in alone.items() if name not in repeats.undecided}
     return Identified(
         decays=decays,
@@ -129,6 +118,24 @@ def identify(
         initial={**resonances, **agreed},
         fitted=fitted,
         log=log,
+    )
+
+
+def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
+    """Return the initial and final estimates side by side; what the fit leaves open is skipped."""
+    fit, final = found.fit, found.fit.parameters if found.fit else {}
+    if fit and not final:
+        found.log.skip(Stage.NAMED_PARAMETERS, _WORDS.text("untied"))
+    for name, estimate in final.items():
+        if reason := why_open(name, estimate):
+            skip = Skipped(stage=Stage.FINAL_PARAMETER, parameter=name, reason=reason)
+            found.log.skipped.append(skip)
+    return compare(
+        found.initial,
+        final=final,
+        names=list(final) or parameter_names(bench.n, rigid=bench.rigid),
+        bench=bench,
+        fitted_to=fit.experiments if fit else (),
     )
 
 
@@ -146,7 +153,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     runs = [r for r in runs if len(r.free) == n]
     log.warn(
         by_note(
-            (run.id, f"all carts are free, but of {n} only {_counted(run.carts)} was recorded")
+            (run.id, _WORDS.text("carts_unseen", all=n, carts=_counted(run.carts)))
             for run in runs
             if len(run.carts) < n
         )
@@ -154,46 +161,29 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     return runs
 
 
-def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
-    """Whether a cart moves in any recording: a last one that does not may not be there."""
-    return cart in {response.cart for response in responses} or any(
-        cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
-    )
-
-
 def _log_decrements(
-    records: Sequence[Record],
-    *,
-    out: Sequence[Record],
-    springs: Sequence[bool],
-    interventions: Sequence[Intervention],
-    log: Log,
+    runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
     """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
     decays: list[LogDecrement] = []
-    for cart, (before, after) in enumerate(pairwise(springs), start=1):
+    for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):
-            log.skip(f"log decrement, cart {cart}", f"no spring holds cart {cart}: it cannot swing")
+            reason = _WORDS.text("no_spring_at_cart", cart=cart)
+            log.skip(Stage.LOG_DECREMENT, reason, cart=cart)
             continue
-        alone = [r for r in records if r.free == (cart,) and cart in r.carts]
-        runs = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
-        if not runs:
+        alone = [r for r in runs.used if r.free == (cart,) and cart in r.carts]
+        swinging = [r for r in alone if r.kind == "decay"] or [r for r in alone if r.kind == "step"]
+        if not swinging:
             _skip_without(
                 log,
-                f"log decrement, cart {cart}",
-                f"decay in which cart {cart} alone is free" if len(springs) > 2 else "decay",
-                out=[r for r in out if r.free == (cart,) and r.kind in ("decay", "step")],
+                Stage.LOG_DECREMENT,
+                f"decay in which cart {cart} alone is free" if bench.n > 1 else "decay",
+                out=[r for r in runs.left_out if r.free == (cart,) and r.kind in ("decay", "step")],
+                cart=cart,
             )
-        for run in runs:
-            decays += (
-                log.attempt_once(
-                    f"log decrement, {run.id}, cart {cart}",
-                    _decays_between,
-                    between(run, interventions),
-                    cart=cart,
-                )
-                or ()
-            )
+        for run in swinging:
+            find = partial(_decays_between, between(run, interventions), cart=cart)
+            decays += log.attempt_once(Stage.LOG_DECREMENT, find, of=run.id, cart=cart) or ()
     return decays
 
 
@@ -224,33 +214,32 @@ def _sticks(decay: LogDecrement) -> bool:
     return decay.friction is not None and decay.friction.present
 
 
-def _skip_without(log: Log, stage: str, what: str, *, out: Sequence[Record]) -> None:
+def _skip_without(
+    log: Log, stage: Stage, what: str, *, out: Sequence[Record], cart: int | None = None
+) -> None:
     """Note that there is none of some records, or that all of them are left out."""
     if out:
-        log.skip(
-            stage, f"every {what} is left out: {listed([r.id for r in out])} (the checks say why)"
-        )
+        reason = _WORDS.text("all_left_out", what=what, runs=abridge([r.id for r in out]))
+        log.skip(stage, reason, cart=cart)
     else:
-        log.skip(stage, f"no {what} was recorded", missing=f"a {what}")
+        reason = _WORDS.text("none_recorded", what=what)
+        log.skip(stage, reason, cart=cart, missing=f"a {what}")
 
 
-def _step_gains(
-    driven: Sequence[Record], *, out: Sequence[Record], system: System, log: Log
-) -> list[StepGain]:
-    if not system.tied:
-        log.skip("step gain", UNTIED)
+def _step_gains(runs: Runs, *, bench: Bench, log: Log) -> list[StepGain]:
+    if not bench.tied:
+        log.skip(Stage.STEP_GAIN, _WORDS.text("untied"))
         return []
-    runs = [record for record in driven if record.kind == "step"]
-    if not runs:
-        n = system.carts
-        steps = [r for r in out if r.kind == "step" and len(r.free) == n]
-        _skip_without(log, "step gain", "step with all carts free" if n > 1 else "step", out=steps)
+    steps = [record for record in runs.driven if record.kind == "step"]
+    if not steps:
+        out = [r for r in runs.left_out if r.kind == "step" and len(r.free) == bench.n]
+        what = "step with all carts free" if bench.n > 1 else "step"
+        _skip_without(log, Stage.STEP_GAIN, what, out=out)
     gains = []
-    for run in runs:
+    for run in steps:
         for cart in run.carts:
-            gain = log.attempt_once(
-                f"step gain, {run.id}, cart {cart}", fit_step_gain, run, cart=cart
-            )
+            fit = partial(fit_step_gain, run, cart=cart)
+            gain = log.attempt_once(Stage.STEP_GAIN, fit, of=run.id, cart=cart)
             if gain:
                 gains.append(gain)
     return gains
@@ -261,50 +250,44 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
     for run in records:
         dwell = Dwell(run)
         for cart in run.carts if run.kind == "sine" else ():
-            stage = f"sine steady state, {run.id}, cart {cart}"
-            point = log.attempt_once(stage, dwell.fit, cart=cart)
+            fit = partial(dwell.fit, cart=cart)
+            point = log.attempt_once(Stage.SINE, fit, of=run.id, cart=cart)
             if point and (fault := dwell_fault(point)):
-                log.skip(stage, fault)
+                log.skip(Stage.SINE, fault, run=run.id, cart=cart)
             elif point:
                 points.append(point)
     return points
 
 
 def _frequency_response(
-    data: Ingested,
-    *,
-    sines: Sequence[SinePoint],
-    driven: Sequence[Record],
-    out: Sequence[Record],
-    log: Log,
+    data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, log: Log
 ) -> Sequence[FrequencyResponse]:
     """From dwells; else from the students' own table; else from steps and sweeps."""
     if sines:
         return collect_dwells(sines)
     if data.tables:
         return data.tables
-    if not any(record.kind == "sine" and record not in out for record in data.records):
-        dwells = [r for r in out if r.kind == "sine"]
-        _skip_without(log, "sine steady state", "sine dwell", out=dwells)
-    if not driven:
-        log.skip(
-            "frequency response",
-            "no usable dwell, no table, and no step or sweep with all carts free to take it from",
-        )
+    if not any(record.kind == "sine" for record in runs.used):
+        dwells = [r for r in runs.left_out if r.kind == "sine"]
+        _skip_without(log, Stage.SINE, "sine dwell", out=dwells)
+    if not runs.driven:
+        log.skip(Stage.FREQUENCY_RESPONSE, _WORDS.text("no_response"))
         return ()
-    responses = log.attempt("frequency response", response_from_records, driven)
+    from_runs = partial(response_from_records, runs.driven)
+    responses = log.attempt(Stage.FREQUENCY_RESPONSE, from_runs)
     if responses:
         used = {run for response in responses for run in response.experiments}
-        kinds = {record.kind for record in driven if record.id in used}
-        runs = " and ".join(f"{kind} records" for kind in ("step", "sweep") if kind in kinds)
-        log.warn([f"the frequency response comes from the {runs}, not from dwells"])
+        kinds = {record.kind for record in runs.driven if record.id in used}
+        said = " and ".join(f"{kind} records" for kind in ("step", "sweep") if kind in kinds)
+        log.warn([_WORDS.text("response_from", runs=said)])
     return responses or ()
 
 
 def _resonances(
-    responses: Sequence[FrequencyResponse], *, system: System, log: Log
+    responses: Sequence[FrequencyResponse], *, bench: Bench, log: Log
 ) -> dict[str, Estimate]:
-    if not system.tied:
-        log.skip("resonances", f"{UNTIED}, and the slowest mode is no resonance")
+    if not bench.tied:
+        log.skip(Stage.RESONANCES, _WORDS.text("untied_modes"))
         return {}
-    return log.attempt("resonances", find_resonances, responses, n=system.carts) or {}
+    find = partial(find_resonances, responses, n=bench.n)
+    return log.attempt(Stage.RESONANCES, find) or {}

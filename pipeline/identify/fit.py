@@ -2,18 +2,23 @@
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from pipeline.estimation.chain.follow import Followed, find_misread, follow, most_follow, near
-from pipeline.identify.limits import CONTRARY
 from pipeline.identify.log import Log
-from pipeline.identify.soundness.other_readings import without_lone_factors
 from pipeline.names import own_zeta
-from pipeline.results import ChainFit, Estimate, FrequencyResponse, LeftOut, Record
+from pipeline.results import ChainFit, Estimate, FrequencyResponse, Record, Stage
+from pipeline.set_up import Bench
+from pipeline.soundness.fault import RecordingFault
+from pipeline.soundness.other_readings import without_lone_factors
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.stages.limits import FEW_COUNTS
+from pipeline.stages.sine import FEW_COUNTS
 from pipeline.stages.time_fit import fit_records
+from pipeline.words.phrases import phrases
+
+_WORDS = phrases("skipped")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,72 +36,59 @@ class Fitted:
     fit: ChainFit | None = None
     fits: Mapping[str, Followed] = field(default_factory=dict)
     by_dwells: bool = False
-    conflict: Mapping[str, LeftOut] = field(default_factory=dict)
+    conflict: Mapping[str, RecordingFault] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Runs:
+    """The records of a submission, as one round of identification takes them.
+
+    Attributes
+    ----------
+    used : to identify the carts; `left_out` are not, but they are held against the fit.
+    driven : of those used, the steps and sweeps of all carts together.
+    """
+
+    used: Sequence[Record]
+    left_out: Sequence[Record]
+    driven: Sequence[Record]
 
 
 def fit_carts(
     responses: Sequence[FrequencyResponse],
     *,
-    records: Sequence[Record],
-    beside: Sequence[Record],
-    driven: Sequence[Record],
+    runs: Runs,
     initial: dict[str, Estimate],
-    n: int,
-    springs: tuple[bool, ...],
+    bench: Bench,
     log: Log,
 ) -> Fitted:
-    """Return the Bode fit where the records follow it, else the joint fit in time.
-
-    `beside` are records that the fit is made without, but held against.
-    """
+    """Return the Bode fit where the records follow it, else the joint fit in time."""
+    if not _is_seen(bench.n, runs.used, responses):
+        log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("unseen_cart", cart=bench.n))
+        return Fitted()
     has_points = any(response.source != "records" for response in responses)
-    dwells = [record for record in records if record.kind == "sine"]
-    bode = None
-    if has_points:
-        values = {name: estimate.value for name, estimate in initial.items()}
-        fit = log.attempt(
-            "Bode fit",
-            fit_bode,
-            responses,
-            n=n,
-            springs=springs,
-            initial=values,
-            decays=_decay_dampings(initial, n=n),
-        )
-        bode = _held(fit, records, beside)
-    mine = _kinds_that_follow(records, bode) if bode else set()
-    if bode:
-        bode = replace(bode, by_dwells="sine" in mine)
-    if not driven:
-        if bode is None:
-            run = "step or sweep with all carts free" if n > 1 else "step or sweep"
-            log.skip(
-                "final estimates",
-                f"the Bode fit gave none, and there is no {run} to fit them to"
-                if has_points
-                else f"there is no usable sine dwell, no table of amplitude ratios, and no {run}",
-                missing=f"a {run}"
-                if has_points
-                else f"sine dwells over the resonances, or a {run}",
-            )
+    bode = _fit_points(responses, runs, initial, bench, log) if has_points else None
+    if not runs.driven and bode is None:
+        run = "step or sweep with all carts free" if bench.n > 1 else "step or sweep"
+        reason = _WORDS.text("no_run_beside_bode" if has_points else "no_run_no_dwell", run=run)
+        missing = f"a {run}" if has_points else _WORDS.text("dwells_or_run", run=run)
+        log.skip(Stage.FINAL_ESTIMATES, reason, missing=missing)
+    dwells = [record for record in runs.used if record.kind == "sine"]
+    if not runs.driven or (bode and not dwells):
         return bode or Fitted()
-    if bode and not dwells:
-        return bode
-    contrary = bode is not None and bool(_contrary_kinds(records, bode))
+    contrary = bode is not None and bool(_contrary_kinds(runs.used, bode))
     if bode and bode.by_dwells and not contrary and not _is_doubted(bode, dwells):
         return bode
-    other = _held(
-        log.attempt("final estimates", fit_records, driven, n=n, springs=springs), records, beside
-    )
+    to_records = partial(fit_records, runs.driven, bench=bench)
+    other = _held(log.attempt(Stage.FINAL_ESTIMATES, to_records), runs)
     if bode is None or other is None:
         return bode or other or Fitted()
     if other.fit is None or not other.fit.converged:
         return bode
-    theirs = _kinds_that_follow(records, other)
+    mine, theirs = (_kinds_that_follow(runs.used, one) for one in (bode, other))
     if bode.by_dwells and contrary and _votes(mine) == _votes(theirs):
-        conflict = _conflict(records, bode, mine=mine, theirs=theirs)
-        if conflict:
-            log.skip("final estimates", next(iter(conflict.values())).reason)
+        if conflict := _conflict(runs.used, bode, mine=mine, theirs=theirs):
+            log.skip(Stage.FINAL_ESTIMATES, next(iter(conflict.values())).reason)
             return Fitted(conflict=conflict)
     if contrary and _votes(mine) != _votes(theirs):
         better = _votes(mine) < _votes(theirs)
@@ -104,10 +96,36 @@ def fit_carts(
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
-    kinds = {run.kind for run in driven if run.id in other.fit.experiments}
+    kinds = {run.kind for run in runs.driven if run.id in other.fit.experiments}
     used = " and ".join(f"{kind}s" for kind in ("step", "sweep") if kind in kinds)
-    log.warn([f"the fit rests on the {used}: the dwells do not follow one chain"])
+    log.warn([_WORDS.text("fit_rests_on", kinds=used)])
     return other
+
+
+def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
+    """Whether a cart moves in any recording: a last one that does not may not be there."""
+    return cart in {response.cart for response in responses} or any(
+        cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
+    )
+
+
+def _fit_points(
+    responses: Sequence[FrequencyResponse],
+    runs: Runs,
+    initial: Mapping[str, Estimate],
+    bench: Bench,
+    log: Log,
+) -> Fitted | None:
+    """Return the fit to the frequency response, and whether the dwells follow it."""
+    to_points = partial(
+        fit_bode,
+        responses,
+        bench=bench,
+        initial={name: estimate.value for name, estimate in initial.items()},
+        decays=_decay_dampings(initial, n=bench.n),
+    )
+    bode = _held(log.attempt(Stage.BODE_FIT, to_points), runs)
+    return bode and replace(bode, by_dwells="sine" in _kinds_that_follow(runs.used, bode))
 
 
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
@@ -132,10 +150,10 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
     return fitted.fit.explains_data and lost[0] < lost[1]
 
 
-def _held(
-    fit: ChainFit | None, records: Sequence[Record], beside: Sequence[Record]
-) -> Fitted | None:
-    return Fitted(fit=fit, fits=follow([*records, *beside], fit.chain)) if fit else None
+def _held(fit: ChainFit | None, runs: Runs) -> Fitted | None:
+    """Return a fit with how all records follow it."""
+    records = [*runs.used, *runs.left_out]
+    return Fitted(fit=fit, fits=follow(records, fit.chain)) if fit else None
 
 
 def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
@@ -158,7 +176,8 @@ def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
     chain, by_id = fitted.fit.chain, {record.id: record for record in records}
 
     def contrary(name: str) -> bool:
-        return all(fit.share > CONTRARY for fit in near(by_id[name], chain))
+        # Inches in place of centimetres leave 0.37.
+        return all(fit.share > 0.3 for fit in near(by_id[name], chain))
 
     return {
         kind
@@ -178,7 +197,7 @@ def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
 
 def _conflict(
     records: Sequence[Record], fitted: Fitted, *, mine: Set[str], theirs: Set[str]
-) -> dict[str, LeftOut]:
+) -> dict[str, RecordingFault]:
     """Return why kinds that follow a chain and those that follow another may not be used.
 
     None are where no known mistake leads from the one to the other: the carts may be such.
@@ -193,18 +212,15 @@ def _conflict(
         return {}
     example, misread = next(iter(found.items()))
     of_mine, of_theirs = (" and ".join(sorted(kinds)) for kinds in (mine - theirs, theirs - mine))
-    reason = (
-        f"the {of_mine} and the {of_theirs} records contradict one another, and nothing tells "
-        f"which are right (of {example}, if the former are: {misread.words})"
-    )
+    said = {"mine": of_mine, "theirs": of_theirs, "example": example, "look": misread.words}
     return {
-        name: LeftOut(experiment=name, reason=reason, is_wrong=True)
+        name: RecordingFault(code="contradicting_kinds", run=name, said=said)
         for kind in mine ^ theirs
         for name in ids[kind]
     }
 
 
-def _decay_dampings(initial: dict[str, Estimate], *, n: int) -> dict[int, Estimate]:
+def _decay_dampings(initial: Mapping[str, Estimate], *, n: int) -> dict[int, Estimate]:
     """Return by cart the damping ratio it has alone, as far as decays tell."""
     own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
     return {

@@ -2,14 +2,12 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar
 
 from pipeline.errors import DataError
-from pipeline.results import Skipped
+from pipeline.results import Skipped, Stage
 
-P = ParamSpec("P")
 T = TypeVar("T")
-Progress = Callable[[str], None]
 
 
 @dataclass
@@ -18,36 +16,43 @@ class Log:
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    measured: dict[str, Any] = field(default_factory=dict)  # by stage, for `attempt_once`
+    measured: dict[Any, Any] = field(default_factory=dict)  # by stage, run and cart
 
-    def attempt(
-        self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
-    ) -> T | None:
-        """Run one stage; data that do not support it are a reason, not an end."""
+    def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
+        """Run one stage, `of` a recording if of one; data that do not support it are a reason."""
         try:
-            return run(*args, **options)
+            return run()
         except DataError as error:
-            self.skip(stage, str(error))
+            self.skip(stage, str(error), run=of)
             return None
 
-    def attempt_once(
-        self, stage: str, run: Callable[P, T], *args: P.args, **options: P.kwargs
-    ) -> T | None:
+    def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
         """Run a stage of one record, which tells the same whatever others are left out."""
-        if stage not in self.measured:
+        key = stage, of, cart
+        if key not in self.measured:
             try:
-                self.measured[stage] = run(*args, **options)
+                self.measured[key] = run()
             except DataError as error:
-                self.measured[stage] = error
-        found = self.measured[stage]
+                self.measured[key] = error
+        found = self.measured[key]
         if isinstance(found, DataError):
-            self.skip(stage, str(found))
+            self.skip(stage, str(found), run=of, cart=cart)
             return None
         return found
 
-    def skip(self, stage: str, reason: str, *, missing: str = "") -> None:
+    def skip(
+        self,
+        stage: Stage,
+        reason: str,
+        *,
+        run: str = "",
+        cart: int | None = None,
+        missing: str = "",
+    ) -> None:
         """Note why a stage did not run, and what would let it."""
-        self.skipped.append(Skipped(stage=stage, reason=reason, missing=missing))
+        self.skipped.append(
+            Skipped(stage=stage, run=run, cart=cart, reason=reason, missing=missing)
+        )
 
     def warn(self, texts: Iterable[str]) -> None:
         """Add what is not said yet."""

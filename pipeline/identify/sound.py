@@ -8,17 +8,16 @@ from itertools import combinations
 from pipeline.errors import DataError
 from pipeline.estimation.chain.follow import Followed, follow, most_follow
 from pipeline.identify.carts import Identified, identify
-from pipeline.identify.log import Progress
-from pipeline.identify.soundness.encoders import find_other_units, find_stuck
-from pipeline.identify.soundness.faults import find_faults, find_impossible_gains, standing_still
-from pipeline.identify.soundness.other_kind import find_other_kinds
-from pipeline.identify.soundness.repeats import find_outlier_repeats
 from pipeline.ingest.read import Ingested
 from pipeline.plant.linear.chain import Chain
-from pipeline.results import LeftOut
-from pipeline.results_of_runs import Intervention
+from pipeline.results import Intervention, LeftOut
+from pipeline.set_up import Bench
+from pipeline.soundness.against_carts import find_faults, find_impossible_gains, standing_still
+from pipeline.soundness.encoders import find_other_units, find_stuck
+from pipeline.soundness.other_kind import find_other_kinds
+from pipeline.soundness.repeats import find_outlier_repeats
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.submission import System
+from pipeline.words.progress import Progress
 
 _ROUNDS = 4  # of leaving out what the carts found without it show to be wrong
 
@@ -27,7 +26,7 @@ def identify_from_sound(
     data: Ingested,
     *,
     interventions: Sequence[Intervention],
-    system: System,
+    bench: Bench,
     progress: Progress,
 ) -> tuple[Identified, list[LeftOut]]:
     """Identify the carts without the records that they, or their repeats, show to be wrong.
@@ -36,7 +35,6 @@ def identify_from_sound(
     say that it may.
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
-    unit = system.position.unit
     # Shown by input or encoder alone, later by numbers that are gone once they are out.
     shown = {
         **find_other_units(data.records),
@@ -46,26 +44,26 @@ def identify_from_sound(
     contradicted = []
     chain: Chain | None = None
     fits: Mapping[str, Followed] = {}
-    left_out = find_outlier_repeats(driven, unit=unit) | shown
+    left_out = find_outlier_repeats(driven, unit=bench.units.position) | shown
     without = left_out.keys() | standing_still(data.records)
     again = partial(
         identify,
         data,
         interventions=interventions,
-        system=system,
+        bench=bench,
         progress=progress,
         measured={},
     )
     found = again(without=without)
     for _ in range(_ROUNDS):
         # Where nothing is left to identify the carts from, the verdict before stands.
-        chain, fits = _witness(found, data, system=system) or (chain, fits)
+        chain, fits = _witness(found, data, bench=bench) or (chain, fits)
         faults = find_faults(data.records, chain=chain, fits=fits)
         shown |= find_impossible_gains(found.gains)
         shown |= {**found.repeats.odd, **found.fitted.conflict}
         # Most repeats may be the wrong ones: who is odd shows among the others.
         sound = [record for record in driven if record.id not in faults]
-        odd = find_outlier_repeats(sound, unit=unit)
+        odd = find_outlier_repeats(sound, unit=bench.units.position)
         # What says how a record is wrong stands before what says that it is odd.
         doubted = {name: one for name, one in faults.items() if not one.is_wrong}
         left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
@@ -75,20 +73,19 @@ def identify_from_sound(
         contradicted += [
             check
             for check in found.repeats.checks
-            if check.outcome == "fail"
-            and check.id.removeprefix("repeats.") not in found.repeats.undecided
+            if check.outcome == "fail" and check.parameter not in found.repeats.undecided
         ]
         found = again(without=without)
     checks = {check.id: check for check in (*found.repeats.checks, *contradicted)}
     repeats = replace(found.repeats, checks=tuple(checks.values()))
     return (
         replace(found, repeats=repeats),
-        [left_out[record.id] for record in data.records if record.id in left_out],
+        [left_out[record.id].left_out for record in data.records if record.id in left_out],
     )
 
 
 def _witness(
-    found: Identified, data: Ingested, *, system: System
+    found: Identified, data: Ingested, *, bench: Bench
 ) -> tuple[Chain, Mapping[str, Followed]] | None:
     """Return the chain that the records follow, and how; or would, with two columns exchanged."""
     if found.fit and found.fit.converged and most_follow(found.fitted.fits):
@@ -96,11 +93,7 @@ def _witness(
     for i, j in combinations(sorted(response.cart for response in found.responses), 2):
         turned = [replace(r, cart={i: j, j: i}.get(r.cart, r.cart)) for r in found.responses]
         try:
-            fit = fit_bode(
-                sorted(turned, key=lambda response: response.cart),
-                n=system.carts,
-                springs=system.springs,
-            )
+            fit = fit_bode(sorted(turned, key=lambda response: response.cart), bench=bench)
         except DataError:
             continue
         if fit.explains_data:

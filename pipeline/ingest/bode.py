@@ -6,15 +6,15 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest import limits
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.formats.table import Table, refuse_extreme
+from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse
 
+_RATIO_SPREAD = 0.01  # relative standard error of a ratio read off two plots, without repeats
 Points = dict[int, list[tuple[float, float]]]
 
 
-def read_points(table: Table, columns: Mapping[str, Column], *, carts: Sequence[int]) -> Points:
+def read_points(table: FileTable, columns: Mapping[str, Column], *, carts: Sequence[int]) -> Points:
     """Return (omega in rad/s, amplitude ratio) of every row, by cart.
 
     Raises
@@ -46,21 +46,21 @@ def read_points(table: Table, columns: Mapping[str, Column], *, carts: Sequence[
     }
 
 
-def _ratios(table: Table, column: Column) -> Array:
+def _ratios(table: FileTable, column: Column) -> Array:
     if column.unit is not None and column.unit.casefold() == "db":
         with np.errstate(over="ignore"):
             return _measured(10 ** (table.values[column.index] / 20), table, column)
     return _measured(_positive(table, column), table, column)
 
 
-def _measured(values: Array, table: Table, column: Column) -> Array:
+def _measured(values: Array, table: FileTable, column: Column) -> Array:
     """Return positive values that a bench measures, each of them."""
     for extreme in (values.min(), values.max()):
         refuse_extreme(extreme, what=f"{table.source}: {column.name!r}")
     return values
 
 
-def _positive(table: Table, column: Column) -> Array:
+def _positive(table: FileTable, column: Column) -> Array:
     values = table.values[column.index]
     if (values <= 0).any():
         row = int(np.argmax(values <= 0))
@@ -77,7 +77,7 @@ def frequency_responses(
     """Return one response a cart, repeats averaged, and where its standard errors come from.
 
     Rows at one frequency are repeats: their pooled relative spread is the standard error of all
-    points. Without enough of them it is `limits.RATIO_SPREAD`.
+    points. Without enough of them it is 1 %.
     """
     squares, freedom = 0.0, 0
     averaged: dict[int, tuple[Array, Array, Array]] = {}
@@ -89,12 +89,11 @@ def frequency_responses(
         squares += float(((logs - means[which]) ** 2).sum())
         freedom += logs.size - omega.size
         averaged[cart] = (omega, np.exp(means), repeats)
-    spread = (
-        np.sqrt(squares / freedom) if freedom >= limits.ENOUGH_REPEATS and squares > 0 else None
-    )
-    relative = limits.RATIO_SPREAD if spread is None else float(spread)
+    # Degrees of freedom of repeats that show the true spread.
+    spread = np.sqrt(squares / freedom) if freedom >= 3 and squares > 0 else None
+    relative = _RATIO_SPREAD if spread is None else float(spread)
     source = (
-        f"standard errors of the amplitude ratios are taken as {limits.RATIO_SPREAD:.0%}: "
+        f"standard errors of the amplitude ratios are taken as {_RATIO_SPREAD:.0%}: "
         "the table has no repeats to tell"
         if spread is None
         else f"standard errors of the amplitude ratios are {relative:.2%}, from {freedom} repeats"

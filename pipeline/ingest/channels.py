@@ -3,7 +3,8 @@
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.ingest import limits
+
+_MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over its travel
 
 
 def encoder_step(x: Array) -> float:
@@ -17,18 +18,19 @@ def encoder_step(x: Array) -> float:
     if levels.size < 3:
         return 0.0
     distances = np.diff(levels)
-    distances = distances[distances > span / limits.MOST_LEVELS / 2]
+    distances = distances[distances > span / _MOST_LEVELS / 2]
     if distances.size < 2:
         return 0.0
     smallest = distances.min()
     step = float(np.median(distances[distances < 1.5 * smallest]))
     counts = np.cumsum(np.round(distances / step))
     at = np.cumsum(distances)
-    if counts[-1] > limits.MOST_LEVELS:
+    if counts[-1] > _MOST_LEVELS:
         return 0.0
     step = float(counts @ at / (counts @ counts))
     off_grid = distances / step - np.round(distances / step)
-    return step if np.sqrt(np.mean(off_grid**2)) < limits.ON_GRID else 0.0
+    # Of a step, rms: farther off, the values are not multiples of one step.
+    return step if np.sqrt(np.mean(off_grid**2)) < 0.15 else 0.0
 
 
 def mirrors(reference: Array, x1: Array) -> bool:
@@ -42,7 +44,8 @@ def mirrors(reference: Array, x1: Array) -> bool:
         return False
     before, now, copy = x1[moving - 1], x1[moving], reference[moving]
     between = (copy >= np.minimum(before, now) - 1.0) & (copy <= np.maximum(before, now) + 1.0)
-    return bool(np.mean(between) > limits.MIRRORED)
+    # Of the samples in motion.
+    return bool(np.mean(between) > 0.8)
 
 
 def stuck_spans(x: Array) -> list[tuple[int, int]]:
@@ -53,13 +56,16 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     beyond any other move.
     """
     moves = np.abs(np.diff(x))
-    still = [run for run in _runs(moves == 0.0, least=limits.STUCK_SAMPLES) if run[0] > 0]
+    # At rest that long at a turning point a cart moves less than one step.
+    still = [run for run in _runs(moves == 0.0, least=10) if run[0] > 0]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
-    abrupt = limits.ABRUPT * (encoder_step(x) or float(np.median(moving)))
+    # Encoder steps a sample: no cart stops from that speed between two samples.
+    abrupt = 5.0 * (encoder_step(x) or float(np.median(moving)))
     after = [last for _, last in still if last < moves.size]
-    jump = max(abrupt, limits.JUMP * float(np.delete(moves, after).max(initial=0.0)))
+    # Times the fastest other move between two samples: no cart starts so from rest.
+    jump = max(abrupt, 1.5 * float(np.delete(moves, after).max(initial=0.0)))
 
     def is_stuck(first: int, last: int) -> bool:
         on = moves[last : last + 2]  # it may move on between two samples
@@ -86,14 +92,16 @@ def saturation(u: Array) -> float | None:
     a controller that creeps up to its last value do not.
     """
     levels, counts = np.unique(u, return_counts=True)
-    if levels.size <= limits.FEW_LEVELS:
+    # A stepped input, of few levels, is at its extremes by design.
+    if levels.size <= 20:
         return None
     for top, following in ((-1, -2), (0, 1)):
         limit, gap = levels[top], abs(levels[top] - levels[following])
-        if limit == 0.0 or counts[top] < limits.CLIPPED_SHARE * counts[following]:
+        # So many times as often as the next level; the rounded crest of a sine takes it 1.4 times.
+        if limit == 0.0 or counts[top] < 5 * counts[following]:
             continue
         at_limit = u == limit
-        for first, last in _runs(at_limit[:-1] & at_limit[1:], least=limits.CLIPPED_SAMPLES):
+        for first, last in _runs(at_limit[:-1] & at_limit[1:], least=3):
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
             m = last - first + 1

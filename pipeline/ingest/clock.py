@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest import limits
 from pipeline.ingest.columns import Column, conversion
-from pipeline.ingest.formats.table import Table
+from pipeline.ingest.formats.table import FileTable
 
-_FINEST_DECIMAL = 9  # a file that prints time beyond the nanosecond has not rounded it
-_ON_STEP = 0.02  # of a step; a value farther off is no multiple
+SLOW = 0.5  # s between samples; no bench records slower
+FEWEST_SAMPLES = 8  # any estimate needs some
+_GAP = 4.0  # usual intervals without a sample: time is missing
+_ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
 # Rounding steps all stamps lie within; one where nothing but the rounding moves them, more where
 # the clock's ticks are late at times.
-_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * limits.ROUNDING_BAND)
+_BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
 _HAIR = 1e-6  # of a rounding step: what doubles err
 _NO_ROOM = 10 * _HAIR  # a strip this sure of its slope is held by stamps that flicker, not by time
 
@@ -61,10 +62,10 @@ class Clock:
         """Root-mean-square deviation of the intervals (gaps aside) from their median, s."""
         steps = np.diff(self.t)
         usual = np.median(steps)
-        return float(np.sqrt(np.mean((steps[steps < limits.GAP * usual] - usual) ** 2)))
+        return float(np.sqrt(np.mean((steps[steps < _GAP * usual] - usual) ** 2)))
 
 
-def time_stamps(table: Table, column: Column | None, *, sample_rate: float | None) -> Array:
+def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float | None) -> Array:
     """Return the sample times (n,) in s as they stand in the file, or from the stated rate.
 
     Raises
@@ -72,9 +73,9 @@ def time_stamps(table: Table, column: Column | None, *, sample_rate: float | Non
     SubmissionError : too few samples; no time column and no rate (Hz), or one in no unit of time.
     """
     n = table.values.shape[1]
-    if n < limits.FEWEST_SAMPLES:
+    if n < FEWEST_SAMPLES:
         raise SubmissionError(
-            f"{table.source}: expected at least {limits.FEWEST_SAMPLES} samples, found {n}"
+            f"{table.source}: expected at least {FEWEST_SAMPLES} samples, found {n}"
         )
     if column is None:
         if sample_rate is None:
@@ -92,7 +93,7 @@ def time_stamps(table: Table, column: Column | None, *, sample_rate: float | Non
 
 
 def clock_notes(
-    table: Table, column: Column, clock: Clock, *, sample_rate: float | None
+    table: FileTable, column: Column, clock: Clock, *, sample_rate: float | None
 ) -> list[str]:
     """Return what is to be said of the clock behind a time column.
 
@@ -109,7 +110,7 @@ def clock_notes(
             f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
         )
     notes = []
-    if clock.mean_interval > limits.SLOW:
+    if clock.mean_interval > SLOW:
         notes.append(
             f"samples are {clock.mean_interval:.4g} s apart: is {column.name!r} in other units?"
         )
@@ -123,7 +124,8 @@ def clock_notes(
         notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
     if len(clock.gaps) > 3:
         notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
-    if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > limits.RATE_DIFFERS:
+    # Of a stated rate that the time column contradicts.
+    if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > 0.01:
         notes.append(
             f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
             f"{1 / clock.mean_interval:.5g} Hz"
@@ -158,7 +160,7 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
     steps = np.diff(t)
     stopped = int(np.argmax(steps <= 0)) + 1 if (steps <= 0).any() else None
     usual = np.median(steps)
-    gaps = np.flatnonzero(steps > limits.GAP * usual + 1.5 * rounding) + 1 if usual > 0 else ()
+    gaps = np.flatnonzero(steps > _GAP * usual + 1.5 * rounding) + 1 if usual > 0 else ()
     return Clock(
         t=t,
         rounding=rounding,
@@ -171,12 +173,14 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
 
 def decimal_step(values: Array) -> float:
     """Return the largest power of ten (1 s at most) that all values are multiples of, or 0."""
-    for digits in range(_FINEST_DECIMAL + 1):
+    # A file that prints time beyond the nanosecond has not rounded it.
+    for digits in range(10):
         step = 10.0**-digits
         multiples = values / step
         # A double near 1e5 s in steps of 1e-9 s is itself only good to a hundredth of the step.
         rounding = 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(multiples).max()
-        if np.abs(multiples - np.round(multiples)).max() < min(rounding, _ON_STEP):
+        # Of a step; a value farther off is no multiple.
+        if np.abs(multiples - np.round(multiples)).max() < min(rounding, 0.02):
             return step
     return 0.0
 
@@ -227,7 +231,8 @@ def _rounded(stamps: Array) -> _Rounded:
     record = _Rounded(stamps=stamps, rounding=rounding, stretches=(), even=False)
     mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
     steps = np.diff(stamps)
-    if (steps < 0).any() or mean <= 0 or rounding <= limits.WORTH_STRAIGHTENING * mean:
+    # Of the interval: finer rounding of the stamps does no harm.
+    if (steps < 0).any() or mean <= 0 or rounding <= 2e-3 * mean:
         return record
     if np.ptp(steps) <= 1e-6 * mean:
         return replace(record, stretches=((0, stamps.size),), even=True)
@@ -242,23 +247,27 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
         start, end = waiting.pop()
         if _usual(stamps[start:end], rounding).any():
             found.append((start, end))
-        elif end - start >= 2 * limits.SHORTEST_PIECE:
+        # Samples; a fit of fewer leaves the band by chance.
+        elif end - start >= 2 * 32:
             middle = (start + end) // 2
             waiting += [(start, middle), (middle, end)]
     explained = sum(end - start for start, end in found)
-    return tuple(sorted(found)) if explained >= limits.MOSTLY * stamps.size else ()
+    # Share of samples on straight pieces below which the clock itself is uneven.
+    return tuple(sorted(found)) if explained >= 0.8 * stamps.size else ()
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which stamps (n,) lie within the rounding of one line: all but a few late, or none."""
     off = np.abs(_line(stamps) - stamps) / rounding
-    near = off <= limits.ROUNDING_BAND
-    if off.max() <= limits.ROUNDING_REACH and near.mean() >= limits.IN_BAND:
+    near = off <= _ROUNDING_BAND
+    # A rare stamp may be a step off: a late tick, a beat.
+    if off.max() <= 1.5 and near.mean() >= 0.99:
         return near
     # A least-squares line leans where few stamps jump; a strip of the rounding's width does not.
     every = np.ones(stamps.size, dtype=np.bool_)
     low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
-    return every & (low <= high and off.max() < limits.WHOLE_STEP)
+    # Of the rounding step off the line: more is a stamp that did not advance.
+    return every & (low <= high and off.max() < 0.9)
 
 
 def _line(stamps: Array, *, slope: float | None = None) -> Array:

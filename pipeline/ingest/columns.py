@@ -5,7 +5,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.table import Table
+from pipeline.ingest.formats.table import FileTable
 
 _ROLES = (
     ("time", r"t|times?|time ?stamps?|t received|elapsed time"),
@@ -67,7 +67,7 @@ class Column:
         return "duty" in self.name.casefold()
 
 
-def holds_counts(table: Table, column: Column) -> bool:
+def holds_counts(table: FileTable, column: Column) -> bool:
     """Tell encoder counts: whole numbers where the form or the heading speaks of an encoder."""
     return table.whole[column.index] and (table.form != "csv" or column.is_counted)
 
@@ -106,7 +106,7 @@ def _plain_micro(unit: str) -> str:
 
 
 def assign_columns(
-    table: Table, *, explicit: Mapping[str, str | int] | None, free: tuple[int, ...]
+    table: FileTable, *, explicit: Mapping[str, str | int] | None, free: tuple[int, ...]
 ) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the column of each role, and the headings that found none.
 
@@ -140,7 +140,7 @@ def assign_columns(
     return columns, tuple(unused)
 
 
-def _column(table: Table, index: int, role: str) -> Column:
+def _column(table: FileTable, index: int, role: str) -> Column:
     name = table.names[index]
     unit = _UNIT.search(name)
     return Column(role=role, index=index, name=name, unit=(unit[1] or unit[2]) if unit else None)

@@ -15,7 +15,6 @@ from typing import Any, Literal
 import tomlkit
 
 from pipeline.errors import ConfigError, SubmissionError
-from pipeline.ingest import limits
 from pipeline.ingest.channels import never_changes
 from pipeline.ingest.columns import is_count, is_known, position_units
 from pipeline.ingest.folder import (
@@ -26,11 +25,9 @@ from pipeline.ingest.folder import (
     recordings_beside,
     refused,
 )
-from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import ENDINGS
+from pipeline.ingest.formats.recognise import ENDINGS, read_table
 from pipeline.ingest.inspect import NO_CLOCK, Inspection, inspect_file
-from pipeline.names import by_note, first_few
-from pipeline.results_of_runs import Kind
+from pipeline.results import Kind
 from pipeline.submission.edit import (
     append_experiment,
     comment_text,
@@ -42,8 +39,9 @@ from pipeline.submission.load import NAME, leaves, outside, posix, stated_column
 from pipeline.submission.models import MOST_CARTS, MOST_EXPERIMENTS
 from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
+from pipeline.words.numbers import by_note, first_few
 
-_UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
+UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
 _TO_STATE = {  # what a file does not tell
     "columns": "columns = { }    # which is what, by name or number: time, input, x1, …",
     "sample_rate": "sample_rate = 0    # Hz",
@@ -142,18 +140,34 @@ def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]
 
     () stands for all: those of a table of ratios, and where none moves, which says nothing.
     """
-    positions = inspection.positions
-    if inspection.kind == "bode":
-        return (), ()
-    step = max((column.step or 0.0 for column in positions.values()), default=0.0)
-    ranges = {cart: column.high - column.low for cart, column in positions.items()}
-    carts = tuple(cart for cart, travel in ranges.items() if travel > limits.HELD_STEPS * step)
-    little = [cart for cart in carts if ranges[cart] < limits.HARDLY * max(ranges.values())]
-    if inspection.kind == "sine" or not little:  # near a null, a free cart hardly moves
+    carts = _moving(inspection)
+    little = hardly_moving(inspection)
+    if not little:
         return carts, ()
     others = [cart for cart in carts if cart not in little]
     which = " and ".join(map(str, little))
     return carts, (f"cart {which} hardly moves; if it was held: carts = {others}",)
+
+
+def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
+    """Return the carts that move so little that a hand may have held them."""
+    if inspection.kind == "sine":  # near a null, a free cart hardly moves
+        return ()
+    ranges, carts = _ranges(inspection), _moving(inspection)
+    # Of the furthest cart's motion.
+    return tuple(cart for cart in carts if ranges[cart] < 0.05 * max(ranges.values()))
+
+
+def _moving(inspection: Inspection) -> tuple[int, ...]:
+    if inspection.kind == "bode":
+        return ()
+    step = max((column.step or 0.0 for column in inspection.positions.values()), default=0.0)
+    # Encoder steps over a whole record; a cart that is free moves more.
+    return tuple(cart for cart, travel in _ranges(inspection).items() if travel > 2.0 * step)
+
+
+def _ranges(inspection: Inspection) -> dict[int, float]:
+    return {cart: column.high - column.low for cart, column in inspection.positions.items()}
 
 
 def experiment_entry(
@@ -259,7 +273,7 @@ class _Filling:
             full = f"not added: {MOST_EXPERIMENTS} experiments are the most"
             return replace(found, remarks=(*found.remarks, full))
         unsure = (*found.unsure, *_unsure(found, self._n))
-        append_experiment(self._document, entry, remarks=[_UNSURE + one for one in unsure])
+        append_experiment(self._document, entry, remarks=[UNSURE + one for one in unsure])
         carts = found.carts or range(1, self._n + 1)
         held = [
             f"{column.name!r} never changes, so cart {cart} is written as held"
@@ -338,7 +352,7 @@ class _Filling:
         kind = 'kind = ""    # decay, step, sine, sweep, closed_loop or bode?'
         self._document.add(tomlkit.nl())
         needs = [_TO_STATE[key] for key in found.inspection.needs] if found.inspection else []
-        for text in (_UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line, *needs):
+        for text in (UNSURE + why, "[[experiments]]", f"id = {id_}", kind, line, *needs):
             self._document.add(tomlkit.comment(comment_text(text)))
 
 
@@ -372,13 +386,21 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
     return f"a count has no fractions, and {first_few(fractions, 1)} {have} some: is it cm?"
 
 
-def system_doubts(folder: Path) -> tuple[str, ...]:
-    """Return what stands marked as unsure beside a key of `[system]`, each with its key."""
-    system: Any = tomlkit.parse(submission_text(folder).replace("\r\n", "\n")).get("system", {})
+def system_doubts(folder: Path) -> dict[str, str]:
+    """Return what stands marked as unsure beside the keys of `[system]`, by key."""
+    system: Any = _read(folder).get("system", {})
     comments = {key: item.trivia.comment.removeprefix("# ") for key, item in system.value.items()}
-    return tuple(
-        f"{key}: {comment}" for key, comment in comments.items() if comment.startswith(_UNSURE)
-    )
+    return {key: said for key, said in comments.items() if said.startswith(UNSURE)}
+
+
+def experiment_doubts(folder: Path) -> list[tuple[str, ...]]:
+    """Return what stands marked as unsure right below each table of an experiment."""
+    tables: Any = _read(folder).get("experiments", ())
+    return [_marked(table) for table in tables]
+
+
+def _read(folder: Path) -> tomlkit.TOMLDocument:
+    return tomlkit.parse(submission_text(folder).replace("\r\n", "\n"))
 
 
 def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = None) -> None:
@@ -395,14 +417,14 @@ def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = N
 
 def unsure(doubt: str) -> str:
     """Return a comment that marks a doubt, which whoever knows better takes out."""
-    return _UNSURE + doubt
+    return UNSURE + doubt
 
 
 def _marked(table: Any) -> tuple[str, ...]:
     """Return what stands marked as unsure right below a table."""
     own = table.as_string().partition("\n\n")[0]
     lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
-    return tuple(line.removeprefix(_UNSURE) for line in lines if line.startswith(_UNSURE))
+    return tuple(line.removeprefix(UNSURE) for line in lines if line.startswith(UNSURE))
 
 
 def _unsure(found: Found, n: int) -> Iterator[str]:
@@ -457,7 +479,7 @@ def format_found(found: Sequence[Found]) -> str:
         for remark in (
             *one.remarks,
             *filter(None, [one.advice]),
-            *(_UNSURE + unsure for unsure in one.unsure),
+            *(UNSURE + unsure for unsure in one.unsure),
         )
     )
     return "\n".join([*lines, *(f"! {remark}" for remark in said)])

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.mat import is_mat
-from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import ENDINGS
-from pipeline.names import first_few
+from pipeline.ingest.formats.mat_variables import is_mat
+from pipeline.ingest.formats.recognise import ENDINGS, read_table
 from pipeline.submission.load import outside
+from pipeline.words.numbers import first_few
 
-_HEAD = 1000  # bytes that show whether a file is text
-_MOST_NAMED = 4  # in a sentence; the JSON names all
 _DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the rest of it is hidden
 _AS_TEXT = "save the recording as .csv"
 # Forms that are not read but may hold a recording: their names, and the advice to give.
@@ -88,7 +85,8 @@ def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
     about: dict[str, list[str]] = {}
     for file, reason, advice in found:
         about.setdefault("; ".join(filter(None, (reason, advice))), []).append(file)
-    return [f"not read: {first_few(names, _MOST_NAMED)} ({why})" for why, names in about.items()]
+    # In a sentence; the JSON names all.
+    return [f"not read: {first_few(names, 4)} ({why})" for why, names in about.items()]
 
 
 def _not_read(root: Path, name: str) -> NotRead:
@@ -106,7 +104,8 @@ def _not_read(root: Path, name: str) -> NotRead:
 def _is_table(root: Path, name: str) -> bool:
     try:
         with (root / name).open("rb") as file:
-            head = file.read(_HEAD)
+            # Bytes that show whether a file is text.
+            head = file.read(1000)
         if b"\0" in head and not is_mat(head):  # a film may be large
             return False
         read_table(root, name)

@@ -5,13 +5,10 @@ Which way the motor pushes shows in the input, held against the force that cart 
     s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1
 
 holds for every record of a bench with one m, c, k and k', so all records decide s together. No
-derivative is taken: both sides are weighed with a smooth bump that slides along the record, and
-the derivatives fall on the bump (modulating functions). An input that reaches the carts late, by a
+derivative is taken: both sides are weighed with a bump that slides along the record
+(`modulating`). An input that reaches the carts late, by a
 delay or a lag, turns the phases above the resonance so far that such a record alone seems to have
 the other sign; together with the others' inertia and stiffness it does not.
-
-Reference: H. A. Preisig & D. W. T. Rippin, Theory and application of the modulating function
-method, Computers & Chemical Engineering 17, 1993.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,18 +19,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import nnls
 
 from pipeline.arrays import Array
-from pipeline.ingest import limits
-from pipeline.names import listed
+from pipeline.estimation.modulating import bump, motion_period
 from pipeline.results import Record
 from pipeline.submission import Submission
+from pipeline.words.numbers import abridge
 
-_BUMP = np.polynomial.Polynomial.fromroots([0.0] * 4 + [1.0] * 4)  # t⁴ (1 - t)⁴
 _NARROWEST = 8  # samples under a bump
 _BUMPS = 6  # side by side in a record, at least
-_OVERLAP = 6  # steps in which a bump slides on by its width
-_MOST_PLACES = 400  # of the bump in a record
 FEW_NAMES = 6  # more are not listed one by one
-_ROUNDS = 5  # of turning contrary records and fitting again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,10 +98,10 @@ def _say_signs(
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"
     if others := [name for name in searched if signs[name] != usual]:
-        text += f", but {-usual:+d} in {listed(others, most=FEW_NAMES)}"
+        text += f", but {-usual:+d} in {abridge(others, most=FEW_NAMES)}"
     if unsure := [name for name in searched if not found.get(name)]:
         text += (
-            f"; taken from the others where the data do not tell: {listed(unsure, most=FEW_NAMES)}"
+            f"; taken from the others where the data do not tell: {abridge(unsure, most=FEW_NAMES)}"
         )
     return [text]
 
@@ -171,20 +164,20 @@ def _settle(
     rule: Sequence[str],
 ) -> dict[str, int]:
     """Turn what is contrary to the equation of `rule` until nothing is; see `find_signs`."""
-    for _ in range(_ROUNDS):
+    # Of turning contrary records and fitting again.
+    for _ in range(5):
         signs = {name: -said[name] if name in turned else said[name] for name in weighed}
         sign, weights = _bench([weighed[name] for name in rule], [signs[name] for name in rule])
         if sign == 0:
             return {}
         cosines = {name: sign * said[name] * _cosine(w, weights) for name, w in weighed.items()}
-        contrary = {
-            n for n, w in weighed.items() if w.decisive and cosines[n] < limits.SIGN_CONTRARY
-        }
+        contrary = {n for n, w in weighed.items() if w.decisive and cosines[n] < -0.7}
         if contrary == turned:
+            # Of the cosine between an input and the force that the bench's equation gives. A lag
+            # (at most 90°) and any likely delay stay above zero; a log that counts the other way is
+            # near -1.
             return {
-                name: sign * signs[name]
-                if name in turned or cosines[name] > limits.SIGN_TELLS
-                else 0
+                name: sign * signs[name] if name in turned or cosines[name] > 0.3 else 0
                 for name in weighed
             }
         turned = contrary
@@ -206,7 +199,10 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
         share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has the norm one
-        sure = abs(share[0] - share[1]) > limits.SIGN_LEAST + limits.SIGN_SHARE * share.min()
+        # Of the input's power: how much more the other sign must leave unexplained to be ruled out.
+        # Far above what an encoder's steps do; a cart's damping is worth more at every frequency
+        # that moves it.
+        sure = abs(share[0] - share[1]) > 1e-3 + 0.1 * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
             weights = (ahead if share[0] < share[1] else back) / size
@@ -240,18 +236,16 @@ def _weigh(record: Record) -> _Weighed | None:
     grid = np.linspace(t[0], t[-1], t.size)
     u, x, other = (np.interp(grid, t, a - a.mean()) for a in (u, x, other))
     dt = float(grid[1] - grid[0])
-    period = 2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2))  # samples, of a sine
+    period = motion_period(x)
     if not np.isfinite(period):
         return None
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
-    at = (np.arange(width) + 0.5) / width
-    bumps = [_BUMP.deriv(order)(at) / (width * dt) ** order for order in (2, 1, 0)]
-    sides = [(x, bumps[0]), (x, -bumps[1]), (x, bumps[2]), (x - other, bumps[2])]
+    weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width * dt)
+    sides = [(x, bend), (x, -slope), (x, weight), (x - other, weight)]
     last = x.size - width  # place of a bump
-    step = max(width // _OVERLAP, last // _MOST_PLACES, 1)
-    places = np.arange(1, last, step)
-    centred = [sliding_window_view(u, width)[places + shift] @ bumps[2] for shift in (-1, 0, 1)]
-    centred += [sliding_window_view(a, width)[places] @ bump for a, bump in sides]
+    places = np.arange(1, last, max(width // 6, last // 400, 1))
+    centred = [sliding_window_view(u, width)[places + shift] @ weight for shift in (-1, 0, 1)]
+    centred += [sliding_window_view(a, width)[places] @ weights for a, weights in sides]
     early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero drops out
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)

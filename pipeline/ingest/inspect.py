@@ -9,15 +9,14 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest import limits
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import Clock, clock_notes, read_clock
+from pipeline.ingest.clock import SLOW, Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
-from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import FORM_TITLES, Table, Variable
-from pipeline.names import by_note, first_few
-from pipeline.results_of_runs import Kind
+from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
+from pipeline.ingest.formats.table import FileTable, Variable
+from pipeline.results import Kind
 from pipeline.submission.models import MOST_CARTS
+from pipeline.words.numbers import by_note, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
 _MOST_COLUMNS = 16  # spelt out in a sentence
@@ -121,7 +120,6 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     clock = _clock(table, assigned, further) if "frequency" not in assigned else None
     kind, frequency = _guess(table, assigned, clock, further)
     problems += table.notes
-    roles = {column.index: role for role, column in assigned.items()}
     needs = []
     if bare or (kind != "bode" and not any(role[0] == "x" for role in assigned)):
         needs.append("columns")
@@ -130,18 +128,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     return Inspection(
         file=str(path),
         format=FORM_TITLES[table.form],
-        columns=tuple(
-            ColumnInspection(
-                name=name,
-                role=roles.get(i),
-                unit=assigned[roles[i]].unit if i in roles else None,
-                low=float(values.min()) + 0.0,  # never "-0"
-                high=float(values.max()) + 0.0,
-                step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
-                whole=bool(table.whole[i]),
-            )
-            for i, (name, values) in enumerate(zip(table.names, table.values, strict=True))
-        ),
+        columns=_inspect_columns(table, assigned),
         samples=table.values.shape[1],
         duration=float(clock.t[-1] - clock.t[0]) if clock else None,
         rate=1 / clock.mean_interval if clock else None,
@@ -153,6 +140,24 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         needs=tuple(needs),
         variables=table.variables,
         guessed=guessed,
+    )
+
+
+def _inspect_columns(
+    table: FileTable, assigned: Mapping[str, Column]
+) -> tuple[ColumnInspection, ...]:
+    roles = {column.index: role for role, column in assigned.items()}
+    return tuple(
+        ColumnInspection(
+            name=name,
+            role=roles.get(i),
+            unit=assigned[roles[i]].unit if i in roles else None,
+            low=float(values.min()) + 0.0,  # never "-0"
+            high=float(values.max()) + 0.0,
+            step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
+            whole=bool(table.whole[i]),
+        )
+        for i, (name, values) in enumerate(zip(table.names, table.values, strict=True))
     )
 
 
@@ -179,7 +184,7 @@ def _name_them(guessed: Mapping[str, int]) -> str:
     )
 
 
-def _suggest_columns(table: Table) -> dict[str, int]:
+def _suggest_columns(table: FileTable) -> dict[str, int]:
     """Return each role's column, counted from 1; {} without a clock and encoders to be seen.
 
     After the clock come the encoders, which hold whole numbers, the first perhaps a commanded
@@ -206,10 +211,11 @@ def _looks_like_a_clock(values: Array) -> bool:
         return False
     clock = read_clock(values)
     regular = bool(clock.jitter < clock.mean_interval)
-    return clock.stopped is None and limits.QUICK < clock.mean_interval < limits.SLOW and regular
+    # No bench records slower or faster.
+    return clock.stopped is None and 1e-5 < clock.mean_interval < SLOW and regular
 
 
-def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
+def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
     """Return the clock, or None where there is none that runs; what is wrong goes to problems."""
     column, n = columns.get("time"), table.values.shape[1]
     factor = conversion(column.unit, "s") if column else None
@@ -222,7 +228,8 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
     except SubmissionError as error:
         problems.append(str(error).removeprefix(f"{table.source} "))
         return None
-    if not clock.pieces and clock.jitter > limits.UNEVEN * clock.mean_interval:
+    # Of the interval, rms: a clock worth a word.
+    if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
         problems.append(
             f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
             "times are used as they are"
@@ -231,7 +238,7 @@ def _clock(table: Table, columns: Mapping[str, Column], problems: list[str]) -> 
 
 
 def _guess(
-    table: Table, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
+    table: FileTable, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
 ) -> tuple[Kind | None, float | None]:
     """Return the kind of experiment the signals look like, and the frequency of a dwell."""
     if "frequency" in columns:
@@ -272,12 +279,15 @@ def _follows(u: Array, reference: Array) -> bool:
 
 def is_stepped(u: Array) -> bool:
     """Is the input flat between a few edges?"""
-    edges = np.flatnonzero(np.abs(np.diff(u)) > limits.EDGE * np.ptp(u)) + 1
-    if edges.size > limits.MOST_EDGES:
+    # Of the input's range.
+    edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
+    # A sweep has more edges.
+    if edges.size > 20:
         return False
     pieces = np.split(u, edges)
     spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
-    return bool(spread < limits.FLAT * np.ptp(u))
+    # Of the input's range, rms between edges.
+    return bool(spread < 0.03 * np.ptp(u))
 
 
 def line_frequency(t: Array, u: Array) -> float | None:
@@ -287,7 +297,8 @@ def line_frequency(t: Array, u: Array) -> float | None:
     power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2
     peak = int(np.argmax(power))
     line = slice(max(peak - 2, 0), peak + 3)
-    if power[line].sum() < limits.ONE_LINE * power.sum():
+    # Share of the input's power in one spectral line: a dwell.
+    if power[line].sum() < 0.9 * power.sum():
         return None
     centre = float(np.arange(power.size)[line] @ power[line] / power[line].sum())
     return centre / float(t[-1] - t[0]) * (t.size - 1) / t.size

@@ -2,25 +2,24 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest import limits
 from pipeline.ingest.bode import Points, frequency_responses, read_points
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import Clock, clock_notes, read_clocks, time_stamps
+from pipeline.ingest.clock import FEWEST_SAMPLES, Clock, clock_notes, read_clocks, time_stamps
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts, is_count
 from pipeline.ingest.formats.recognise import read_table
-from pipeline.ingest.formats.table import Table, refuse_extreme
+from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.ingest.input_sign import Signs, with_signs
-from pipeline.results import FrequencyResponse, Record
-from pipeline.results_of_runs import HeadingUnit
+from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
+_FEW_COUNTS = 10  # a motor does not move at so few; whole numbers up to it are volts, typed in
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
@@ -62,7 +61,7 @@ def read_data(submission: Submission) -> Ingested:
             f"{submission.folder.resolve().name}/submission.toml: there is no [[experiments]] "
             "table yet; add one for each data file"
         )
-    tables: dict[str, tuple[Table, str]] = {}
+    tables: dict[str, tuple[FileTable, str]] = {}
     opened: list[_Opened] = []
     points: Points = {}
     warnings: list[str] = []
@@ -85,7 +84,7 @@ def read_data(submission: Submission) -> Ingested:
     clocks = read_clocks([o.stamps for o in opened])  # one clock made them all
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
-            records.append(_read_record(one, clock, submission.system))
+            records.append(_read_record(one, clock))
     if len(unreadable) == len(submission.experiments):
         raise SubmissionError(_none_readable(unreadable))
     warnings += _unused_scale(records, submission.system)
@@ -123,11 +122,11 @@ def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
         return []
     return [
         f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
-        f"numbers beyond ±{limits.FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
+        f"numbers beyond ±{_FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
     ]
 
 
-def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
+def _copies(tables: Mapping[str, tuple[FileTable, str]]) -> list[str]:
     """Return a warning for every file that is a copy of another."""
     first: dict[str, str] = {}
     return [
@@ -138,7 +137,7 @@ def _copies(tables: Mapping[str, tuple[Table, str]]) -> list[str]:
 
 
 def _read_bode(
-    table: Table, experiment: Experiment, system: System, points: Points, warnings: list[str]
+    table: FileTable, experiment: Experiment, system: System, points: Points, warnings: list[str]
 ) -> bool:
     """Add the rows of a Bode table to `points`; return whether it can be used."""
     if len(experiment.carts) < system.carts:
@@ -156,7 +155,7 @@ def _read_bode(
     return True
 
 
-def _refuse_cut(table: Table) -> None:
+def _refuse_cut(table: FileTable) -> None:
     if table.cut is not None:
         raise SubmissionError(
             f"{table.source} {table.cut}; the file was cut short: export it again, "
@@ -169,17 +168,23 @@ def _refuse_cut(table: Table) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Opened:
-    """A file, its columns told apart; `positions` by cart, `stamps` (n,) s as they stand in it."""
+    """A file, its columns told apart; `positions` by cart, `stamps` (n,) s as they stand in it.
 
-    table: Table
+    Reading it adds to `notes`, and to `headed` the units that its headings state.
+    """
+
+    system: System
+    table: FileTable
     experiment: Experiment
     columns: dict[str, Column]
     positions: list[Column]
     unused: tuple[str, ...]
     stamps: Array
+    notes: list[str] = field(default_factory=list)
+    headed: list[HeadingUnit] = field(default_factory=list)
 
 
-def _open(table: Table, experiment: Experiment, system: System) -> _Opened:
+def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
     _refuse_cut(table)
     own = experiment.columns or {}
     shared = {
@@ -194,6 +199,7 @@ def _open(table: Table, experiment: Experiment, system: System) -> _Opened:
     )
     _check_carts(table, experiment, positions)
     return _Opened(
+        system=system,
         table=table,
         experiment=experiment,
         columns=columns,
@@ -203,18 +209,18 @@ def _open(table: Table, experiment: Experiment, system: System) -> _Opened:
     )
 
 
-def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
+def _read_record(opened: _Opened, clock: Clock) -> Record:
     """Return the record with the input's scale applied, but not yet a sign that must be found."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
-    positions = opened.positions
-    notes, headed = list(table.notes), list[HeadingUnit]()
+    positions, notes = opened.positions, opened.notes
+    notes += table.notes
     extra = [c.name for role, c in columns.items() if role[0] == "x" and c not in positions]
     if opened.unused or extra:
         notes.append(f"columns not used: {', '.join([*opened.unused, *extra])}")
     if (time := columns.get("time")) is not None:
         notes += clock_notes(table, time, clock, sample_rate=experiment.sample_rate)
     keep = _window(clock, experiment)
-    scales = [_position_scale(table, column, system, notes, headed) for column in positions]
+    scales = [_position_scale(opened, column) for column in positions]
     y = np.array(
         [table.values[c.index] * scale for c, scale in zip(positions, scales, strict=True)]
     )
@@ -222,8 +228,8 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         scale if holds_counts(table, c) else encoder_step(row)
         for c, row, scale in zip(positions, y, scales, strict=True)
     ]
-    u, input_scale = _input(table, columns, experiment, system, notes, headed)
-    reference = _reference(table, columns, experiment, system, notes, headed, keep)
+    u, input_scale = _input(opened)
+    reference = _reference(opened, keep)
     measured = {f"the position of cart {c.cart}": row for c, row in zip(positions, y, strict=True)}
     measured |= {"the input": u, "the reference": reference, "the time": clock.t - clock.t[0]}
     for what, values in measured.items():
@@ -249,11 +255,11 @@ def _read_record(opened: _Opened, clock: Clock, system: System) -> Record:
         notes=tuple(notes),
         position_scale=scales[0],
         input_scale=input_scale,
-        heading_units=tuple(dict.fromkeys(headed)),
+        heading_units=tuple(dict.fromkeys(opened.headed)),
     )
 
 
-def _check_carts(table: Table, experiment: Experiment, positions: list[Column]) -> None:
+def _check_carts(table: FileTable, experiment: Experiment, positions: list[Column]) -> None:
     if not positions:
         raise SubmissionError(
             f"{table.source}: no column is a cart's position; it has {table.headings()}; "
@@ -273,7 +279,8 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         return slice(None)
     start, end = experiment.window
     first, last = float(clock.t[0]), float(clock.t[-1])
-    slack = max(limits.WINDOW_SLACK * (last - first), 2 * clock.mean_interval)
+    # Of the record's length: "to the end" is often typed rounded up.
+    slack = max(0.01 * (last - first), 2 * clock.mean_interval)
     if start < first - slack or end > last + slack:
         raise SubmissionError(
             f"submission.toml: window = [{start:g}, {end:g}] lies outside the data of "
@@ -281,10 +288,10 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         )
     half = 0.5 * clock.rounding if clock.pieces else 1e-9
     inside = np.flatnonzero((clock.t >= start - half) & (clock.t <= end + half))
-    if inside.size < limits.FEWEST_SAMPLES:
+    if inside.size < FEWEST_SAMPLES:
         raise SubmissionError(
             f"submission.toml: window = [{start:g}, {end:g}] holds {inside.size} samples of "
-            f"{experiment.file}, {limits.FEWEST_SAMPLES} are needed"
+            f"{experiment.file}, {FEWEST_SAMPLES} are needed"
         )
     return slice(int(inside[0]), int(inside[-1]) + 1)
 
@@ -292,11 +299,10 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
 # ------------------------------------------------------------------------ units and signs
 
 
-def _position_scale(
-    table: Table, column: Column, system: System, notes: list[str], headed: list[HeadingUnit]
-) -> float:
+def _position_scale(opened: _Opened, column: Column) -> float:
     """Return position units per number in the file."""
-    unit, per_count = system.position.unit, system.position.per_count
+    table, stated = opened.table, opened.system.position
+    unit, per_count = stated.unit, stated.per_count
     if holds_counts(table, column):
         if per_count is not None:
             return per_count
@@ -306,43 +312,30 @@ def _position_scale(
             f"{table.source}: {column.name!r} holds encoder counts; state how many {unit} one "
             f"count is: position = {{ unit = {unit!r}, per_count = … }}"
         )
-    return _unit_scale(column, unit, "position", notes, headed)
+    return _unit_scale(opened, column, unit, "position")
 
 
 def _unit_scale(
-    column: Column,
-    unit: str,
-    role: Literal["position", "input"],
-    notes: list[str],
-    headed: list[HeadingUnit],
+    opened: _Opened, column: Column, unit: str, role: Literal["position", "input"]
 ) -> float:
-    """Return the factor from the heading's unit to the submission's, and say what was done.
-
-    What the heading states joins those `headed`, whether it converts or not.
-    """
+    """Return the factor from the heading's unit to the submission's, and say what was done."""
     factor = conversion(column.unit, unit)
     if column.unit is not None:
         converts = factor is not None
-        headed.append(
+        opened.headed.append(
             HeadingUnit(role=role, heading=column.name, unit=column.unit, converts=converts)
         )
     if factor is None:
         return 1.0
     if factor != 1.0:
-        notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
+        opened.notes.append(f"{column.name!r} was converted from {column.unit} to {unit}")
     return factor
 
 
-def _input(
-    table: Table,
-    columns: Mapping[str, Column],
-    experiment: Experiment,
-    system: System,
-    notes: list[str],
-    headed: list[HeadingUnit],
-) -> tuple[Array | None, float]:
+def _input(opened: _Opened) -> tuple[Array | None, float]:
     """Return the input in input units and the scale used, both without a sign to be found."""
-    column = columns.get("input")
+    table, experiment, stated = opened.table, opened.experiment, opened.system.input
+    column = opened.columns.get("input")
     if column is None:
         if experiment.kind in _NEED_INPUT:
             raise SubmissionError(
@@ -351,7 +344,7 @@ def _input(
             )
         return None, 1.0
     override = experiment.input
-    values, per_count = table.values[column.index], system.input.per_count
+    values, per_count = table.values[column.index], stated.per_count
     in_counts = table.whole[column.index] and (
         table.form in ("bench_log", "bench_mat")
         or column.is_duty
@@ -364,27 +357,20 @@ def _input(
     elif in_counts:
         scale = per_count or DUTY_COUNT
         if per_count is None:
-            notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {system.input.unit}")
+            opened.notes.append(f"{column.name!r} is taken as duty counts of 5/4096 {stated.unit}")
     else:
-        scale = _unit_scale(column, system.input.unit, "input", notes, headed)
+        scale = _unit_scale(opened, column, stated.unit, "input")
     return values * scale, scale
 
 
 def _beyond_volts(values: Array) -> bool:
     """Tell counts from volts typed in: whole numbers, perhaps written "512.0", and large ones."""
-    return bool(np.all(values == np.round(values)) and np.abs(values).max() > limits.FEW_COUNTS)
+    return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 
-def _reference(
-    table: Table,
-    columns: Mapping[str, Column],
-    experiment: Experiment,
-    system: System,
-    notes: list[str],
-    headed: list[HeadingUnit],
-    keep: slice,
-) -> Array | None:
+def _reference(opened: _Opened, keep: slice) -> Array | None:
     """Return the set point of a closed loop: the experiment's own, else the file's column."""
+    table, experiment, columns = opened.table, opened.experiment, opened.columns
     if experiment.kind != "closed_loop":
         return None
     n = table.values[0, keep].size
@@ -400,6 +386,6 @@ def _reference(
         and holds_counts(table, column)
         and mirrors(values, table.values[first.index])
     ):
-        notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
+        opened.notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
         return None
-    return values[keep] * _position_scale(table, column, system, notes, headed)
+    return values[keep] * _position_scale(opened, column)

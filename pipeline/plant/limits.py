@@ -1,6 +1,7 @@
 """The limits that decide what is said of a plant, a loop or an effect, each with its reason."""
 
 HEAVY_DAMPING = 0.3  # of a damping ratio: above it the orders of frequencies may bend
+CALIBRATION = 1e-3  # no teaching bench's encoder and motor are known better than this share
 SETTLING_BAND = 0.02  # of the change in level: the 2 % criterion
 
 # Relative errors of an identified mass or spring, and of a damping, that a design must stand:

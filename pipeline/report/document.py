@@ -8,29 +8,16 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any, Literal
 
-from pipeline.report.math.tree import Math, Term
-from pipeline.report.numbers import at_decimal
+from pipeline import __version__
+from pipeline.words.math import Math
+from pipeline.words.numbers import at_decimal
+from pipeline.words.spans import Span, Spans, plain, spans
 
+_MUCH = 24  # letters of a cell that takes most of the width of a phone
 _LONG = 16  # letters of a value for which a tile is wide
 _WIDE_TILES, _MOST_TILES = 3, 5  # side by side
 
 Tone = Literal["", "good", "bad", "quiet"]
-
-
-@dataclass(frozen=True)
-class Span:
-    """A run of text in one style, a link, or inline mathematics.
-
-    Links of students are http, https or mailto; our own also lead into the page or beside it.
-    """
-
-    text: str
-    style: Literal["plain", "strong", "em", "code"] = "plain"
-    url: str = ""
-    math: Term | None = None
-
-
-Spans = tuple[Span, ...]
 
 
 @dataclass(frozen=True)
@@ -113,6 +100,13 @@ class Table:
     finder: bool = False
     small: bool = False
     kind: str = field(default="table", init=False)
+
+    @property
+    def told(self) -> bool:
+        """Return whether its cells say much: a phone then shows a row as lines, not as columns."""
+        if self.finder or self.small:
+            return False
+        return any(len(plain(cell.text)) > _MUCH for row in self.rows for cell in row)
 
 
 @dataclass(frozen=True)
@@ -203,13 +197,14 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report."""
+    """A whole report; `plots` is a page of plots beside it, "" where there is none."""
 
     title: str
     subtitle: str
     authors: tuple[str, ...]
     sections: tuple[Section, ...]
-    footer: str
+    plots: str = ""
+    footer: str = f"cartlab {__version__}"
 
     def pictures(self) -> tuple[Picture, ...]:
         """Return the figures, in order."""
@@ -230,19 +225,6 @@ def flat(blocks: Iterable[Block]) -> Iterator[Block]:
             yield block
 
 
-def spans(*parts: str | Span | Spans) -> Spans:
-    """Join strings, spans and tuples of spans."""
-    joined: list[Span] = []
-    for part in parts:
-        if isinstance(part, str):
-            joined.append(Span(part))
-        elif isinstance(part, Span):
-            joined.append(part)
-        else:
-            joined.extend(part)
-    return tuple(joined)
-
-
 def paragraph(*parts: str | Span | Spans) -> Paragraph:
     """Return a paragraph of the joined parts."""
     return Paragraph(spans(*parts))
@@ -251,6 +233,18 @@ def paragraph(*parts: str | Span | Spans) -> Paragraph:
 def bullet_list(items: Iterable[Spans]) -> Items:
     """Return a list of one-paragraph items."""
     return Items(tuple((Paragraph(item),) for item in items))
+
+
+def plain_lines(blocks: Iterable[Block]) -> str:
+    """Return paragraphs and lists as lines of plain text."""
+    lines = []
+    for block in blocks:
+        if isinstance(block, Paragraph):
+            lines.append(plain(block.text))
+        elif isinstance(block, Items):
+            items = (inner for item in block.items for inner in item)
+            lines += [f"- {plain(inner.text)}" for inner in items if isinstance(inner, Paragraph)]
+    return "\n".join(lines)
 
 
 def cell(text: str | Spans | Span, tone: Tone = "") -> Cell:
@@ -287,8 +281,3 @@ def as_json(value: Any) -> Any:
     if isinstance(value, tuple):
         return [as_json(item) for item in value]
     return value
-
-
-def plain(text: Spans) -> str:
-    """Return the text alone, for titles, alt texts and attributes."""
-    return "".join(span.text for span in text)

@@ -25,24 +25,20 @@ from pipeline.names import own_zeta, read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
-from pipeline.stages import limits
+from pipeline.set_up import Bench
 
-_STARTS = 8  # random ones, tried where the first does not explain the data
 _START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
 _START_ZETAS = (0.02, 0.3)
 _SEED = 2005  # of the random starts; any, but the same every time
 _NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way there, and at the end
 _EVALUATIONS = 100  # a fit that gets there takes about ten
-_RANK = 1e-8  # smallest singular value over the largest, columns in natural sizes
 _SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
-_WIDENINGS = 3  # fits in turn with the error they call for: it settles to a per cent
 
 
 def fit_bode(
     responses: Sequence[FrequencyResponse],
     *,
-    n: int,
-    springs: Sequence[bool],
+    bench: Bench,
     initial: Mapping[str, float] | None = None,
     decays: Mapping[int, Estimate] | None = None,
     near: Chain | None = None,
@@ -62,7 +58,7 @@ def fit_bode(
 
     Parameters
     ----------
-    springs : (n + 1,) which springs there are.
+    bench : which carts and springs there are.
     initial : named parameters to start from, as far as known.
     decays : by cart, the damping ratio it has alone; used only where the responses put it at zero.
     near : carts like these, fitted before: the one start, in place of all others.
@@ -76,7 +72,7 @@ def fit_bode(
     DataError : too few amplitudes and phases for the parameters, responses that do not determine
         them, or none of the starts leads anywhere.
     """
-    P = Parametrisation(n=n, springs=tuple(springs))
+    P, n = Parametrisation(bench=bench), bench.n
     data = Points.collect(responses, n=n)
     if data.size + data.n_phases <= len(P.names):
         raise DataError(
@@ -84,21 +80,14 @@ def fit_bode(
             f"amplitudes and phases than that, found {data.size} and {data.n_phases}"
         )
     known = {name: value for name, value in (initial or {}).items() if value > 0}
-    like = _stand_in(data, known, n=n, springs=springs)
+    like = _stand_in(data, known, bench=bench)
     if near is None:
-        staged, first = _staged_start(data, known, n=n, springs=springs, like=like)
-        starts = itertools.chain([first], _random_starts(like, P.springs))
+        staged, first = _staged_start(data, known, bench=bench, like=like)
+        starts = itertools.chain([first], _random_starts(like, bench=bench))
     else:
-        staged, starts = None, (physical_start(near, springs=springs),)
+        staged, starts = None, (physical_start(near, bench=bench),)
     best, tried = _fit_from_starts(P, data, starts)
-    remark = ""
-    if data.n_phases:
-        # As few magnitudes as parameters say nothing about what the phases should be.
-        limit = limits.PHASE_AGREES * max(1.0, best.chi_square_per_dof**0.5)
-        if best.dof <= 0 or _phase_misfit(best, data) <= limit:
-            best = _solve(P, data, best.theta, "polar")
-        else:
-            remark = "magnitudes alone: the phases do not agree with them"
+    best, remark = _fit_phases(best, data)
     best, share = _widen(best, data)
     best, used = _hold_vanished(best, data.widened(share), decays or {})
     data = replace(data, decays=used.decays)
@@ -111,14 +100,12 @@ def fit_bode(
 # ---------------------------------------------------------------------- starts
 
 
-def _stand_in(
-    data: Points, known: Mapping[str, float], *, n: int, springs: Sequence[bool]
-) -> Chain:
+def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chain:
     """Return a chain of even carts with the right gain and mean frequency."""
     first = np.flatnonzero(data.cart == np.min(data.cart))
     lowest = first[np.argmin(data.omega[data.at[first]])]
     highest = first[np.argmax(data.omega[data.at[first]])]
-    if n == 1 and not any(springs):
+    if bench.rigid:
         omega = data.omega[data.at[highest]]
         m = 1.0 / (np.exp(data.level[highest]) * omega**2)
         return Chain(m=np.array([m]), c=np.array([0.1 * m * omega]), k=np.zeros(2))
@@ -128,17 +115,17 @@ def _stand_in(
         start.setdefault("omega_a", float(data.omega[data.at[first[np.argmax(speed)]]]))
     if "K" not in known:
         start.setdefault("K_1", float(np.exp(data.level[lowest])))
-    return even_chain(start, n=n, springs=springs)
+    return even_chain(start, bench=bench)
 
 
 def _staged_start(
-    data: Points, known: Mapping[str, float], *, n: int, springs: Sequence[bool], like: Chain
+    data: Points, known: Mapping[str, float], *, bench: Bench, like: Chain
 ) -> tuple[StagedFit | None, Chain]:
     """Fit stage by stage and return the chain it implies, made possible where it is not."""
-    if not any(springs):
+    if not any(bench.springs):
         return None, like
     measured = {}
-    for cart in range(1, n + 1):
+    for cart in range(1, bench.n + 1):
         of = data.of_cart(cart)
         if of.any():
             measured[cart] = LogMagnitude(
@@ -147,18 +134,19 @@ def _staged_start(
                 level=data.level[of],
                 weight=data.level_weight[of],
             )
-    staged = fit_stage_by_stage(measured, n=n, initial=known, like=like)
+    staged = fit_stage_by_stage(measured, n=bench.n, initial=known, like=like)
     implied = recover_chain(staged.gains, staged.tails).chain()
-    return staged, physical_start(implied, springs=springs)
+    return staged, physical_start(implied, bench=bench)
 
 
-def _random_starts(like: Chain, springs: Sequence[bool]) -> Iterator[Chain]:
+def _random_starts(like: Chain, *, bench: Bench) -> Iterator[Chain]:
     rng = np.random.default_rng(_SEED)
-    for _ in range(_STARTS):
+    # Random starts, tried where the first does not explain the data.
+    for _ in range(8):
         m = like.m * np.exp(_START_SPREAD * rng.standard_normal(like.m.shape))
         k = like.k * np.exp(_START_SPREAD * rng.standard_normal(like.k.shape))
         zeta = float(np.exp(rng.uniform(*np.log(_START_ZETAS))))
-        yield physical_start(Chain(m=m, c=like.c, k=k), springs=springs, zeta=zeta)
+        yield physical_start(Chain(m=m, c=like.c, k=k), bench=bench, zeta=zeta)
 
 
 # ------------------------------------------------------------------------ fits
@@ -198,8 +186,6 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
         solution = minimise(
             evaluate,
             theta,
-            residual=lambda both: both[0],
-            jacobian=lambda both: both[1],
             scale="jac",
             tolerance=_NEAR if scale == "log" else _PRECISION,
             max_evaluations=_EVALUATIONS,
@@ -234,13 +220,27 @@ def _fit_from_starts(
     return min(fits, key=lambda fit: fit.chi_square), len(fits) + len(failed)
 
 
+def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
+    """Fit again with the phases, where there are any that agree with the magnitudes."""
+    if not data.n_phases:
+        return fitted, ""
+    # As few magnitudes as parameters say nothing about what the phases should be.
+    # Phases count unless so many times as far off as the magnitudes: a delay or a wrong sign is.
+    limit = 3.0 * max(1.0, fitted.chi_square_per_dof**0.5)
+    if fitted.dof > 0 and _phase_misfit(fitted, data) > limit:
+        return fitted, "magnitudes alone: the phases do not agree with them"
+    return _solve(fitted.parametrisation, data, fitted.theta, "polar"), ""
+
+
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
     """Fit again with the relative error that makes the misfit what the errors allow; 0 if it is."""
     excess = fitted.chi_square_per_dof - 1
-    if data.from_table or excess <= limits.EXCESS_SIGMAS * np.sqrt(2 / fitted.dof):
+    # Standard deviations of χ² above its mean: by chance once in a thousand.
+    if data.from_table or excess <= 3.1 * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
-    for _ in range(_WIDENINGS):
+    # Fits in turn with the error they call for: it settles to a per cent.
+    for _ in range(3):
         share = _missing_share(fitted, data)
         widened = data.widened(share)
         fitted = _solve(fitted.parametrisation, widened, fitted.theta, fitted.scale)
@@ -275,10 +275,11 @@ def _hold_vanished(
     """
     P, chain = fitted.parametrisation, fitted.chain
     sizes = _natural_sizes(P, chain, data)
+    # Of its usual size: a damping or far spring that the data put at zero.
     vanished = [
         name
         for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
-        if value < (0.0 if name == "k_1" else limits.VANISHING * size)
+        if value < (0.0 if name == "k_1" else 1e-4 * size)
     ]
     if not vanished:
         return fitted, data
@@ -292,7 +293,8 @@ def _hold_vanished(
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
         along = replace(data, decays=told)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
-        if both.chi_square < fitted.chi_square + limits.DECAY_AGREES * len(told):
+        # χ² that each decay may add: by chance it is three standard errors off.
+        if both.chi_square < fitted.chi_square + 9.0 * len(told):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
     return _hold_vanished(_solve(held, data, held.pack(chain), fitted.scale), data, {})
@@ -385,7 +387,8 @@ def _covariance(
         sizes = _natural_sizes(Q, chain, data)
         _, J = weighted_residuals(Q, data, scale, Q.physical(chain))
         _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
-        if singular[-1] >= _RANK * singular[0]:
+        # Smallest singular value over the largest, columns in natural sizes.
+        if singular[-1] >= 1e-8 * singular[0]:
             root = (V / singular[:, None]) * sizes
             return Q.names, root.T @ root
     listed = ", ".join(str(cart) for cart in np.unique(data.cart) + 1)

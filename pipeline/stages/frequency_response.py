@@ -21,20 +21,18 @@ from pipeline.names import (
     parameter_names,
 )
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
-from pipeline.stages import limits
 
+_LARGEST_RELATIVE_STD = 0.2  # a record's frequency is kept where the response stands five sigma out
 # Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is
 # good to some 1e-4, and no response changes by more than its error within it.
 _SAME_FREQUENCY = 1e-3
 # No bench measures better; exact data would weigh infinitely.
 _SMALLEST_RELATIVE_STD = 1e-6
 
-_GRID_RATIO = 1.02  # some five lines across the half-power width 2ζω of a mode with ζ = 0.05
 
 # Peaks and nulls
 _CLEAR_FALL = 3.0  # below the low-frequency level: a mode has been passed, twice its frequency
 _LOW_SHARE = 0.7  # of the first resonance: below, a gain can be told from the magnitude
-_SAME_PEAK = 0.15  # of ln(omega): carts share their resonances
 
 
 # ---------------------------------------------------------------------- dwells
@@ -81,7 +79,8 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         groups[-1].append(point)
     rows = []
     for group in groups:
-        extra = np.array([0.0 if p.settled else limits.UNSETTLED_STD for p in group])
+        # A dwell that ends before its steady state is off by a few per cent.
+        extra = np.array([0.0 if p.settled else 0.05 for p in group])
         gain = np.array([p.gain for p in group])
         magnitude, magnitude_std = _weighted_mean(
             gain, np.hypot([p.gain_std for p in group], extra * gain)
@@ -164,7 +163,8 @@ def _grid(runs: Sequence[Record]) -> Array:
     """Return harmonics of the (median) record length, thinned to a constant ratio."""
     base = 2 * np.pi / float(np.median([run.t[-1] - run.t[0] for run in runs]))
     top = max(int(max(visible_band(run) for run in runs) / base), 2)
-    count = int(np.log(top) / np.log(_GRID_RATIO)) + 2
+    # Some five lines across the half-power width 2ζω of a mode with ζ = 0.05.
+    count = int(np.log(top) / np.log(1.02)) + 2
     return base * np.unique(np.rint(np.geomspace(1, top, count)))
 
 
@@ -175,13 +175,13 @@ def _combined(
     for w in range(omega.size):
         G = np.array([row[0][w] for row in rows])
         std = np.array([row[1][w] for row in rows])
-        good = std <= limits.LARGEST_RELATIVE_STD * np.abs(G)
+        good = std <= _LARGEST_RELATIVE_STD * np.abs(G)
         if not good.any():
             continue
         real, real_std = _weighted_mean(np.real(G[good]), std[good])
         imag, imag_std = _weighted_mean(np.imag(G[good]), std[good])
         magnitude, spread = abs(complex(real, imag)), max(real_std, imag_std)
-        if spread <= limits.LARGEST_RELATIVE_STD * magnitude:
+        if spread <= _LARGEST_RELATIVE_STD * magnitude:
             phase = np.arctan2(imag, real)
             points.append((omega[w], magnitude, spread, phase, spread / magnitude))
     columns = np.array(points).reshape(-1, 5).T
@@ -272,11 +272,13 @@ def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
     level, position = sign * np.log(magnitude), np.log(omegas)
     found = []
     for i in range(1, level.size - 1):
-        if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > limits.CLEAR):
+        # With a larger relative error a point shows no peak.
+        if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > 0.1):
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        if prominence < max(limits.LEAST_PROMINENCE, 6 * np.max(error[i - 1 : i + 2])):
+        # Of ln|G|; and six standard errors: noise alone spans five in 40 points.
+        if prominence < max(0.05, 6 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
         omega = omegas[i] * np.exp(-curve[1] / (2 * curve[0]))
@@ -297,7 +299,8 @@ def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Ex
     clusters: list[dict[int, _Extremum]] = []  # one peak of each cart at most
     start = 0.0
     for peak, cart in peaks:
-        if not clusters or np.log(peak.omega / start) > _SAME_PEAK:
+        # Of ln(omega): carts share their resonances.
+        if not clusters or np.log(peak.omega / start) > 0.15:
             clusters.append({})
             start = peak.omega
         rival = clusters[-1].get(cart)

@@ -10,23 +10,14 @@ from pipeline.errors import DataError
 from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
-from pipeline.stages import limits
 
+FEW_COUNTS = 20  # encoder steps: an amplitude below is known to a few percent only
 _MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
-_BACK_SIGMAS = 4.0  # a stretch whose mean square residual is further up is not steady
-_MARGIN = 3  # the share of the steady part given up to what is left of the transient
-_DRIFT_SIGMAS = 3.0  # the steady part's two halves differ by no more
-_DROP = 6  # the share of it that goes at once where they do
-_PASSES = 3  # of carrying the sine back; each doubles or so what it stands on
-_DRIVEN = 0.5  # of the input's amplitude: the dwell runs from its first to its last such sample
-_FLOOR_ROUNDING = 0.111  # of the encoder step, times sqrt(step / amplitude): see `_rounding_std`
 _PEAK_LINES = 4  # of the padded spectrum: a sine's frequency is no further from its peak
-_GAP = 3.0  # sample intervals; longer ones are gaps in the log
 _ITERATIONS = 20
-_PHASE_CONVERGED = 1e-9  # rad at the ends of the record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -142,7 +133,8 @@ class Dwell:
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
-        if drive.rms >= limits.NO_SINE * abs(drive.z):
+        # Of the amplitude of the input: a residual above this is another signal.
+        if drive.rms >= 0.5 * abs(drive.z):
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
                 f"{abs(drive.z):.3g} at {omega / (2 * np.pi):.4g} Hz and {drive.rms:.3g} (rms) "
@@ -218,24 +210,28 @@ class Dwell:
         z = np.array([fit.z for fit in fits])
         latest, _ = last[-1]
         spread = float(np.max(np.abs(z - z.mean())))
-        agree = spread <= max(limits.STEADY_SPREAD * abs(z.mean()), floor)
+        # The last windows agree to half a percent of the amplitude, or to their noise.
+        agree = spread <= max(0.005 * abs(z.mean()), floor)
         if len(last) < 2 or not (agree or spread <= 3 * max(fit.std for fit in fits)):
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
         if start > 0:
-            start = min(start + (y.size - start) // _MARGIN, latest)
+            # The share of the steady part given up to what is left of the transient.
+            start = min(start + (y.size - start) // 3, latest)
         start, left = self._drop_drifting(y, start, latest=latest, floor=floor)
         return _Steady(start=start, settled=True, left=left)
 
     def _carry_back(self, y: Array, start: int, *, floor: float, stretches: int) -> int:
         """Return how far back the sine from `start` on explains the record."""
-        for _ in range(_PASSES):
+        # Of carrying the sine back; each doubles or so what it stands on.
+        for _ in range(3):
             steady = self._fit(y, start)
             square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
             hop = max((y.size - start) // stretches, _MIN_SAMPLES)
             edges = np.arange(start, -1, -hop)
             mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
-            limit = max(steady.rms, floor) ** 2 * (1 + _BACK_SIGMAS * np.sqrt(2 / hop))
+            # A stretch whose mean square residual is further up is not steady.
+            limit = max(steady.rms, floor) ** 2 * (1 + 4.0 * np.sqrt(2 / hop))
             worse = np.flatnonzero(mean > limit)
             reached = int(edges[worse[0]]) if worse.size else 0
             if reached == start:
@@ -259,9 +255,11 @@ class Dwell:
             late = self._fit(y, middle)
             difference = abs(early.z - late.z)
             noise = max(np.hypot(early.std, late.std), floor / np.sqrt(y.size - start))
-            if start == latest or difference <= _DRIFT_SIGMAS * noise:
+            # The steady part's two halves differ by no more.
+            if start == latest or difference <= 3.0 * noise:
                 return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
-            start = min(start + (y.size - start) // _DROP, latest)
+            # The share of it that goes at once where they do.
+            start = min(start + (y.size - start) // 6, latest)
 
 
 # ------------------------------------------------------------------- the fits
@@ -285,7 +283,8 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
         X = np.column_stack([_columns(t, omega=omega), turned])
         fit = _Part.of(X, angle=angle).fit(y)
         omega += fit.coefficients[4] / half
-        if abs(fit.coefficients[4]) < _PHASE_CONVERGED:
+        # In rad, at the ends of the record.
+        if abs(fit.coefficients[4]) < 1e-9:
             break
     return float(omega), fit.error(4) / float(half)
 
@@ -305,13 +304,15 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
     if step == 0:
         return 0.0
     left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
-    return _FLOOR_ROUNDING * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
+    # Of the encoder step, times sqrt(step / amplitude): see `_rounding_std`.
+    return 0.111 * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
 
 
 def _held(t: Array, *, omega: float) -> complex:
     """Return the factor from a sampled sine to the first harmonic of its held staircase."""
     dt = np.diff(t)
-    dt = dt[dt < _GAP * np.median(dt)]  # what the input did in a gap is not known
+    # Sample intervals; longer ones are gaps in the log.
+    dt = dt[dt < 3.0 * np.median(dt)]  # what the input did in a gap is not known
     return complex(np.sum(-np.expm1(-1j * omega * dt)) / (1j * omega * np.sum(dt)))
 
 
@@ -331,7 +332,8 @@ def _driven(record: Record) -> slice:
             f"{record.id}: a sine dwell needs an input that oscillates, found {u[0]:g} throughout"
         )
     offset = (np.max(u) + np.min(u)) / 2
-    first, last = np.flatnonzero(np.abs(u - offset) > _DRIVEN * np.ptp(u) / 2)[[0, -1]]
+    # Of the input's amplitude: the dwell runs from its first to its last such sample.
+    first, last = np.flatnonzero(np.abs(u - offset) > 0.5 * np.ptp(u) / 2)[[0, -1]]
     driven = slice(int(first), int(last) + 1)
     if last + 1 - first < _MIN_SAMPLES:
         raise DataError(
@@ -354,9 +356,8 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
         fitted = peak
     if stated is None:
         return fitted, ""
-    if abs(fitted - stated) <= max(
-        limits.FREQUENCY_SIGMAS * std, limits.FREQUENCY_RELATIVE * stated
-    ):
+    # A stated frequency as far off by standard errors, and by more than any clock, is not believed.
+    if abs(fitted - stated) <= max(5.0 * std, 2e-4 * stated):
         return stated, ""
     return fitted, (
         f"the input oscillates at {fitted / (2 * np.pi):.4g} Hz, not at the "
@@ -386,12 +387,13 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
 
 
 def _note_small(amplitude: float, *, step: float) -> str:
-    if step == 0 or amplitude >= limits.FEW_COUNTS * step:
+    if step == 0 or amplitude >= FEW_COUNTS * step:
         return ""
     return f"the amplitude is {amplitude / step:.1f} encoder counts only"
 
 
 def _note_off_sine(fit: _Sine, *, floor: float) -> str:
-    if fit.rms <= max(2 * floor, limits.OFF_SINE * abs(fit.z)):
+    # Of the amplitude: a residual below this is a good sine.
+    if fit.rms <= max(2 * floor, 0.01 * abs(fit.z)):
         return ""
     return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"

@@ -24,23 +24,25 @@ from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.loop.gains import lqr_gains, place_poles
 from pipeline.plant.loop.robustness import level_error_percent
-from pipeline.plant.loop.sampled_loop import StateFeedback, check_ticks, discretise, simulate_loop
+from pipeline.plant.loop.sampled_loop import (
+    LoopSetup,
+    StateFeedback,
+    check_ticks,
+    discretise,
+    simulate_loop,
+)
 from pipeline.plant.loop.sampled_plant import RADIANS_PER_SAMPLE, SampledPlant, energy_weights
 from pipeline.results import FeedbackDesign
-from pipeline.stages import limits
+from pipeline.submission import Design
 
 Method = Literal["poles", "lqr"]
 
-_HORIZON = 3.0  # settling times of the goal that a candidate's step is followed for
-_SHOWN = 2.0  # settling times of the chosen design's step in the result
-_LATEST = 10.0  # settling times of the goal at which a design that misses it is given up
 _POINTS = 512  # of a candidate's step; a power of two, as it is made by doubling
 
 # Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to
 # a few percent only and should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
 _UNSEEN = 0.05  # percent of overshoot that nobody sees
-_PEAK_FREEDOM = 1.25  # times the gentlest candidate's peak input that a faster one may take
 
 _WEIGHTS = np.logspace(-3, 4, 25)  # of energies: from no feedback to be seen to a stiff loop
 _HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # to all but deadbeat
@@ -48,41 +50,22 @@ _DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
 _FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its own if better
 _FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
 
-_SCREENED = 8  # candidates, in order, tried for a loop that is stable whatever the model's errors
 
-
-def design_feedback(
-    chain: Chain,
-    *,
-    cart: int,
-    reference: float,
-    overshoot_percent: float,
-    settling_time: float,
-    input_limit: float | None = None,
-    sample_time: float | None = None,
-    method: Method = "lqr",
-) -> FeedbackDesign:
+def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
     """Design u = prefilter r - gains [x1, v1, x2, v2, …] for a step of one cart.
 
     A goal that cannot be met gives `reachable` False, the nearest design, and a message that
-    says what is reachable.
-
-    Parameters
-    ----------
-    reference : size of the step, position units.
-    overshoot_percent : at most, of the step.
-    settling_time : 2 %, at most, s from the step of the reference, the delay included.
-    input_limit : the input stays within ± this.
-    sample_time : s; default 0.00884, less where the plant or the goal is fast.
+    says what is reachable. The settling time counts from the step of the reference, the delay
+    included. A sample time that is not stated is 0.00884 s, less where plant or goal is fast.
 
     Raises
     ------
     DataError : there is no such cart or no step, a missing spring leaves a cart out of reach, the
         chain is none that a computer can design for, or the run takes too many ticks to simulate.
     """
-    if not 1 <= cart <= chain.n:
-        raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {cart}")
-    if reference == 0:
+    if not 1 <= task.cart <= chain.n:
+        raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {task.cart}")
+    if task.reference == 0:
         raise DataError("state feedback needs a reference other than 0")
     if np.any(chain.k[1:-1] <= 0):
         missing = int(np.argmax(chain.k[1:-1] <= 0)) + 1
@@ -91,18 +74,18 @@ def design_feedback(
             f"carts {missing} and {missing + 1}"
         )
     goal = _Goal(
-        overshoot=overshoot_percent,
-        settling=settling_time,
-        limit=np.inf if input_limit is None else input_limit,
-        reference=reference,
+        overshoot=task.overshoot_percent,
+        settling=task.settling_time,
+        limit=np.inf if task.input_limit is None else task.input_limit,
+        reference=task.reference,
     )
     try:
         # A candidate may well be unstable and run away; it is judged by the numbers it ends in.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plant = SampledPlant.of(
-                chain, cart=cart, settling=settling_time, sample_time=sample_time
+                chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
             )
-            return _design(plant, goal, method=method)
+            return _design(plant, goal, method=task.method)
     except np.linalg.LinAlgError:
         raise DataError(
             "state feedback needs carts alike in mass, damping and springs to some ten orders of "
@@ -208,7 +191,8 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
-    apart = min(_HORIZON * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
+    # Settling times of the goal that a candidate's step is followed for.
+    apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
     stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
@@ -241,15 +225,18 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
     within = candidates.peak <= goal.limit
     if not within.any():  # a step of this size is out of reach: design for a smaller one
         within = np.full_like(within, True)
-    for level_error, (settling, overshoot) in product((limits.LEVEL_ERROR, np.inf), _AIMS):
+    # Percent of the step that errors in the springs may move the level, if it can be had.
+    for level_error, (settling, overshoot) in product((10.0, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
         good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
         if not good.any():
             continue
-        good &= candidates.peak <= _PEAK_FREEDOM * candidates.peak[good].min()
+        # Times the gentlest candidate's peak input that a faster one may take.
+        good &= candidates.peak <= 1.25 * candidates.peak[good].min()
         order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
-        for index in order[:_SCREENED]:
+        # Candidates, in order, tried for a loop that is stable whatever the model's errors.
+        for index in order[:8]:
             if plant.stays_stable(plant.to_units(candidates.gains[index])):
                 return int(index), True
     excess = np.maximum(
@@ -281,7 +268,9 @@ def _finish(
     if requested is not None:
         away = np.abs(requested[None, :] - poles[:, None])
         requested = requested[linear_sum_assignment(away)[1]]
-    shown = _SHOWN * min(max(goal.settling, settling), _LATEST * goal.settling)
+    # Settling times of the chosen design's step in the result.
+    # Settling times of the goal at which a design that misses it is given up.
+    shown = 2.0 * min(max(goal.settling, settling), 10.0 * goal.settling)
     check_ticks(shown, T)
     t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)
     run = simulate_loop(
@@ -289,8 +278,7 @@ def _finish(
         StateFeedback(gains=gains, prefilter=prefilter, model=chain),
         t=t,
         reference=goal.reference,
-        sample_time=T,
-        input_limit=goal.limit,
+        setup=LoopSetup(sample_time=T, input_limit=goal.limit),
     )
     y = run.x[plant.cart - 1]
     judged = {"before": 0.0, "level": np.float64(goal.reference)}
@@ -341,7 +329,7 @@ def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
             f"or dampings {100 * DAMPING_ERROR:g} % off"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
-    if error > limits.LEVEL_WARNING:
+    if error > 5.0:
         said.append(
             f"these gains cancel much of the plant's own stiffness: errors of "
             f"{100 * MASS_SPRING_ERROR:g} % in the springs move the level by up to {error:.0f} %"

@@ -1,7 +1,7 @@
 """Step: static gain from the levels a cart settles at before and after each edge."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,18 +12,16 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import find_poles, fit_ringing
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.estimation.peaks import extrema, plateaus
-from pipeline.results import Record, StepGain
-from pipeline.results_of_runs import StepEdge
-from pipeline.stages import limits
+from pipeline.results import Record, StepEdge, StepGain
 
+_MOVED = 6.0  # grains (encoder steps, or noise as coarse): a cart that moved less has not moved
+_EXTRAPOLATES = 0.02  # of the motion: what a fit that foretells the level may leave, and be off by
+_STICKS_SIGMAS = 4.0  # standard errors: by chance one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
-_CREEP = 0.005  # of the input's range: two halves of a constant stretch differ by no more
 # Motion is counted in grains: encoder steps, or as much noise as would round as coarsely.
 _FLAT = 3.0  # a window that spans no more is level
 _PROMINENCE = 6.0
 _ARITHMETIC = 1e-3  # the scatter of a level without noise or rounding
-_NEARLY_FLAT = 0.02  # of the motion, where a window is not level to the noise
-_STARTS_AT_REST = 0.1  # of the motion, per radian of the ringing: an initial velocity below this
 _DRIFT_PASSES = 4
 _SAME_INPUT = 0.02  # of the input's range
 
@@ -62,14 +60,13 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         settles.
     """
     t, y, step = record.t, record.position(cart), record.encoder_step(cart)
-    parts = _constant_parts(record)
+    parts, drift = _constant_parts(record), 0.0
     if cart not in record.free:
         raise DataError(f"{record.id}: step gain needs a cart that is free, cart {cart} is held")
     if np.ptp(y) == 0:
         raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
     size = grain(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
-    drift = 0.0
     for _ in range(_DRIFT_PASSES):  # with less drift the settled windows reach further
         more = _drift(t, y, [p.level for p in found if p.level], size=size)
         if not more:
@@ -80,31 +77,23 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     found, notes = _with_unseen_start(t, y, found, size=size, step=step)
     if drift:
         notes.append(f"a drift of {drift:.3g} per second is taken out")
-
-    same = _SAME_INPUT * float(np.ptp([p.u for p in found]))
-    edges = [
-        _edge(t, before, after, before.level, after.level)
-        for before, after in pairwise(found)
-        if before.level and after.level and abs(after.u - before.u) > same
-    ]
+    edges = _edges(t, found)
     if not edges:
         raise DataError(
             f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
             f"{len(found) - 1} edges, none with both"
         )
-    moving = [
-        edge for edge in edges if abs(edge.level_after - edge.level_before) > limits.MOVED * size
-    ]
+    moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > _MOVED * size]
     if not moving:
         raise DataError(
-            f"{record.id}: step gain needs cart {cart} to move by more than {limits.MOVED:.0f} "
+            f"{record.id}: step gain needs cart {cart} to move by more than {_MOVED:.0f} "
             "encoder steps, found less"
         )
     gain, gain_std = _combine(moving)
     shift, shift_std = _rest_shift(found)
     spread = [abs(edge.gain - gain) / edge.gain_std for edge in moving]
-    sticks = len(moving) < len(edges) or max(spread) > limits.STICKS_SIGMAS
-    sticks = sticks or (shift is not None and abs(shift) > limits.STICKS_SIGMAS * shift_std)
+    sticks = len(moving) < len(edges) or max(spread) > _STICKS_SIGMAS
+    sticks = sticks or (shift is not None and abs(shift) > _STICKS_SIGMAS * shift_std)
     notes += _notes(found, moving, edges, shift=shift if sticks else None)
     return StepGain(
         experiment=record.id,
@@ -129,7 +118,8 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
             f"{record.id}: step gain needs the input beside the positions, found no input column: "
             "export it too, or name it under `columns`"
         )
-    creep = _CREEP * float(np.ptp(u))
+    # Of the input's range: two halves of a constant stretch differ by no more.
+    creep = 0.005 * float(np.ptp(u))
     long = [
         (a, b)
         for a, b in plateaus(u)
@@ -137,7 +127,8 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
-    if share < limits.STEADY_SHARE or not any(value for _, _, value in parts):
+    # With less of the record at constant input this is no step run.
+    if share < 0.6 or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
             f"and not zero for {100 * share if any(p[2] for p in parts) else 0:.0f} % of the record"
@@ -158,13 +149,7 @@ def _settle(
         record.t[first:stop], y[first:stop], n_modes=len(record.free), size=size, step=step
     )
     if level:
-        level = _Level(
-            first=first + level.first,
-            stop=first + level.stop,
-            value=level.value,
-            std=level.std,
-            extrapolated=level.extrapolated,
-        )
+        level = replace(level, first=first + level.first, stop=first + level.stop)
     return _Plateau(first=first, stop=stop, u=u, level=level)
 
 
@@ -177,7 +162,8 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
     ringing = _extrapolated(t, y, n_modes=n_modes, floor=size / np.sqrt(12))
     if ringing:
         return ringing
-    flat = _flat_from(y, span=_NEARLY_FLAT * motion)
+    # Of the motion, where a window is not level to the noise.
+    flat = _flat_from(y, span=0.02 * motion)
     if t[-1] - t[flat] >= pace:
         return _mean_level(y, flat, step=step, arithmetic=_ARITHMETIC * size)
     return None
@@ -229,13 +215,13 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
             continue
         fit = fit_ringing(t, y, poles=poles, drift=False)
         std = float(np.sqrt(fit.covariance[0, 0]))
-        left = max(2 * floor, limits.EXTRAPOLATES * motion)
+        left = max(2 * floor, _EXTRAPOLATES * motion)
         if (
             fit.converged
             and bool(np.all(fit.poles.real < 0))
             and float(np.min(fit.poles.imag)) * (t[-1] - t[0]) >= np.pi  # half a period is seen
             and fit.rms <= left
-            and std <= limits.EXTRAPOLATES * motion
+            and std <= _EXTRAPOLATES * motion
         ):
             return _Level(first=0, stop=y.size, value=fit.level, std=std, extrapolated=True)
     return None
@@ -246,12 +232,13 @@ def _with_unseen_start(
 ) -> tuple[list[_Plateau], list[str]]:
     """Put a rest before a record that starts with the input on and the cart just setting off."""
     head = found[0]
-    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= limits.MOVED * size:
+    if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
     radian = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
     n = max(5, int(np.searchsorted(t, t[0] + radian / 2)))
     velocity = np.polyfit(t[:n] - t[0], y[:n], 2)[1]
-    if abs(velocity) * radian > _STARTS_AT_REST * abs(head.level.value - y[0]):
+    # Of the motion, per radian of the ringing: an initial velocity below this.
+    if abs(velocity) * radian > 0.1 * abs(head.level.value - y[0]):
         return found, []
     std = max(size, step) / np.sqrt(12)
     level = _Level(first=0, stop=1, value=float(y[0]), std=float(std), extrapolated=False)
@@ -276,29 +263,35 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    seen = abs(drift) > limits.DRIFT_SIGMAS / np.sqrt(weight.sum())
-    alike = np.abs(np.array(slopes) - drift) <= limits.DRIFT_AGREES * abs(drift) + 3 * np.array(
-        errors
-    )
+    # A drift is seen, and alike in every settled window.
+    seen = abs(drift) > 5.0 / np.sqrt(weight.sum())
+    alike = np.abs(np.array(slopes) - drift) <= 0.3 * abs(drift) + 3 * np.array(errors)
     return drift if seen and bool(np.all(alike)) else 0.0
 
 
 # ----------------------------------------------------------------- edges to gain
 
 
-def _edge(t: Array, before: _Plateau, after: _Plateau, low: _Level, high: _Level) -> StepEdge:
-    change = after.u - before.u
-    return StepEdge(
-        t=float(t[after.first]),
-        u_before=before.u,
-        u_after=after.u,
-        level_before=low.value,
-        level_after=high.value,
-        window_before=(float(t[low.first]), float(t[low.stop - 1])),
-        window_after=(float(t[high.first]), float(t[high.stop - 1])),
-        gain=(high.value - low.value) / change,
-        gain_std=float(np.hypot(low.std, high.std)) / abs(change),
-    )
+def _edges(t: Array, found: Sequence[_Plateau]) -> list[StepEdge]:
+    """Return the edges of the input on whose two sides the cart settles."""
+    same = _SAME_INPUT * float(np.ptp([p.u for p in found]))
+    edges = []
+    for before, after in pairwise(found):
+        low, high, change = before.level, after.level, after.u - before.u
+        if low and high and abs(change) > same:
+            edge = StepEdge(
+                t=float(t[after.first]),
+                u_before=before.u,
+                u_after=after.u,
+                level_before=low.value,
+                level_after=high.value,
+                window_before=(float(t[low.first]), float(t[low.stop - 1])),
+                window_after=(float(t[high.first]), float(t[high.stop - 1])),
+                gain=(high.value - low.value) / change,
+                gain_std=float(np.hypot(low.std, high.std)) / abs(change),
+            )
+            edges.append(edge)
+    return edges
 
 
 def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:

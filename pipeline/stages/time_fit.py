@@ -22,22 +22,17 @@ from pipeline.estimation.chain.parametrisation import (
     named_estimates,
 )
 from pipeline.estimation.chain.time_search import Attempt, condense, descend, look, search
-from pipeline.estimation.chain.time_window import Window, open_window
+from pipeline.estimation.chain.time_window import FitWindow, open_window
 from pipeline.estimation.colour import long_run_variance, score_covariance
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
-from pipeline.stages import limits
+from pipeline.set_up import Bench
 
-_STRUCTURE_VALUES = 20  # independent values of the chain's own error in a record
-_DETERMINED = 1e-9  # smallest singular value of the scaled Jacobian over its largest
-_NO_DAMPING = 1e-6  # of the critical one: as good as none, and its logarithm has derivatives
 _TOLERANCE = 1e-9  # of the cost, relative; far below one standard error for any record
 
 
-def fit_records(
-    records: Sequence[Record], *, n: int, springs: tuple[bool, ...], start: Chain | None = None
-) -> ChainFit:
+def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None = None) -> ChainFit:
     """Fit one chain to all records at once.
 
     Records may differ in length, rate, free and measured carts; held carts drop out of the
@@ -46,7 +41,7 @@ def fit_records(
 
     Parameters
     ----------
-    springs : (n + 1,) which springs there are.
+    bench : which carts and springs there are.
     start : tried besides what the records themselves suggest.
 
     Returns
@@ -58,7 +53,7 @@ def fit_records(
     ------
     DataError : no record drives cart 1, or the records do not determine a parameter.
     """
-    parametrisation = Parametrisation(n=n, springs=springs)
+    parametrisation = Parametrisation(bench=bench)
     windows, remarks = _open(records)
     found = search(windows, parametrisation, given=start)
     attempt, explained = found.best, found.best.follows
@@ -81,7 +76,7 @@ def fit_records(
     return _result(attempt, explained=explained, n_starts=found.n_starts, remarks=remarks)
 
 
-def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
+def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
     """Return the windows of all usable records, and what was left out."""
     windows, left_out = [], []
     for record in records:
@@ -98,7 +93,7 @@ def _open(records: Sequence[Record]) -> tuple[list[Window], list[str]]:
 # ------------------------------------------------------- what the residuals tell
 
 
-def _informed(attempt: Attempt, index: int) -> Window:
+def _informed(attempt: Attempt, index: int) -> FitWindow:
     """Return a window that knows its errors, from its residuals, and whether it starts at rest."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
     at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
@@ -116,10 +111,12 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     others = [misfit for i, misfit in enumerate(attempt.misfits) if i != index]
     misfit = attempt.misfits[index]
     gain = condense([*others, held])[-1, -1] ** 2 - condense([*others, misfit])[-1, -1] ** 2
-    structure = (np.sum(misfit.residual**2) - misfit.residual.size) / _STRUCTURE_VALUES
+    # Independent values of the chain's own error in a record.
+    structure = (np.sum(misfit.residual**2) - misfit.residual.size) / 20
     chance = max(long_run_variance(misfit.residual), structure)
     freed = misfit.n_nuisance - held.n_nuisance
-    return bool(gain <= chance * (freed + limits.REST_SIGMAS * np.sqrt(2 * freed)))
+    # Beyond chance, by which a free start must improve the fit to be kept.
+    return bool(gain <= chance * (freed + 5.0 * np.sqrt(2 * freed)))
 
 
 def _covariance(attempt: Attempt) -> Array:
@@ -142,7 +139,8 @@ def _covariance(attempt: Attempt) -> Array:
     long = np.concatenate([s.reshape(scale.size, -1) for s in jacobians], axis=1)
     R = np.asarray(np.linalg.qr(long.T, mode="r"))
     _, singular, Vt = np.linalg.svd(R)
-    if singular[-1] < _DETERMINED * singular[0]:
+    # Smallest singular value of the scaled Jacobian over its largest.
+    if singular[-1] < 1e-9 * singular[0]:
         raise _undetermined(names[int(np.argmax(np.abs(Vt[-1])))])
     whitening = np.linalg.inv(R)  # jacobians @ whitening are orthonormal
     scores = np.zeros_like(R)
@@ -166,11 +164,8 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     """
     parametrisation, chain = attempt.parametrisation, attempt.chain
     share = parametrisation.physical(chain) / np.sqrt(np.diag(covariance))
-    gone = [
-        name
-        for name, value in zip(parametrisation.names, share, strict=True)
-        if value < limits.NEGLIGIBLE
-    ]
+    # Of its standard error: a damping or wall spring that is held at zero.
+    gone = [name for name, value in zip(parametrisation.names, share, strict=True) if value < 0.05]
     walls = tuple(name for name in gone if name in ("k_1", f"k_{chain.n + 1}"))
     is_held = chain.k[0] > 0 or chain.k[-1] > 0
     return walls or tuple(name for name in gone if read_name(name).symbol == "c" and is_held)
@@ -187,7 +182,8 @@ def _released(attempt: Attempt) -> Attempt:
     if springs == held.zero:
         return attempt
     free = replace(held, zero=springs)
-    c = np.where(chain.c > 0, chain.c, _NO_DAMPING * critical_damping(chain))
+    # Of the critical one: as good as none, and its logarithm has derivatives.
+    c = np.where(chain.c > 0, chain.c, 1e-6 * critical_damping(chain))
     return look(attempt.windows, free, free.pack(replace(chain, c=c)))
 
 

@@ -4,37 +4,20 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from decimal import Decimal
 from difflib import get_close_matches
+from functools import cache
 from typing import Literal, get_args, get_origin
 
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from pipeline.names import first_few
-from pipeline.submission import models
+from pipeline.submission.models import Submission
+from pipeline.words.numbers import first_few
 
 Location = Sequence[int | str]
 
 _LONGEST_QUOTE = 60  # characters of a found value worth showing
 MOST_TOLD = 20  # problems of a file; to find what a misspelt key may mean takes a while
 _MOST_KNOWN = 40  # of what would do
-
-# The tables of the format, by their dotted path without the numbers.
-_TABLES: dict[str, type[models.BaseModel]] = {
-    "authors": models.Author,
-    "system": models.System,
-    "system.input": models.Input,
-    "system.position": models.Position,
-    "design": models.Design,
-    "experiments": models.Experiment,
-    "experiments.input": models.InputOverride,
-    "experiments.controller.state_feedback": models.StateFeedback,
-    "experiments.controller.pid": models.Pid,
-    "reported": models.Reported,
-    "reported.state_space": models.StateSpace,
-    "reported.feedback": models.Feedback,
-}
-TOP_LEVEL = tuple(
-    name for name in models.Submission.model_fields if name not in ("folder", "discussion")
-)
 
 # What a value should have been, by pydantic's name for the error.
 _EXPECTED = {
@@ -83,14 +66,37 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
     return f"; known: {first_few(candidates, _MOST_KNOWN)}" if candidates else ""
 
 
-def takes_numbers(key: str, tables: Mapping[str, type[models.BaseModel]] | None = None) -> bool:
-    """Tell whether a key of a format holds numbers and no text, in whatever table it stands.
+@cache
+def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
+    """Return the tables of a format by their dotted path, what selects one of several included."""
+    found: dict[str, type[BaseModel]] = {}
+    for name, field in root.model_fields.items():
+        kinds = [kind for kind in _kinds(field.annotation) if isinstance(kind, type)]
+        models = [kind for kind in kinds if issubclass(kind, BaseModel)]
+        for model in models:
+            tags = (
+                get_args(one.annotation)
+                for key, one in model.model_fields.items()
+                if get_origin(one.annotation) is Literal
+                and all(key in other.model_fields for other in models)
+            )
+            for tag in next(tags) if len(models) > 1 else ("",):
+                path = f"{name}.{tag}".rstrip(".")
+                found[path] = model
+                found |= {f"{path}.{key}": below for key, below in list_tables(model).items()}
+    return found
 
-    `tables` are the models of the format, by default those of a submission.
-    """
+
+def list_keys(model: type[BaseModel]) -> tuple[str, ...]:
+    """Return the keys that may stand in a table."""
+    return tuple(name for name, field in model.model_fields.items() if not field.exclude)
+
+
+def takes_numbers(key: str, root: type[BaseModel]) -> bool:
+    """Tell whether a key of a format holds numbers and no text, in whatever table it stands."""
     kinds = [
         kind
-        for model in (_TABLES if tables is None else tables).values()
+        for model in list_tables(root).values()
         if key in model.model_fields
         for kind in _kinds(model.model_fields[key].annotation)
     ]
@@ -125,16 +131,10 @@ def dotted(location: Location, document: object) -> str:
     return path + name
 
 
-def explain(
-    error: ErrorDetails,
-    document: dict,
-    *,
-    tables: Mapping[str, type[models.BaseModel]] = _TABLES,
-    top_level: Sequence[str] = TOP_LEVEL,
-) -> str:
+def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Submission) -> str:
     """Return one pydantic error as `key: what was expected, what was found, what is near`.
 
-    `tables` are the models of a format by their dotted path, what selects a model included.
+    `root` is the model of the format.
     """
     location = [part for part in error["loc"] if not isinstance(part, str) or part != "str"]
     table = ".".join(part for part in location[:-1] if isinstance(part, str))
@@ -143,7 +143,7 @@ def explain(
     if kind == "missing":
         return f"{where}: is required and not there"
     if kind == "extra_forbidden":
-        keys = tuple(tables[table].model_fields) if table in tables else top_level
+        keys = list_keys(list_tables(root).get(table, root))
         return f"{where}: unknown key{nearest(location[-1], keys)}"
     text = f"{where}: {refusal(error)}"
     if kind == "tuple_type" and isinstance(found, dict):
@@ -154,6 +154,13 @@ def explain(
         )
         text += f"; did you mean {close[0]!r}?" if close else ""
     return text
+
+
+def first_refusal(error: ValidationError) -> str:
+    """Say what is wrong first with a file that another program wrote, and where."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    return f"{where}: {refusal(first)}" if where else refusal(first)
 
 
 def refusal(error: ErrorDetails) -> str:

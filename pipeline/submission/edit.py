@@ -17,10 +17,6 @@ from pipeline.submission.load import MAX_TOML_BYTES, NAME, outside, parse_submis
 from pipeline.submission.models import Submission
 from pipeline.submission.toml_file import Value, read_text
 
-_MANY_BLANKS = re.compile(r"\n{3,}(?=\[\[experiments\]\])")
-_MOST_EDITED = 200_000  # characters; tomlkit takes seconds for the worst of them
-_LONGEST_LINE = 90  # characters of a comment
-
 
 class Outdated(SubmissionError):
     """The file is another than the one that the change was made for; `text` is what it is now."""
@@ -68,16 +64,16 @@ def edit_submission(
         if seen and seen != text_digest(text):
             raise Outdated(text)
         where = f"{folder.resolve().name}/{NAME}"
-        if len(text) > _MOST_EDITED:
+        if len(text) > 200_000:  # tomlkit takes seconds for the worst of them
             raise SubmissionError(
-                f"{where}: {len(text):,} characters; a program changes files of up to "
-                f"{_MOST_EDITED:,}"
+                f"{where}: {len(text):,} characters; a program changes files of up to 200,000"
             )
         newline = "\r\n" if "\r\n" in text else "\n"
         try:
             document = tomlkit.parse(text.replace("\r\n", "\n"))
             change(document)
-            new = _MANY_BLANKS.sub("\n\n", tomlkit.dumps(document)).rstrip() + "\n"
+            new = re.sub(r"\n{3,}(?=\[\[experiments\]\])", "\n\n", tomlkit.dumps(document))
+            new = new.rstrip() + "\n"
         except (TOMLKitError, RecursionError) as error:
             raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
         except ValueError:  # an integer of thousands of digits
@@ -121,7 +117,7 @@ def append_experiment(
 def comment_text(remark: str) -> str:
     """Return a remark fit to stand behind a #, whatever a file's name brought into it."""
     plain = "".join(c if c.isprintable() else " " for c in remark)
-    return plain if len(plain) <= _LONGEST_LINE else plain[: _LONGEST_LINE - 1] + "…"
+    return plain if len(plain) <= 90 else plain[:89] + "…"
 
 
 def toml_item(value: Value) -> Any:

@@ -9,6 +9,7 @@ from contextlib import suppress
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
 
 from pydantic import ValidationError
 
@@ -16,20 +17,20 @@ from pipeline.errors import SubmissionError, lies_in_the_file
 from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
     MOST_TOLD,
-    TOP_LEVEL,
     Location,
     all_told,
     dotted,
     explain,
+    list_keys,
     nearest,
     quote,
     told_once,
     without_tag,
 )
-from pipeline.submission.models import Experiment, Reported, StateFeedback, Submission
+from pipeline.submission.models import Experiment, Reported, StateFeedbackController, Submission
 from pipeline.submission.toml_file import (
-    BACKSLASH,
     UnusableNumber,
+    backslash_words,
     check_number,
     parse_toml,
     read_text,
@@ -39,11 +40,7 @@ NAME = "submission.toml"
 MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-_MOST_SHOWN = 30_000  # characters of the notes: fifteen pages
-_MOST_LOOKED_AT = 1_000  # files and folders, for the one that may be meant
 COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
-_HIDDEN = "it has a character that does not show: rename the file"
-_SYSTEM_COLUMNS = ("time", "input", "reference", "frequency")
 
 
 def load_submission(path: Path) -> Submission:
@@ -125,11 +122,12 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
 
 def _validate(document: dict, *, where: str) -> Submission:
+    keys = list_keys(Submission)
     unknown: list[tuple[Location, str]] = [
-        ((key,), f"{dotted([key], document)}: unknown key{nearest(key, TOP_LEVEL)}")
-        for key in islice((key for key in document if key not in TOP_LEVEL), MOST_TOLD)
+        ((key,), f"{dotted([key], document)}: unknown key{nearest(key, keys)}")
+        for key in islice((key for key in document if key not in keys), MOST_TOLD)
     ]
-    document = {key: value for key, value in document.items() if key in TOP_LEVEL}
+    document = {key: value for key, value in document.items() if key in keys}
     try:
         plain = {key: _plain(value, (key,)) for key, value in document.items()}
     except UnusableNumber as error:
@@ -173,8 +171,9 @@ def _notes(folder: Path) -> str | None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
     text = COMMENT.sub("", typed)
-    if len(text) > _MOST_SHOWN:
-        shown = text[: text.rfind("\n", 0, _MOST_SHOWN) + 1] or text[:_MOST_SHOWN]
+    most = 30_000  # characters: fifteen pages
+    if len(text) > most:
+        shown = text[: text.rfind("\n", 0, most) + 1] or text[:most]
         length = f"{len(shown):,} of {len(text):,} characters"
         text = f"{shown}\n\n(notes.md goes on: {length} are shown.)\n"
     return text if text.strip() else None
@@ -214,7 +213,7 @@ def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
     lengths = {
         f"the gains of {name}": len(law.gains)
         for name, law in controllers.items()
-        if isinstance(law, StateFeedback)
+        if isinstance(law, StateFeedbackController)
     }
     lengths["the reported gains"] = len(reported.feedback.gains) if reported.feedback else 0
     lengths["the reported A"] = len(reported.state_space.A) if reported.state_space else 0
@@ -254,7 +253,7 @@ def _experiment_problems(
     if experiment.controlled_cart is not None:
         yield from _in_range(("controlled_cart",), experiment.controlled_cart, n)
     controller = experiment.controller
-    if isinstance(controller, StateFeedback):
+    if isinstance(controller, StateFeedbackController):
         if len(controller.gains) not in (0, 2 * n):
             yield (
                 ("controller", "gains"),
@@ -267,7 +266,7 @@ def _experiment_problems(
 
 
 def _columns(columns: Mapping[str, str | int], n: int) -> Iterator[tuple[Location, str]]:
-    roles = (*_SYSTEM_COLUMNS, *(f"x{i}" for i in range(1, n + 1)))
+    roles = ("time", "input", "reference", "frequency", *(f"x{i}" for i in range(1, n + 1)))
     for role, column in columns.items():
         if role not in roles:
             yield ("columns", role), f"unknown column{nearest(role, roles)}"
@@ -279,7 +278,7 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
     reported, n = submission.reported, submission.system.carts
     if reported is None:
         return
-    names = parameter_names(n, rigid=submission.system.rigid)
+    names = parameter_names(n, rigid=submission.system.bench.rigid)
     for table in ("initial", "final"):
         for name in getattr(reported, table):
             if name not in names:
@@ -307,11 +306,15 @@ def posix(name: str) -> str:
     return str(PurePosixPath(name.replace("\\", "/")))
 
 
-def stated_columns(document: Mapping[str, object], file: str) -> dict[str, str | int]:
-    """Return which column of a file is what by a `submission.toml`, valid or not yet."""
+def list_experiments(document: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the tables of the experiments of a `submission.toml`, valid or not yet."""
     tables = document.get("experiments")
-    listed = tables if isinstance(tables, list) else []
-    own = (t for t in listed if isinstance(t, dict) and posix(str(t.get("file", ""))) == file)
+    return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
+
+
+def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | int]:
+    """Return which column of a file is what by a `submission.toml`, valid or not yet."""
+    own = (t for t in list_experiments(document) if posix(str(t.get("file", ""))) == file)
     stated: dict[str, str | int] = {}
     for table in (document.get("system"), *own):
         columns = table.get("columns") if isinstance(table, dict) else None
@@ -325,7 +328,8 @@ def leaves(folder: Path, name: str) -> str | None:
     """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
-        hint = "" if name.isprintable() else f"; {BACKSLASH if _typed(name) else _HIDDEN}"
+        hidden = "it has a character that does not show: rename the file"
+        hint = "" if name.isprintable() else f"; {backslash_words() if _typed(name) else hidden}"
         return f"expected a file name, found {shown}{hint}"
     windows, relative = PureWindowsPath(name), Path(posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
@@ -383,7 +387,7 @@ def _near_file(folder: Path, name: str, taken: Collection[str]) -> str:
     A similar one elsewhere may be a table that a report wrote.
     """
     try:
-        paths = sorted(p for p in islice(folder.rglob("*"), _MOST_LOOKED_AT) if p.is_file())
+        paths = sorted(p for p in islice(folder.rglob("*"), 1_000) if p.is_file())
     except OSError:
         return ""
     files = [path.relative_to(folder).as_posix() for path in paths]

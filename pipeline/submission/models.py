@@ -1,4 +1,7 @@
-"""The tables of `submission.toml`, as validated models."""
+"""The tables of `submission.toml`, as validated models.
+
+The title and the description of a key are what the form of the desk says of it.
+"""
 
 from decimal import Decimal
 from pathlib import Path
@@ -6,62 +9,90 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from pipeline.set_up import Bench, Units
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 # A line on any page; pages and PDF readers fail at texts of a hundred thousand letters.
 Line = Annotated[str, Field(max_length=200)]
 # Units stand in the titles of figures, which scripts read.
 Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
-MOST_AUTHORS = 50
 MOST_CARTS = 4
 MOST_EXPERIMENTS = 1_000  # every stage and every comparison goes through them
-Typed = Annotated[Decimal, Field(allow_inf_nan=False)]  # keeps the digits as typed: 0.10 has two
+# Keeps the digits as typed: 0.10 has two.
+TypedNumber = Annotated[Decimal, Field(allow_inf_nan=False)]
 
 
-class _Model(BaseModel):
+class TomlTable(BaseModel):
+    """A table of a file that people type: an unknown key is an error."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Author(_Model):
+class Author(TomlTable):
     """One student."""
 
     id: Line
     name: Line = ""
 
 
-class Input(_Model):
+class InputScale(TomlTable):
     """The input's unit, sign and scale; `sign` None: found from the data."""
 
-    unit: Unit = "V"
-    sign: Literal[1, -1] | None = None
-    per_count: Positive | None = None
+    unit: Unit = Field(default="V", title="Unit of the input", description="V")
+    sign: Literal[1, -1] | None = Field(
+        default=None,
+        title="Sign of the input",
+        description="-1: a positive input drives cart 1 towards negative x; left out, it is found "
+        "from the data",
+    )
+    per_count: Positive | None = Field(
+        default=None,
+        title="Input of one duty count",
+        description="only for logs that hold duty counts",
+    )
 
 
-class InputOverride(_Model):
+class InputOverride(TomlTable):
     """Where one record's input differs from the system's."""
 
     sign: Literal[1, -1] | None = None
     per_count: Positive | None = None
 
 
-class Position(_Model):
+class PositionScale(TomlTable):
     """The position's unit; `per_count` converts columns that hold encoder counts."""
 
-    unit: Unit = "count"
-    per_count: Positive | None = None
+    unit: Unit = Field(
+        default="count",
+        title="Unit of positions",
+        description="cm; count where a file holds encoder counts",
+    )
+    per_count: Positive | None = Field(
+        default=None,
+        title="Position of one encoder count",
+        description="in that unit: 0.00227 cm on an ECP 210; only for files that hold counts",
+    )
 
 
-class System(_Model):
+class System(TomlTable):
     """The carts and springs on the bench; springs not stated are all there.
 
     `columns` (role to heading or number) are those of every recording that has them.
     """
 
-    carts: Annotated[int, Field(ge=1, le=MOST_CARTS)]
-    springs: tuple[bool, ...] = ()
-    input: Input = Input()
-    position: Position = Position()
-    columns: dict[str, str | int] = {}
+    carts: int = Field(ge=1, le=MOST_CARTS, title="Carts")
+    springs: tuple[bool, ...] = Field(
+        default=(), title="Springs that are there", description="from one wall to the other"
+    )
+    input: InputScale = InputScale()
+    position: PositionScale = PositionScale()
+    columns: dict[str, str | int] = Field(
+        default={},
+        title="Columns of all your files",
+        description="where their headings are not understood, a line each: x1 = Encoder 1 Pos, or "
+        "x1 = 3 for the third",
+    )
 
     @model_validator(mode="after")
     def _all_springs(self) -> "System":
@@ -76,74 +107,104 @@ class System(_Model):
         return "springs" in self.model_fields_set
 
     @property
-    def rigid(self) -> bool:
-        """Whether there is one cart without a spring: a mass and a damping, no gain."""
-        return self.carts == 1 and not any(self.springs)
-
-    @property
-    def tied(self) -> bool:
-        """Whether a spring ties the carts to a wall: else no constant input has a rest position."""
-        return self.springs[0] or self.springs[-1]
+    def bench(self) -> Bench:
+        """The bench that it states."""
+        units = Units(position=self.position.unit, input=self.input.unit)
+        return Bench(springs=self.springs, units=units, sign=self.input.sign)
 
 
-class Design(_Model):
+class Design(TomlTable):
     """The state-feedback task."""
 
-    cart: int = 1
-    reference: Finite = 1.0
-    overshoot_percent: Annotated[float, Field(ge=0, lt=100)] = 10.0
-    settling_time: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 1.0  # s
-    input_limit: Positive | None = None
-    sample_time: Annotated[float, Field(ge=1e-4, le=1, allow_inf_nan=False)] | None = None  # s
-    method: Literal["poles", "lqr"] = "lqr"
+    cart: int = Field(default=1, title="Cart whose position is controlled")
+    reference: Finite = Field(
+        default=1.0, title="Size of the step", description="in position units"
+    )
+    overshoot_percent: float = Field(
+        default=10.0, ge=0, lt=100, title="Overshoot", description="at most, in percent"
+    )
+    settling_time: Finite = Field(
+        default=1.0, gt=0, le=1000, title="Settling time", description="s, to within 2 %"
+    )
+    input_limit: Positive | None = Field(
+        default=None, title="Largest input", description="in input units; may be left out"
+    )
+    sample_time: Annotated[Finite, Field(ge=1e-4, le=1)] | None = Field(
+        default=None, title="Sample time of the controller", description="s; may be left out"
+    )
+    method: Literal["poles", "lqr"] = Field(default="lqr", title="Method")
 
 
-class StateFeedback(_Model):
+class StateFeedbackController(TomlTable):
     """u = prefilter r - gains [x1, v1, x2, v2, …]."""
 
-    type: Literal["state_feedback"]
-    gains: tuple[Finite, ...] = ()
-    prefilter: Finite = 1.0
+    type: Literal["state_feedback"] = Field(title="Controller")
+    gains: tuple[Finite, ...] = Field(
+        default=(), title="Gains", description="of a state feedback: two a cart, position first"
+    )
+    prefilter: Finite = Field(default=1.0, title="Prefilter")
 
 
-class Pid(_Model):
+class PidController(TomlTable):
     """u = scale (kp e + ki ∫e + kd de/dt), e in the file's own counts or units."""
 
-    type: Literal["pid"]
-    kp: Finite = 0.0
-    ki: Finite = 0.0
-    kd: Finite = 0.0
-    scale: Finite = 1.0
-    cart: int = 1
+    type: Literal["pid"] = Field(title="Controller")
+    kp: Finite = Field(
+        default=0.0, title="kp", description="of a PID: u = scale (kp e + ki ∫e + kd de/dt)"
+    )
+    ki: Finite = Field(default=0.0, title="ki")
+    kd: Finite = Field(default=0.0, title="kd")
+    scale: Finite = Field(default=1.0, title="scale")
+    cart: int = Field(default=1, title="Cart that a PID feeds back")
 
 
-Controller = Annotated[StateFeedback | Pid, Field(discriminator="type")]
+Controller = Annotated[StateFeedbackController | PidController, Field(discriminator="type")]
 
 
-class Experiment(_Model):
+class Experiment(TomlTable):
     """One data file and what was done to record it."""
 
     id: str
-    kind: Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"]
+    kind: Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"] = Field(title="Kind")
     file: str
-    carts: tuple[int, ...] = ()  # the free carts; filled in with all of them on loading
-    frequency: Positive | None = None  # Hz
-    window: tuple[Finite, Finite] | None = None  # s
-    note: Annotated[str, Field(max_length=2_000)] = ""
+    # Filled in with all of them on loading.
+    carts: tuple[int, ...] = Field(
+        default=(), title="Free carts", description="1, 2; all where left out"
+    )
+    frequency: Positive | None = Field(
+        default=None, title="Frequency", description="Hz, of a sine; found where left out"
+    )
+    window: tuple[Finite, Finite] | None = Field(
+        default=None, title="Use only", description="from, to, in s"
+    )
+    note: str = Field(default="", max_length=2_000, title="Note")
     input: InputOverride | None = None
-    columns: dict[str, str | int] | None = None
-    sample_rate: Positive | None = None  # Hz
+    columns: dict[str, str | int] | None = Field(
+        default=None,
+        title="Columns",
+        description="of this file, a line each: x1 = Encoder 1 Pos, or x1 = 3",
+    )
+    sample_rate: Positive | None = Field(
+        default=None, title="Sample rate", description="Hz, of a file without a time column"
+    )
     hold: Literal["zero_order", "band_limited"] = "zero_order"
-    controlled_cart: int | None = None
+    controlled_cart: int | None = Field(default=None, title="Controlled cart")
     controller: Controller | None = None
-    reference: Finite | None = None
+    reference: Finite | None = Field(
+        default=None, title="Set point", description="where the file has no column for it"
+    )
 
 
-class StateSpace(_Model):
+class ReportedStateSpace(TomlTable):
     """The state matrices as the students wrote them."""
 
-    A: tuple[tuple[Typed, ...], ...] = ()
-    B: tuple[Typed, ...] = ()  # flat; a column [[b1], [b2], …] is accepted
+    A: tuple[tuple[TypedNumber, ...], ...] = Field(
+        default=(),
+        title="A",
+        description="a row a line, two for each cart, states x1, v1, x2, v2, …",
+    )
+    # Flat; a column [[b1], [b2], …] is accepted.
+    B: tuple[TypedNumber, ...] = Field(default=(), title="B")
 
     @field_validator("B", mode="before")
     @classmethod
@@ -156,35 +217,59 @@ class StateSpace(_Model):
         return value
 
 
-class Feedback(_Model):
+class ReportedFeedback(TomlTable):
     """The feedback design as the students wrote it."""
 
-    gains: tuple[Typed, ...] = ()
-    prefilter: Typed | None = None
-    overshoot_percent: Typed | None = None
-    settling_time: Typed | None = None
+    gains: tuple[TypedNumber, ...] = Field(
+        default=(),
+        title="Gains",
+        description="two a cart, position first: u = prefilter·r − gains·[x1, v1, …]",
+    )
+    prefilter: TypedNumber | None = Field(default=None, title="Prefilter")
+    overshoot_percent: TypedNumber | None = Field(
+        default=None, title="Overshoot you found", description="percent"
+    )
+    settling_time: TypedNumber | None = Field(
+        default=None, title="Settling time you found", description="s"
+    )
 
 
-class Reported(_Model):
+class Reported(TomlTable):
     """What the students claim; numbers keep the digits as typed."""
 
-    initial: dict[str, Typed] = {}
-    final: dict[str, Typed] = {}
-    state_space: StateSpace | None = None
-    feedback: Feedback | None = None
+    initial: dict[str, TypedNumber] = {}
+    final: dict[str, TypedNumber] = {}
+    state_space: ReportedStateSpace | None = None
+    feedback: ReportedFeedback | None = None
 
 
-class Submission(_Model):
+class Students(TomlTable):
+    """What students see of what is computed: the report, or only which of their numbers are off."""
+
+    see: Literal["report", "check"] = "report"
+
+
+class Submission(TomlTable):
     """A validated submission; `folder` is where it lies."""
 
     version: Literal[1]
-    title: Line = ""
-    section: Line = ""
-    authors: Annotated[tuple[Author, ...], Field(max_length=MOST_AUTHORS)] = ()
+    title: Line = Field(
+        default="", title="Title of the report", description="Two-cart system, bench 4"
+    )
+    section: Line = Field(
+        default="", title="Lab section", description="as your instructor numbers them"
+    )
+    authors: tuple[Author, ...] = Field(
+        default=(),
+        max_length=50,
+        title="You",
+        description="one line each: id, name (the name may be left out)",
+    )
     system: System
     design: Design | None = None
     experiments: Annotated[tuple[Experiment, ...], Field(max_length=MOST_EXPERIMENTS)] = ()
     reported: Reported | None = None
+    students: Students = Students()
     folder: Path = Field(default=Path(), exclude=True)
     discussion: str | None = Field(default=None, exclude=True)
 

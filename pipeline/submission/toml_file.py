@@ -5,108 +5,32 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeAlias
 
 from pydantic import BaseModel
 
 from pipeline.errors import PipelineError, lies_in_the_file
+from pipeline.resources import TEMPLATES
 from pipeline.submission.complaints import Location, dotted, quote, takes_numbers
+from pipeline.submission.models import Submission
 
-Tables: TypeAlias = Mapping[str, type[BaseModel]]
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
-_MAX_KEY_DEPTH = 30  # tomllib's time grows with the square of a dotted key's depth
-_DOTTED_KEY = re.compile(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*")
 _LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
-_LONGEST_MENDED, _MOST_PASSES = 50_000, 30  # characters that are read again after a slip; times
-_BEGINS = re.compile(r"\s*(#|\[|[\w\"'.-]+\s*=)")  # a line that is no rest of the one before
 _LARGEST = 30  # powers of ten: beyond any physical number in any unit, yet safe to multiply
-_MOST_DIGITS = 1_000
-_MOST_BITS = 100  # of a whole number: 1e30
-_MANY_DIGITS = re.compile(r"(?<![\w.])[-+]?\d[\d_]{4299,}")  # Python reads 4,300 at most
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
-_NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"
 
-BACKSLASH = 'inside "…" a backslash begins a special character; folders are parted by /'
-_TEXT = "text stands in quotes"
-_UNCLOSED = "a list [ … ] before this line is not closed, or lacks a comma"
 
-# What a line looks like that TOML refuses, what is wrong with it, and what in it becomes what. The
-# first that fits is it; the line is shown mended where that makes it one that TOML takes.
-_SLIPS: tuple[tuple[str, str, tuple[tuple[str, str], ...]], ...] = (
-    (
-        r"[“”„‟«»‘’‚]",
-        "these are curly quotes; type straight ones",
-        ((r"[“”„‟«»]", '"'), (r"[‘’‚]", "'")),
-    ),
-    (
-        r"[\xa0\u2000-\u200f\u202f\u3000]",
-        "a special space; delete it and type a plain one",
-        ((r"[\xa0\u2000-\u200f\u202f\u3000]+", " "),),
-    ),
-    (
-        r"=.*[−–—]\s*\d",
-        "this is a dash; type the minus of the keyboard",
-        ((r"[−–—]\s*(?=\d)", "-"),),
-    ),
-    (r"=\s*[-+]?\d+,\d", "a decimal comma; write a point", ((r"(\d),(\d)", r"\1.\2"),)),
-    (r'"[^"]*\\', BACKSLASH, ((r"\\+", "/"),)),
-    (
-        r"=\s*\[?.*\b(True|TRUE|False|FALSE)\b",
-        "true and false are written in small letters",
-        ((r"\b(?:True|TRUE)\b", "true"), (r"\b(?:False|FALSE)\b", "false")),
-    ),
-    (r"^\s*(//|;|%)", "a comment begins with #", ((r"^\s*(?://|;|%)+", "#"),)),
-    (r"^\s*(\[[A-Za-z][^\[\]]*\]|\[\[[^\[\]]+\]\])\s*(#.*)?$", _UNCLOSED, ()),
-    (
-        r"^\s*\[+\s*[A-Za-z]",
-        "a table begins with [name], one of several with [[name]], in a line of its own",
-        (),
-    ),
-    (r"^\s*[\w-]+\s*=\s*(#.*)?$", "nothing stands after the =", ()),
-    (
-        r"^\s*[\w-]+(\s*:|\s+[^=\s])",
-        "between a name and its value stands a =",
-        ((r"^(\s*[\w-]+)\s*:?\s*", r"\1 = "),),
-    ),
-    (
-        r"=\s*[-+]?\.\d|=\s*[-+]?\d+\.(?!\d)",
-        "a point has digits on both sides",
-        ((r"(?<!\d)\.(?=\d)", "0."), (r"(\d)\.(?!\d)", r"\1.0")),
-    ),
-    (
-        r"=\s*[-+]?0\d",
-        "a number begins with no 0 but that of 0.5",
-        ((r"(=\s*[-+]?)0+(?=\d)", r"\1"),),
-    ),
-    (
-        rf"=\s*{_NUMBER}\s*[^]\s\d#.,}}]",
-        "a number stands alone, without a unit or a sum",
-        (
-            (r"(\d)\s*[*·x×]\s*10\^?([-+]?\d)", r"\1e\2"),
-            (rf"(=\s*{_NUMBER})\s+[A-Za-zµ].*", r"\1"),
-        ),
-    ),
-    (
-        r"^[^=]*=\s*[A-Za-z_./\\]",
-        _TEXT,
-        ((r"^([^=]*=)\s*([^#]*[^#\s])", r'\1 "\2"'),),
-    ),
-    (
-        r"=\s*[\[{][^\"']*[\[{,\s][A-Za-z_]\w*\s*[,\]}]",
-        _TEXT,
-        ((r"([\[{,=]\s*)(?!true\b|false\b)([A-Za-z_]\w*)(?=\s*[,\]}])", r'\1"\2"'),),
-    ),
-    (r"=\s*(\"[^\"]*|'[^']*)$", "the quote is not closed", ((r"([\"'])([^\"']*)$", r"\1\2\1"),)),
-)
-# What tomllib says where no single line shows it.
-_SAID: tuple[tuple[str, str], ...] = (
-    (r"Cannot (declare|mutate|define).*", "there is such a table already; one of several, as an "
-     "experiment is, begins with [[experiments]], in double brackets"),
-    (r"Cannot overwrite a value|Duplicate.*", "this name has a value already, in the same table"),
-    (r"Unclosed array", _UNCLOSED),
-    (r"Unclosed inline table", "all of { … } stands in one line"),
-)  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class _Slip:
+    """What people type that TOML refuses; see templates/toml_slips.toml."""
+
+    words: str
+    parser: str = ""
+    line: str = ""
+    code: str = ""
+    mends: Sequence[Sequence[str]] = ()
 
 
 def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError]) -> str:
@@ -171,7 +95,7 @@ def parse_toml(
     where: str,
     error: type[PipelineError],
     as_typed: bool = False,
-    tables: Tables | None = None,
+    root: type[BaseModel] = Submission,
 ) -> dict[str, Any]:
     """Parse TOML that somebody typed.
 
@@ -181,14 +105,14 @@ def parse_toml(
     error : whose mistake it is.
     as_typed : leave numbers with a point or an exponent as the decimals that were typed, whatever
         their size: see `check_number`. Else they are floats that can be reckoned with.
-    tables : the models of the format, by default those of a submission.
+    root : the model of the format.
 
     Raises
     ------
     PipelineError : of the kind `error`; for each slip a line with its number, or the key, and what
         to write.
     """
-    read = read_toml(text, as_typed=as_typed, tables=tables)
+    read = read_toml(text, as_typed=as_typed, root=root)
     if read.slips:
         raise error("\n".join(at_line(where, line, what) for line, what in read.slips))
     return read.document
@@ -203,16 +127,16 @@ def read_toml(
     text: str,
     *,
     as_typed: bool = False,
-    tables: Tables | None = None,
+    root: type[BaseModel] = Submission,
 ) -> Toml:
     """Read what can be read of TOML that somebody typed: a slip hides nothing in other lines."""
-    for key in _DOTTED_KEY.finditer(text):
-        if key.group().count(".") > _MAX_KEY_DEPTH:
+    for key in re.finditer(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*", text):
+        if key.group().count(".") > 30:  # tomllib's time grows with the square of a key's depth
             line = text.count("\n", 0, key.start()) + 1
             return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
     typed, slips = text.split("\n"), list[tuple[int, str]]()
     lines, emptied = list(typed), -1  # the last line of the slip before
-    for _ in range(_MOST_PASSES if len(text) <= _LONGEST_MENDED else 1):
+    for _ in range(30 if len(text) <= 50_000 else 1):  # a long one is not read again
         try:
             document = tomllib.loads("\n".join(lines), parse_float=_decimal)
             if not as_typed:
@@ -222,13 +146,15 @@ def read_toml(
             message = " ".join(str(wrong).split())
             at = _AT.search(message)
             line = int(at[1]) if at else len(lines)
-            words = _words(typed[line - 1].strip(), _AT.sub("", message), tables)
+            shown = typed[line - 1].strip()
+            slip = _find_slip(shown, _AT.sub("", message))
             # The rest of a list or text whose first line is gone is no mistake of its own.
-            if line != emptied + 1 or _BEGINS.match(typed[line - 1]):
-                shown = typed[line - 1].strip()
+            begins = re.match(r"\s*(#|\[|[\w\"'.-]+\s*=)", typed[line - 1])
+            if line != emptied + 1 or begins:
+                words = _explain_slip(slip, shown, root)
                 shown = shown if shown.isprintable() and len(shown) <= _SHOWN else quote(shown)
                 slips.append((line, f"{words}; found {shown or 'the end'}"))
-            first, emptied = _spoilt(lines, line, words)
+            first, emptied = _find_spoilt(lines, line, slip)
             if not any(map(str.strip, lines[first - 1 : emptied])):
                 break
             lines[first - 1 : emptied] = [""] * (emptied + 1 - first)
@@ -266,7 +192,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
         raise UnusableNumber(at, f"expected a finite number, found {number}")
     # Nothing is worked out before the exponent is known to be small: some take for ever.
     sound = (
-        number.bit_length() <= _MOST_BITS and abs(number) < 10**_LARGEST
+        number.bit_length() <= 100 and abs(number) < 10**_LARGEST
         if isinstance(number, int)
         else -_LARGEST <= number.adjusted() < _LARGEST
     )
@@ -274,8 +200,8 @@ def check_number(value: float | Decimal, at: Location) -> None:
         raise UnusableNumber(
             at, f"expected a number between 1e-{_LARGEST} and 1e+{_LARGEST} in size, or 0"
         )
-    if isinstance(number, Decimal) and len(number.as_tuple().digits) > _MOST_DIGITS:
-        raise UnusableNumber(at, f"expected a number of at most {_MOST_DIGITS} digits")
+    if isinstance(number, Decimal) and len(number.as_tuple().digits) > 1_000:
+        raise UnusableNumber(at, "expected a number of at most 1000 digits")
 
 
 def _decimal(text: str) -> Decimal:
@@ -304,13 +230,13 @@ def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, s
 
 def _long_number(text: str) -> int:
     """Return the line of the first whole number that is too long to be read, 0 without one."""
-    found = _MANY_DIGITS.search(text)
+    found = re.search(r"(?<![\w.])[-+]?\d[\d_]{4299,}", text)  # Python reads 4,300 at most
     return text.count("\n", 0, found.start()) + 1 if found else 0
 
 
-def _spoilt(lines: Sequence[str], line: int, words: str) -> tuple[int, int]:
+def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int]:
     """Return the first and last line that a slip, found at `line`, takes with it."""
-    if words == _UNCLOSED:
+    if slip.code == "unclosed_list":
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
                 return n, line - 1
@@ -320,28 +246,39 @@ def _spoilt(lines: Sequence[str], line: int, words: str) -> tuple[int, int]:
     return line, line
 
 
-def _words(line: str, message: str, tables: Tables | None) -> str:
+def _find_slip(line: str, message: str) -> _Slip:
     """Return what is wrong with a line, by what it looks like, else by what the parser says."""
-    for said, words in _SAID:
-        if re.fullmatch(said, message):
-            return words
-    looked_at = line[:_LONGEST_LINE]
-    for slip, words, mends in _SLIPS:
-        if re.search(slip, looked_at):
-            key = looked_at.partition("=")[0].strip()
-            if words == _TEXT and takes_numbers(key, tables):
-                return f"{key} takes a number, written in digits"
-            return words + _mended(looked_at, mends)
-    return f"not valid TOML: {message}"
+    for slip in _slips():
+        if slip.parser and re.fullmatch(slip.parser, message):
+            return slip
+        if slip.line and re.search(slip.line, line[:_LONGEST_LINE]):
+            return slip
+    return _Slip(words=f"not valid TOML: {message}")
 
 
-def _mended(line: str, mends: tuple[tuple[str, str], ...]) -> str:
-    """Return ": write …" with the line as it should be; "" where that is not known."""
+def _explain_slip(slip: _Slip, line: str, root: type[BaseModel]) -> str:
+    """Return what is wrong, with ": write …" and the line as it should be where that is known."""
+    line = line[:_LONGEST_LINE]
+    key = line.partition("=")[0].strip()
+    if slip.code == "unquoted_text" and takes_numbers(key, root):
+        return f"{key} takes a number, written in digits"
     new = line
-    for pattern, put in mends:
+    for pattern, put in slip.mends:
         new = re.sub(pattern, put, new)
     try:
         tomllib.loads(new)
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        return ""
-    return f": write {new}" if new != line and new.isprintable() and len(new) <= _SHOWN else ""
+        return slip.words
+    mended = new != line and new.isprintable() and len(new) <= _SHOWN
+    return f"{slip.words}: write {new}" if mended else slip.words
+
+
+@cache
+def _slips() -> tuple[_Slip, ...]:
+    text = (TEMPLATES / "toml_slips.toml").read_text(encoding="utf-8")
+    return tuple(_Slip(**row) for row in tomllib.loads(text)["slips"])
+
+
+def backslash_words() -> str:
+    """Return what is said of a backslash in quotes."""
+    return next(slip.words for slip in _slips() if slip.code == "backslash")

@@ -41,7 +41,13 @@ document.addEventListener("htmx:sendError", () => {
 
 // An answer replaces all of #main. Of each page, by its heading, is kept what was typed and not sent with the request; it goes
 // back when the page comes back. A row is known by its experiment, whose number may have changed.
-const unsaved = new Map(), sent = new WeakMap();
+// So does what somebody unfolded.
+const unsaved = new Map(), sent = new WeakMap(), opened = new Set();
+let going_on = []; // where the request came from: it does not fold while somebody types there
+document.addEventListener("click", (event) => {
+  const folded = event.target.closest("summary")?.parentElement;
+  if (folded?.id) opened[folded.open ? "delete" : "add"](heading() + folded.id);
+});
 let before = "";
 const heading = () => document.querySelector("h1").textContent;
 const switched = (one) => one.type === "checkbox" || one.type === "radio";
@@ -64,11 +70,15 @@ document.addEventListener("htmx:beforeSwap", (event) => {
   const went = sent.get(event.detail.xhr) ?? new Map();
   const kept = typed(event.detail.target).filter((one) => (went.has(one) ? state(one) !== went.get(one) : differs(one)));
   before = heading();
+  going_on = [];
+  for (let around = event.detail.requestConfig?.elt.closest("form, details"); around; around = around.parentElement.closest("details"))
+    going_on.push(around.id, ...[...around.querySelectorAll("details[open]")].map((one) => one.id));
   unsaved.set(before, new Map(kept.map((one) => [key(one), state(one)])));
 });
 document.addEventListener("htmx:afterSwap", (event) => {
   if (event.detail.target.id !== "main") return;
   const kept = unsaved.get(heading()) ?? new Map();
+  for (const one of event.detail.target.querySelectorAll("details[id]")) one.open ||= opened.has(heading() + one.id) || going_on.includes(one.id);
   for (const one of typed(event.detail.target)) {
     if (!kept.has(key(one))) continue;
     one[switched(one) ? "checked" : "value"] = kept.get(key(one));

@@ -1,13 +1,19 @@
-// Keys for a team's page: each presses what carries it. Whoever needs the letters turns them off.
+// Keys for a team's page and the list of several: each presses what carries it. Whoever needs the letters turns them off.
 "use strict";
 const keys = document.querySelector("#keys");
 if (keys) {
-  keys.closest("p").hidden = false;
+  keys.closest("details").hidden = false;
   keys.checked = localStorage.getItem("keys") !== "off";
-  keys.addEventListener("change", () => localStorage.setItem("keys", keys.checked ? "on" : "off"));
+  const mark = () => document.body.classList.toggle("keyed", keys.checked);
+  mark();
+  keys.addEventListener("change", () => {
+    localStorage.setItem("keys", keys.checked ? "on" : "off");
+    mark();
+  });
+  const switched = "[type=checkbox], [type=radio]";
   document.addEventListener("keydown", (event) => {
     if (!keys.checked || event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-    if (event.target.closest("input:not([type=checkbox]), select, textarea")) {
+    if (event.target.closest(`input:not(${switched}), select, textarea`)) {
       if (event.key === "Escape") event.target.blur();
       return;
     }
@@ -15,7 +21,17 @@ if (keys) {
     if (!wanted) return;
     event.preventDefault();
     if (!wanted.matches("input")) return wanted.click();
-    wanted.focus();
-    wanted.select();
+    if (!wanted.matches(switched)) return edit(wanted);
+    wanted.click();
+    edit(document.querySelector("#why"));
   });
+  const edit = (field) => {
+    field.value ||= field.dataset.usual ?? "";
+    field.focus();
+    field.select();
+  };
+  // A number that was typed before would count in place of a step that is chosen after it.
+  const other = document.querySelector("[name=other]");
+  for (const step of document.querySelectorAll("[type=radio][name=points]"))
+    step.addEventListener("change", () => (other.value = ""));
 }

@@ -4,8 +4,8 @@ import pytest
 
 from benchmarks import explorations, rivals
 from benchmarks.drawn import draw
-from pipeline.bench.planning.plan import Recording
-from pipeline.bench.planning.propose import propose_plan
+from pipeline.experiments.plan import Recording
+from pipeline.experiments.propose import propose_plan
 from pipeline.submission import load_submission
 from tests.helpers.virtual import LimitPassed, VirtualBench, new_folder
 

@@ -12,6 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.resources import EXAMPLES
 from pipeline.results import ChainFit, Check
+from pipeline.set_up import Bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.examples import analysed
@@ -65,7 +66,9 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
     values["k"][0] = 0.1
     symbol, _, number = name.partition("_")
     values[symbol][int(number) - 1] = value
-    (check,) = check_vanishing(fitted(Chain(**values), **{name: std}), springs=(True,) * 3)
+    (check,) = check_vanishing(
+        fitted(Chain(**values), **{name: std}), bench=Bench(springs=(True,) * 3)
+    )
     assert (check.id, check.outcome) == (f"vanishing.{name}", "fail")
     assert found in check.message
     assert "?" in check.message
@@ -77,10 +80,13 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
 def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
     """The paper's plants have no spring wall-1; where it is declared so, all is well."""
     chain = PRESETS[preset]
-    springs = [bool(k > 0) for k in chain.k]
-    assert check_vanishing(fitted(chain), springs=springs) == []
-    assert check_vanishing(fitted(chain, converged=False), springs=(True,) * len(springs)) == []
-    found = check_vanishing(fitted(chain), springs=(True,) * len(springs))
+    springs = tuple(bool(k > 0) for k in chain.k)
+    assert check_vanishing(fitted(chain), bench=Bench(springs=springs)) == []
+    assert (
+        check_vanishing(fitted(chain, converged=False), bench=Bench(springs=(True,) * len(springs)))
+        == []
+    )
+    found = check_vanishing(fitted(chain), bench=Bench(springs=(True,) * len(springs)))
     assert [check.id for check in found] == ([] if chain.n == 1 else ["vanishing.k_1"])
 
 

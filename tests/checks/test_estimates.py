@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 from pipeline.checks.estimates import check_rows, check_steps
 from pipeline.cli import app
 from pipeline.results import Estimate, ParameterRow, StepGain
+from pipeline.set_up import Bench
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.examples import analysed
@@ -27,7 +28,7 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
         )
         for i, interval in enumerate([(29.33, 30.55), (27.85, 28.75)])
     ]
-    checks = check_steps(steps, gain_unit="cm/V")
+    checks = check_steps(steps, bench=Bench(springs=(True, True)))
     assert [check.outcome for check in checks] == ["fail", "fail"]
     assert all("may be farther off" in check.message for check in checks)
 
@@ -56,7 +57,8 @@ def test_one_edge_does_not_tell_whether_a_cart_sticks():
     """A step that is never switched off shows one level only; on and off again it is a test."""
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(
-        [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)], gain_unit="cm/V"
+        [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)],
+        bench=Bench(springs=(True, True)),
     )
     assert (both.outcome, one.outcome) == ("pass", "skip")
     assert "at all 2 edges" in both.message

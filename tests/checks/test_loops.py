@@ -15,6 +15,7 @@ from pipeline.plant.loop.margins import closed_loop, stability_margins
 from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
+from pipeline.submission import Design
 
 RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))
 FREE_PAIR = Chain(m=np.full(2, 3e-4), c=np.full(2, 4e-4), k=np.array([0.0, 0.12, 0.0]))
@@ -31,12 +32,14 @@ def designed(
 ) -> tuple[FeedbackDesign, StateFeedback]:
     design = design_feedback(
         chain,
-        cart=chain.n,
-        reference=1.0,
-        overshoot_percent=10.0,
-        settling_time=settling_time,
-        sample_time=sample_time,
-        method=method,
+        Design(
+            cart=chain.n,
+            reference=1.0,
+            overshoot_percent=10.0,
+            settling_time=settling_time,
+            sample_time=sample_time,
+            method=method,
+        ),
     )
     return design, design.controller(chain)
 

@@ -15,9 +15,9 @@ from urllib.parse import urlencode
 import pytest
 
 from pipeline.bench.host.raw import read_raw
-from pipeline.bench.planning.plan_file import load_plan
 from pipeline.desk.app import DeskServer
-from pipeline.report.exploration.page import NAME as DIARY
+from pipeline.experiments.plan_file import load_plan
+from pipeline.report.exploration.diary import NAME as DIARY
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.desks import Visitor, a_recorded_cart
@@ -58,6 +58,10 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         # How far the stop is when the first news are sent is not ours to say.
         assert json.loads(states[0])["waits"] in ("Recording long.", "Stopping.")
         assert json.loads(states[-1])["waits"] == "The session is over."
+        # Who comes late has the points from before.
+        first, *_ = map(json.loads, re.findall(rb"event: points\ndata: (.*)\n", heard[0]))
+        assert (first["run"], first["start"]) == (1, 0)
+        assert first["points"][0][0] < 0.1 < 0.5 < first["points"][-1][0]
         # Told when the room shows the plan again: a page drawn just before hears it and reloads.
         assert heard[0].endswith(b"event: ended\ndata:\n\n")
         assert "Stopped. Begin again" in visitor.get("/bench/0/").text
@@ -164,8 +168,9 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
             re.findall(r'action="/bench/0/(\w+)"', form)[0]: set(re.findall(r'name="(\w+)"', form))
             for form in forms
         }
-        assert fields["explore"] == {"port", "what", "error", "minutes"}
-        assert fields["acquire"] == {"port"}
+        ports = {"port", "other"} & fields["acquire"]  # to be typed where none is listed
+        assert fields["explore"] == {*ports, "what", "error", "minutes"}
+        assert fields["acquire"] == ports
         sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
         for name, typed, said in (
             ("error", "", "to within ± %: expected a number above 0 and below 100"),
@@ -204,6 +209,8 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
             assert visitor.get(f"/bench/0/weigh?{urlencode(wrong)}").status == 422
         blank = visitor.get(f"/bench/0/weigh?{urlencode(mine | {'frequency': ''})}")
         assert blank.status == 422
+        assert 'name="frequency_end"' not in decay.text  # no fields of other kinds
+        assert 'name="amplitude"' not in decay.text
         assert "found" not in re.findall('class="wrong" role="alert">(.*?)<', blank.text)[0]
         assert not (work / "plan.toml").exists()
         assert visitor.post("/bench/0/add", **{**mine, "amplitude": "20"}).status == 422
@@ -212,3 +219,37 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
         assert visitor.post("/bench/0/explore", port="x", what="all", minutes="1").status == 422
     (added,) = [one for one in load_plan(load_submission(work)).recordings if one.id == "sweep-1"]
     assert (added.amplitude, added.frequency_end) == (0.01, 5.0)
+
+
+def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
+    """A virtual bench that runs here is in the list; a port that is gone stays, and says so."""
+    work = write_work(tmp_path / "team", [sine("long", seconds=300)])
+    with DeskServer(folder=work) as server:
+        visitor = Visitor.of(server.url)
+        assert f'<option value="{real.address}">virtual bench' in visitor.get("/bench/0/").text
+        visitor.post("/bench/0/acquire", port=real.address, other=NOBODY)  # what is typed counts
+        until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
+        page = visitor.get("/bench/0/").text
+        assert f'<option value="{NOBODY}">{NOBODY} (used last, not found now)' in page
+        begun(visitor, work, "long", port=real.address)
+        visitor.post("/bench/0/press", wish="stop", number="0", plain="1")
+        until(lambda: "Stopped. Begin again" in visitor.get("/bench/0/").text)
+    with DeskServer(folder=work) as server:  # another desk, later
+        page = Visitor.of(server.url).get("/bench/0/").text
+    first = re.findall(r'<select name="port" id="port"><option value="([^"]+)"', page)
+    assert first == [real.address]
+
+
+def test_what_is_new_in_the_plan_is_marked(tmp_path):
+    """The plan of a folder has rows for what is recorded, what is next, and what was added last."""
+    work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])
+    with DeskServer(folder=work) as server:
+        visitor = Visitor.of(server.url)
+        rows = re.findall(r"<tr.*?</tr>", visitor.get("/bench/0/").text, re.DOTALL)
+        marked = [re.findall(r'class="chip \w+">(\w+)<', row) for row in rows if "checkbox" in row]
+        assert marked == [["next"], []]
+        mine = {"kind": "step", "amplitude": "0.02", "seconds": "20"}
+        assert visitor.post("/bench/0/add", **mine).status == 303
+        rows = re.findall(r"<tr.*?</tr>", visitor.get("/bench/0/").text, re.DOTALL)
+        marked = [re.findall(r'class="chip \w+">(\w+)<', row) for row in rows if "checkbox" in row]
+        assert marked == [["next"], [], ["new"]]

@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Iterator
 from html import unescape
-from pathlib import Path
 from urllib.parse import urlencode
 
 import pytest
@@ -12,11 +11,9 @@ from typer.testing import CliRunner
 
 from pipeline.cli import app
 from pipeline.desk.app import DeskServer
-from pipeline.desk.exercises import exercise
-from pipeline.grading.rubric_file import load_rubric
+from pipeline.desk.exercises import look_at_exercise
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.resources import RUBRICS
 from tests.helpers.desks import Visitor, a_submission
 from tests.helpers.waiting import until
 
@@ -53,7 +50,7 @@ def test_every_effect_has_its_sizes_and_slides_about_them():
         for effect in CATALOGUE:
             if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
                 continue
-            found = exercise(
+            found = look_at_exercise(
                 {"preset": preset},
                 [{"key": effect.key, "place": "", "sizes": {}}],
                 progress=print,
@@ -67,7 +64,7 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
-        found = exercise({"preset": preset}, chosen, progress=print)
+        found = look_at_exercise({"preset": preset}, chosen, progress=print)
         return found["effects"][0]["parameters"][0]
 
     usual = force("throne-2dof")["value"]
@@ -98,7 +95,15 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
         effect="coulomb_friction",
     )
     assert answer.status == 303
-    wait_for(visitor, answer.headers["location"])
+    made = unescape(wait_for(visitor, answer.headers["location"]))
+    assert "2 exercises are made." in made
+    assert re.findall(r'<th scope="row">(\w+)</th><td>(\d+)</td>', made) == [("1", "5"), ("2", "6")]
+    assert told in made
+    kinds = re.findall(r"<figcaption>([\w ]+): ", made)
+    assert len(kinds) == len(set(kinds)) >= 3
+    assert made.count("<polyline") >= len(kinds)
+    assert "submission.toml" in made
+    assert f'href="/exercises/made?{urlencode({"out": out})}"' in unescape(visitor.get("/").text)
     assert [folder.name for folder in sorted(out.iterdir())] == ["1", "2"]
     command = ["simulate", "--preset", "throne-1dof", "--seed", "6", "--out", str(tmp_path / "b")]
     hide = f"coulomb_friction:cart=1,force={force[1]}"
@@ -147,65 +152,6 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
         assert visitor.get("/solution/0/solution.html").status == 200
         values = json.loads(visitor.get("/solution/0/solution.json").body)
     assert values["schema"] == "cartlab-solution/1"
-
-
-# ------------------------------------------------------------------------------- rubrics
-
-
-def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
-    """A new one begins with a shipped one; a mistake stands beside its line, and is not written."""
-    path = tmp_path / "rubric.toml"
-    page = visitor.get(f"/rubric/?{urlencode({'file': path, 'start': 'throne-2dof'})}")
-    text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
-    assert unescape(page.text).count(text.strip()) == 1
-    line = next(i for i, one in enumerate(text.split("\n"), 1) if one.startswith("title"))
-    spoilt = text.replace("title", "titel", 1)
-    answer = visitor.post("/rubric/save", file=str(path), text=spoilt, seen=page.value("seen"))
-    assert answer.status == 422
-    assert f'<th scope="row">{line}</th><td><code>titel' in answer.text
-    assert not path.exists()
-    crlf = text.replace("\n", "\r\n")  # as browsers send it
-    saved = visitor.post("/rubric/save", file=str(path), text=crlf, seen=page.value("seen"))
-    assert saved.status == 303
-    assert path.read_text(encoding="utf-8").rstrip() == text.rstrip()
-    assert load_rubric(path) == load_rubric(Path("throne-2dof"))
-
-
-def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, tmp_path):
-    """Both versions are shown; what is on disk stays."""
-    path = tmp_path / "rubric.toml"
-    text = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
-    path.write_text(text, encoding="utf-8")
-    seen = visitor.get(f"/rubric/?{urlencode({'file': path})}").value("seen")
-    path.write_text(f"# by another\n{text}", encoding="utf-8")
-    mine = f"# mine\n{text}"
-    answer = visitor.post("/rubric/save", file=str(path), text=mine, seen=seen)
-    assert answer.status == 409
-    assert "# by another" in answer.text
-    assert "# mine" in answer.text
-    assert path.read_text(encoding="utf-8").startswith("# by another")
-    new = visitor.post("/rubric/save", file=str(path), text=mine, seen="new")
-    assert new.status == 409  # begun as a new file, which is there now
-
-
-@pytest.mark.parametrize(
-    "file",
-    ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
-     "a" * 300 + ".toml"],
-)  # fmt: skip
-def test_a_rubric_lies_where_it_can(visitor, file):
-    """A name that is none is one clear sentence."""
-    assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
-
-
-def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
-    """A name with the signs of an address: the page after saving is of the same file."""
-    folder = tmp_path / "R+D & co #2 100%"
-    folder.mkdir()
-    path, text = folder / "rubric.toml", (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
-    saved = visitor.post("/rubric/save", file=str(path), text=text, seen="new")
-    page = visitor.get(saved.headers["location"])
-    assert page.value("file") == str(path)
 
 
 @pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])

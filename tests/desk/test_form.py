@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 from pipeline.desk.student.form import (
     Field,
-    apply,
-    experiment_fields,
-    groups,
+    fill_experiment,
+    fill_form,
+    find_changes,
+    mark_errors,
     read_document,
-    typed,
-    with_errors,
+    write_fields,
 )
 from pipeline.errors import SubmissionError
 from pipeline.resources import EXAMPLES
@@ -29,15 +29,15 @@ def fields(text: str) -> dict[str, Field]:
     """Return every field of a file's form, by path."""
     document = read_document(text)
     loop = [i for i, e in enumerate(document.get("experiments", [])) if e["kind"] == "closed_loop"]
-    of_loop = experiment_fields(document, loop[0]) if loop else ()
-    every = [field for group in groups(document) for field in group.fields]
+    of_loop = fill_experiment(document, loop[0]) if loop else ()
+    every = [field for group in fill_form(document) for field in group.fields]
     return {field.path: field for field in (*every, *of_loop)}
 
 
 def changed(text: str, **values: str) -> str:
     """Return a file in which these fields were typed."""
     document = tomlkit.parse(text)
-    apply(document, typed(fields(text).values(), values, lambda path: []))
+    write_fields(document, find_changes(fields(text).values(), values, lambda path: []))
     return tomlkit.dumps(document)
 
 
@@ -46,7 +46,7 @@ def test_a_form_that_nobody_touched_changes_nothing():
     form = {path: field.value for path, field in fields(WHOLE).items()}
     flags = {"system.springs.shown": "1"}
     on = [str(i) for i, flag in enumerate(fields(WHOLE)["system.springs"].on) if flag]
-    assert typed(fields(WHOLE).values(), form | flags, lambda path: on) == []
+    assert find_changes(fields(WHOLE).values(), form | flags, lambda path: on) == []
 
 
 NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
@@ -121,17 +121,17 @@ def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
     """In the words of the file's own check, and nowhere else."""
     now = [Field(path=path, label="", kind=fields(WHOLE)[path].kind, value=value)]
     document = tomlkit.parse(WHOLE)
-    apply(document, now)
+    write_fields(document, now)
     with pytest.raises(SubmissionError) as error:
         parse_submission(tomlkit.dumps(document), folder=EXAMPLES / "two-cart")
-    shown, left = with_errors(tuple(fields(WHOLE).values()), now, error.value)
+    shown, left = mark_errors(tuple(fields(WHOLE).values()), now, error.value)
     assert {field.path: wrong in field.wrong for field in shown if field.wrong} == {path: True}
     assert left == []
 
 
 def test_numbers_are_asked_for_by_their_symbols():
     """As in the tables of the lab, not as a program spells them."""
-    (claims,) = [g for g in groups({"system": {"carts": 2}}) if g.title == "Your numbers"]
+    (claims,) = [g for g in fill_form({"system": {"carts": 2}}) if g.title == "Your numbers"]
     labels = {field.path: field.label for field in claims.fields}
     assert labels["reported.initial.zeta_1"] == "ζ₁ initial"
     assert labels["reported.final.omega_b"] == "ω_b final"

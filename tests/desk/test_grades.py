@@ -14,6 +14,7 @@ from urllib.parse import quote, urlencode, urlsplit
 import pytest
 
 from pipeline.desk.app import DeskServer
+from pipeline.desk.grades.criteria import point_steps
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.schema import FILE
@@ -63,7 +64,7 @@ def version(answer: Answer, criterion: str) -> str:
 
 def change(who: Visitor, team: str, criterion: str = "laws", seen: str = "", **fields: str):
     """Send the form of a criterion."""
-    seen = seen or version(who.get(at(team)), criterion)
+    seen = seen or version(who.get(at(team, criterion=criterion)), criterion)
     return who.post(at(team), do="change", criterion=criterion, seen=seen, **fields)
 
 
@@ -115,7 +116,9 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
 def test_the_class_says_who_shares_recordings(ta):
     """How many at its head, leading to them; each in words, not by a code."""
     page = ta.get(ROOM).text
-    assert re.search(r'href="[^"]*\?flag=shared_data">2 with recordings', page)
+    line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
+    assert line
+    assert line.groups() == ("A recording that another submission has too", "2")
     assert page.count("<td>a recording that another submission has too") == 2
     assert "<td>shared_data" not in page
 
@@ -169,6 +172,7 @@ def test_a_team_has_its_numbers_beside_ours(ta):
     assert "19.6" in page
     remark = page.split('id="remarks"')[1].split("</section>")[0]
     assert re.findall(r"<th [^>]*>(.*?)</th>", remark) == ["Reported", "Recomputed", "Ratio"]
+    page = ta.get(at("team-01", criterion="final-gains")).text
     figure = re.search(r'<img class="drawing" src="(.*?)"', page)
     assert figure
     drawn = ta.get(unescape(figure[1]))
@@ -196,20 +200,84 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(outcome)
         book.finish(_batch([outcome]), rubric=two_cart_rubric())
+    found = {}
     with DeskServer(folder=tmp_path) as server:
-        page = Visitor.of(server.url).get(at("team")).text
-    found = {
-        criterion: re.findall('figure=(.*?).svg"><img', unescape(article))
-        for criterion, article in re.findall(
-            r'(?s)<article id="criterion-(.*?)"(.*?)</article>', page
-        )
-    }
+        who = Visitor.of(server.url)
+        for asked in two_cart_rubric().criteria:
+            page = unescape(who.get(at("team", criterion=asked.id)).text)
+            beside, _, rest = page.partition('id="evidence"')
+            found[asked.id] = re.findall('figure=([^"&]*?).svg"><img', beside)
+            assert "figure=other.svg" in rest
     assert {criterion: figures for criterion, figures in found.items() if figures} == {
         "initial-gains": ["record-K_1"],
         "initial-decays": ["record-omega_2-zeta_2"],
+        "final-gains": ["response-1"],
         "final-frequencies": ["response-1"],
+        "final-dampings": ["response-1"],
     }
-    assert "figure=other.svg" in page.split('id="evidence"')[1]
+
+
+def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
+    """Of two responses that of its cart; the other is one click away, without scripts."""
+    drawn = tuple((f"response-{n}.svg", f"<svg><title>cart {n}</title></svg>") for n in (1, 2))
+    grade = make_grade("team", share=0.5)
+    pair = {"found": {"K_1": 25.0, "K_2": 8.0}, "expected": {"K_1": 24.0, "K_2": 16.0}}
+    criteria = tuple(
+        c.model_copy(update=pair) if c.id == "final-gains" else c for c in grade.criteria
+    )
+    outcome = make_outcome(grade.model_copy(update={"criteria": criteria}), figures=drawn)
+    with Gradebook(tmp_path, assignment="lab", create=True) as book:
+        book.put(outcome)
+        book.finish(_batch([outcome]), rubric=two_cart_rubric())
+    with DeskServer(folder=tmp_path) as server:
+        who = Visitor.of(server.url)
+        page = who.get(at("team", criterion="final-gains")).text
+        shown = r'<img class="drawing" src="[^"]*figure=(.*?).svg"'
+        assert re.findall(shown, page) == ["response-2"]
+        other = re.search(r'<a class="button" href="([^"]*)"[^>]*>cart 1</a>', page)
+        assert other
+        address = unescape(other[1]).partition("#")[0]
+        assert re.findall(shown, who.get(address).text) == ["response-1"]
+
+
+def test_what_lost_points_comes_first_and_is_shown(ta):
+    """Most lost first, what has all its points after it in one line each; any can be chosen."""
+    with_all = ta.get(at("a-name-without-end-" * 5)).text
+    titles = {asked.id: asked.title for asked in two_cart_rubric().criteria}
+    assert "To look at" in with_all
+    change(ta, "team-06", "final-gains", points="2", why="right after all")
+    page = ta.get(at("team-06")).text
+    doubts, passed = (page.split(f'id="{part}-title"')[1].split("</section>")[0]
+                      for part in ("doubts", "passed"))  # fmt: skip
+    order = re.findall(r"criterion=([\w-]+)", doubts)
+    lost = {asked.id: asked.points for asked in two_cart_rubric().criteria}
+    assert [lost[one] for one in order] == sorted((lost[one] for one in order), reverse=True)
+    assert re.findall(r"criterion=([\w-]+)", passed) == ["final-gains"]
+    assert "2 / 2" in passed
+    chosen = re.search(r'id="chosen-title">(.*): ', page)
+    assert chosen
+    assert chosen[1].lower() == titles[order[0]].lower()
+    for criterion in (*order, "final-gains"):
+        own = ta.get(at("team-06", criterion=criterion)).text
+        assert f'name="criterion" value="{criterion}"' in own
+        assert own.count('aria-current="true"') == 1
+
+
+@pytest.mark.parametrize(
+    ("out_of", "step", "steps"),
+    [
+        (1.0, 0.25, [0, 0.25, 0.5, 0.75, 1]),
+        (2.0, 0.25, [0, 0.25, 0.5, 0.75, 1, 1.25, 1.5, 1.75, 2]),
+        (5.0, 0.25, [0, 1.25, 2.5, 3.75, 5]),
+        (1.0, 0.01, [0, 0.25, 0.5, 0.75, 1]),
+        (1.5, 1.0, [0, 1, 1.5]),
+        (3.0, 0.5, [0, 0.5, 1, 1.5, 2, 2.5, 3]),
+        (0.1, 0.25, [0, 0.1]),
+    ],
+)
+def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
+    """As many as there are keys; else quarters, to the step."""
+    assert point_steps(out_of, step=step) == steps
 
 
 def test_points_are_changed_as_the_command_does(ta, grades):
@@ -221,7 +289,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
     page = ta.get(at("team-01"))
     assert "a clear plot" in page.text
     for expected in ({}, {"laws": 0.5}):  # undone, and that undone
-        seen = version(ta.get(at("team-01")), "laws")
+        seen = version(ta.get(at("team-01", criterion="laws")), "laws")
         ta.post(at("team-01"), do="undo", criterion="laws", seen=seen)
         with Gradebook(grades) as book:
             overrides = book.entry("team-01").overrides
@@ -249,7 +317,7 @@ def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
 
 def test_forged_forms_change_nothing(ta, grades):
     """Another button, another criterion, no version."""
-    seen = version(ta.get(at("team-01")), "laws")
+    seen = version(ta.get(at("team-01", criterion="laws")), "laws")
     for form in ({"do": "drop"}, {"do": "change", "criterion": "x", "seen": seen, "points": "1"},
                  {"do": "change", "criterion": "laws", "points": "1", "why": "x"},
                  {"do": "undo", "criterion": "laws", "seen": seen}):  # fmt: skip
@@ -279,8 +347,8 @@ def test_reasons_are_there_to_be_used_again(ta):
     """Of the same criterion, the commonest first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
         change(ta, team, points="1", why=why)
-    page = ta.get(at("team-08")).text
-    offered = re.search(r'<datalist id="reasons-laws">(.*?)</datalist>', page)
+    page = ta.get(at("team-08", criterion="laws")).text
+    offered = re.search(r'<datalist id="reasons">(.*?)</datalist>', page)
     assert offered
     assert re.findall('value="(.*?)"', offered[1])[:2] == ["b", "a"]
 
@@ -319,7 +387,7 @@ def two_desks(database, tmp_path):
 def test_two_change_the_same_and_one_is_told(two_desks, database):
     """The second sees both versions, and the news; nothing of theirs was written."""
     ada, bob, eve = two_desks
-    seen = version(bob.get(at("team-04")), "laws")
+    seen = version(bob.get(at("team-04", criterion="laws")), "laws")
     since = re.search(r"since=(\d+)", bob.get(at("team-04")).text)
     assert since
     assert change(ada, "team-04", points="1", why="ada's reason", by="Mallory").status == 303
@@ -346,7 +414,7 @@ def test_of_changes_at_one_moment_one_counts(two_desks, database):
     """Twenty rounds of two that rest on the same page: one is taken, one refused."""
     ada, bob, _ = two_desks
     for number in range(20):
-        seen = version(ada.get(at("team-06")), "pieces")
+        seen = version(ada.get(at("team-06", criterion="pieces")), "pieces")
         ready = Barrier(2)
 
         def give(who, why, *, seen=seen, ready=ready):
@@ -377,9 +445,9 @@ def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
             assert not book.entry("team-01").overrides
     assert upload(ta, ROOM + "import", "table", "a,b\n1,2\n").status == 422
     assert upload(ta, ROOM + "import", "table", head + good).status == 303
-    assert "2 changes taken over" in ta.get(ROOM).text
+    assert "2 changes imported" in ta.get(ROOM).text
     upload(ta, ROOM + "import", "table", head + good)
-    assert "0 changes taken over, 2 were so before" in ta.get(ROOM).text
+    assert "0 changes imported, 2 were the same already" in ta.get(ROOM).text
     with Gradebook(grades) as book:
         assert book.entry("team-01").overrides["laws"].why == "clear, at last"
         assert book.entry("Ünal 学生 & co").overrides["pieces"].by == "Ada"
@@ -462,6 +530,12 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
                 link = unescape(link).split("#")[0]
                 if "feedback/" in link and not link.startswith("/"):
                     link = ROOM + link
+                # One team is enough for each criterion; a way through a list shows the same pages.
+                more = link.partition("team?")[2]
+                if re.search("(flag|lost|seen)=", more) or (
+                    re.search("(criterion|remark)=", more) and shown[1] not in link
+                ):
+                    continue
                 if link.startswith(ROOM) and link not in seen and "?page" not in link:
                     waiting.append(link)
         assert len(seen) > 2 * len(shown)
@@ -475,7 +549,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_the_lines_of_a_class_are_those_of_its_grades(grades):
-    """Read from briefs without validation, and again from what is known: the same."""
+    """Read in part, and again from what is known: the same."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:
@@ -496,13 +570,138 @@ def test_an_older_gradebook_gets_what_it_lacks(grades):
     with Gradebook(grades) as book:
         before = [(e.submission, e.grade) for e in book.entries()]
         with closing(sqlite3.connect(grades / FILE)) as raw:
-            raw.executescript("DROP TABLE briefs; DROP TABLE looks")
+            raw.executescript("DROP TABLE looks")
         with OpenBook(grades) as opened, OpenBook(grades) as again:
             listings = opened.class_now().listings
-            assert [(n.line.name, n.line.points) for n in listings] == [
+            assert [(n.line.submission, n.line.points) for n in listings] == [
                 (name, grade.points) for name, grade in before
             ]
             assert again.class_now() == opened.class_now()
             opened.mark("team-01", by="Ada", seen=True)
-            assert set(again.class_now().seen.values()) == {"Ada"}
+            assert {one.seen for one in again.class_now().listings} - {""} == {"Ada"}
         assert [(e.submission, e.grade) for e in book.entries()] == before
+
+
+# ------------------------------------------------------------- one decision for several teams
+
+
+def listed(answer: Answer) -> dict[str, list[str]]:
+    """Return the rows of a list of several: points now, after, total now, after."""
+    assert answer.status in (200, 409), answer.text
+    row = r'(?s)name="team" value="(.*?)".*?((?:<td class="r">.*?</td>\s*){4})'
+    rows = re.findall(row, answer.text)
+    cells = {unescape(name): re.findall(r'<td class="r">(.*?)</td>', own) for name, own in rows}
+    return {name: [re.sub("<.*?>", "", cell) for cell in own] for name, own in cells.items()}
+
+
+def together(**more: str) -> str:
+    """Return the address of the list of those with Hz who lost points of the laws."""
+    about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
+    return f"{ROOM}together?{urlencode(about | more)}"
+
+
+def sent(answer: Answer, *teams: str, **fields: str) -> str:
+    """Return the form of such a list with some teams ticked."""
+    seen = {
+        f"seen.{name}": unescape(version)
+        for name, version in re.findall(r'name="seen\.(.*?)" value="(.*?)"', answer.text)
+    }
+    ticked = [("team", name) for name in teams]
+    return urlencode([*seen.items(), *fields.items(), ("listed", "1"), *ticked])
+
+
+def apply(who: Visitor, address: str, form: str) -> Answer:
+    """Send it."""
+    return who.send(address, form.encode(), kind="application/x-www-form-urlencoded")
+
+
+def test_one_decision_for_several_is_looked_through_first(ta, grades):
+    """Points before and after; who is not ticked stays; signed, and undone at once."""
+    with Gradebook(grades) as book:
+        before = {entry.submission: entry.grade for entry in book.entries()}
+    page = ta.get(together(points="0.5"))
+    rows = listed(page)
+    flagged = {n for n, g in before.items() if any(f.code == "hz_for_rad_s" for f in g.flags)}
+    lost = {
+        n for n, g in before.items() if any(c.id == "laws" and c.points < 1 for c in g.criteria)
+    }
+    assert set(rows) == flagged & lost
+    left, *ticked = rows
+    answer = apply(ta, together(), sent(page, *ticked, do="apply", points="0.5", why="one unit"))
+    assert answer.status == 303
+    with Gradebook(grades) as book:
+        after = {entry.submission: entry for entry in book.entries()}
+        for name in ticked:
+            given = after[name].overrides["laws"]
+            assert (given.points, given.why, given.by) == (0.5, "one unit", "Ada")
+            assert rows[name][1:4:2] == ["0.5", f"{after[name].grade.points:g}"]
+            assert book.history(name)[1][-1].text == "one unit"
+        assert after[left].grade == before[left]
+    done = ta.get(answer.headers["location"])
+    assert f"{len(ticked)} teams changed" in done.text
+    ta.post(answer.headers["location"], do="undo", set=done.value("set"))
+    with Gradebook(grades) as book:
+        assert {entry.submission: entry.grade for entry in book.entries()} == before
+
+
+def test_a_comment_changes_no_points(ta, grades):
+    """Points and outcome stay, the team reads the comment."""
+    page = ta.get(together())
+    names = list(listed(page))
+    with Gradebook(grades) as book:
+        before = {name: book.entry(name).grade for name in names}
+    form = sent(page, *names, do="apply", points="same", why="Mind the unit.")
+    assert apply(ta, together(), form).status == 303
+    with Gradebook(grades) as book:
+        for name in names:
+            grade = book.entry(name).grade
+            assert [c.points for c in grade.criteria] == [c.points for c in before[name].criteria]
+            was, now = (
+                next(c for c in g.criteria if c.id == "laws") for g in (before[name], grade)
+            )
+            assert (now.points, now.outcome) == (was.points, was.outcome)
+            assert now.message == f"{was.message} Mind the unit."
+    assert "Mind the unit." in ta.get(f"{ROOM}feedback/{quote(names[0])}/feedback.html").text
+
+
+def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
+    """No comment, points that are none, nobody ticked, somebody who changed meanwhile."""
+    page = ta.get(together())
+    names = list(listed(page))
+    for wrong, fields in (
+        ("needs a reason", {"points": "0.5", "why": " "}),
+        ("Expected 0 to 1 points", {"points": "7", "why": "x"}),
+        ("Many: points are a number", {"other": "many", "points": "same", "why": "x"}),
+    ):
+        answer = apply(ta, together(), sent(page, *names, do="apply", **fields))
+        assert answer.status == 422
+        assert wrong in unescape(answer.text)
+    assert apply(ta, together(), sent(page, do="apply", points="1", why="x")).status == 422
+    change(ta, names[1], points="0", why="mine")
+    answer = apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
+    assert answer.status == 409
+    assert answer.text.count("changed meanwhile") == 1
+    assert listed(answer)[names[1]][0] == "0"  # as it is now
+    with Gradebook(grades) as book:
+        given = {name: book.entry(name).overrides for name in names}
+        assert {name: own["laws"].why for name, own in given.items() if own} == {names[1]: "mine"}
+    again = apply(ta, together(), sent(answer, *names, do="apply", points="0.5", why="one unit"))
+    assert again.status == 303  # looked through once more
+
+
+def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
+    """Whoever was changed since stays, and is named; the class page has each decision."""
+    page = ta.get(together())
+    names = list(listed(page))
+    apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
+    change(ta, names[0], points="1", why="right after all")
+    shown = ta.get(ROOM)
+    assert f"{len(names)} teams" in shown.text.split('id="sets"')[1]
+    ta.post(ROOM + "together", do="undo", set=shown.value("set"))
+    page = ta.get(ROOM).text
+    assert f"{len(names) - 1} teams taken back. Changed since, so as before: {names[0]}." in page
+    with Gradebook(grades) as book:
+        given = {name: book.entry(name).overrides for name in names}
+    assert {name: own["laws"].why for name, own in given.items() if own} == {
+        names[0]: "right after all"
+    }

@@ -10,8 +10,8 @@ import psutil
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.jobs import _HANDS, _WAITING, Busy, Failed, Hand, Jobs
-from pipeline.processes import LineProcess
+from pipeline.desk.jobs import _HANDS, _WAITING, Busy, Jobs, WorkerPool
+from pipeline.processes import Failed, LineProcess
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
 from tests.helpers.waiting import PATIENCE, until
 
@@ -28,26 +28,26 @@ def jobs():
 
 def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
     """Another's task is done meanwhile; of those that wait for the folder, not all threads do."""
-    slow, hand = a_submission(tmp_path / "slow"), Hand()
+    slow, workers = a_submission(tmp_path / "slow"), WorkerPool()
 
     def ask(task: str) -> threading.Thread:
         def run() -> None:
             with suppress(Failed):
-                hand.do(task, folder=str(slow))
+                workers.do(task, folder=str(slow))
 
         thread = threading.Thread(target=run)
         thread.start()
         return thread
 
-    threads = [ask("report")]
-    until(lambda: hand._free.qsize() < _HANDS)
-    assert hand.do("files", folder=str(tmp_path)) == []
-    threads += [ask("files") for _ in range(_WAITING - 1)]
-    until(lambda: hand._folders[str(slow)][0]._value == 0)  # type: ignore[attr-defined]
+    threads = [ask("make_report")]
+    until(lambda: workers._free.qsize() < _HANDS)
+    assert workers.do("list_files", folder=str(tmp_path)) == []
+    threads += [ask("list_files") for _ in range(_WAITING - 1)]
+    until(lambda: workers._folders[str(slow)][0]._value == 0)  # type: ignore[attr-defined]
     with pytest.raises(Busy):
-        hand.do("files", folder=str(slow))
+        workers.do("list_files", folder=str(slow))
     assert threads[0].is_alive()
-    hand.close()
+    workers.close()
     for thread in threads:
         thread.join()
 
@@ -57,8 +57,8 @@ def test_a_stop_waits_for_no_thread(tmp_path):
     """Where all that answer are busy, a page waits, and a Stop does not."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
-        visitor, hand = Visitor.of(server.url), server._desk.hand
-        processes = [hand._free.get() for _ in range(_HANDS)]
+        visitor, workers = Visitor.of(server.url), server._desk.workers
+        processes = [workers._free.get() for _ in range(_HANDS)]
         path = "/exercises/picture.svg?preset=throne-2dof&hide=nothing"
         threads = [threading.Thread(target=visitor.get, args=(path,)) for _ in range(45)]
         for thread in threads:
@@ -68,7 +68,7 @@ def test_a_stop_waits_for_no_thread(tmp_path):
             assert visitor.post("/student/0/stop").status == 303
         finally:
             for process in processes:
-                hand._free.put(process)
+                workers._free.put(process)
         for thread in threads:
             thread.join()
 
@@ -76,7 +76,7 @@ def test_a_stop_waits_for_no_thread(tmp_path):
 def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch):
     """The desk says so, and does not wait for it when it is closed."""
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
-    job = jobs.start("report", title="The report", place=tmp_path, folder=str(tmp_path))
+    job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over)
     assert (job.state, "no process could be started" in job.said) == ("failed", True)
 
@@ -92,13 +92,13 @@ def test_a_fault_of_our_own_is_told(tmp_path, jobs):
 def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
     """The same again is the same job; another is refused with what is under way."""
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
-    job = jobs.start("report", title="The report", **given)
-    assert jobs.start("report", title="The report", **given) is job
+    job = jobs.start("make_report", title="The report", **given)
+    assert jobs.start("make_report", title="The report", **given) is job
     with pytest.raises(Busy, match="The report is under way"):
-        jobs.start("solution", title="The solution", **given)
+        jobs.start("make_solution", title="The solution", **given)
     job.stop.set()
     until(lambda: job.over)
-    assert jobs.start("solution", title="The solution", **given) is not job
+    assert jobs.start("make_solution", title="The solution", **given) is not job
 
 
 def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_path):
@@ -170,22 +170,23 @@ def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
 
 def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
     """What went wrong is said, with its kind; the same process does the next task."""
-    hand = Hand()
+    workers = WorkerPool()
     with pytest.raises(Failed, match=r"cartlab itself failed \(TypeError: .*please report it"):
-        hand.do("plan", folder=str(tmp_path), stock=True, nonsense=1)
-    process = hand._free.get()
+        workers.do("propose_recordings", folder=str(tmp_path), stock=True, nonsense=1)
+    worker = workers._free.get()
+    process = worker._process
     assert process is not None
     assert "Traceback" in process.said()
-    hand._free.put(process)
-    assert hand.do("files", folder=str(tmp_path)) == []
+    workers._free.put(worker)
+    assert workers.do("list_files", folder=str(tmp_path)) == []
     assert process.runs
-    hand.close()
+    workers.close()
 
 
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("pipeline.desk.worker", b"no json\n"),
+        ("pipeline.desk.tasks", b"no json\n"),
         ("pipeline.desk.bench.process", b'{"folder": ".", "explore": [[], 7]}\n'),
     ],
 )
@@ -210,21 +211,22 @@ def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
 
     raised = []
     monkeypatch.setattr(threading, "excepthook", raised.append)
-    monkeypatch.setattr("pipeline.desk.jobs.LineProcess", no_more)
-    job = jobs.start("report", title="The report", place=tmp_path, folder=str(tmp_path))
+    monkeypatch.setattr("pipeline.processes.LineProcess", no_more)
+    job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over and raised)
     assert (job.state, job.said) == ("failed", "the desk itself failed (MemoryError: no more)")
 
 
 def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
     """A worker whose desk was killed ends by itself."""
-    hand = Hand()
-    hand.do("files", folder=str(tmp_path))
-    process = hand._free.get()
-    hand._free.put(process)
+    workers = WorkerPool()
+    workers.do("list_files", folder=str(tmp_path))
+    worker = workers._free.get()
+    workers._free.put(worker)
+    process = worker._process
     assert process is not None
     (child,) = [p for p in psutil.Process().children() if p.pid == process._process.pid]
     assert process._process.stdin is not None
     process._process.stdin.close()
     until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
-    hand.close()
+    workers.close()

@@ -17,14 +17,15 @@ from urllib.parse import unquote
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.jobs import Failed, Hand
-from pipeline.desk.last_report import sources
-from pipeline.desk.state import Desk
+from pipeline.desk.ask import Desk
+from pipeline.desk.jobs import WorkerPool
+from pipeline.desk.last_report import stat_sources
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.lock import turn_in
+from pipeline.processes import Failed
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
@@ -53,16 +54,18 @@ def filled(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def hand():
+def workers():
     """What does the short tasks of no desk."""
-    hand = Hand()
-    yield hand
-    hand.close()
+    workers = WorkerPool()
+    yield workers
+    workers.close()
 
 
-def take_upload(name: str, content: io.BytesIO, folder: Path, *, hand: Hand) -> list[str]:
-    """Upload one file."""
-    return take_uploads([(name, content)], folder, hand=hand)
+def take_upload(name: str, content: io.BytesIO, folder: Path, *, workers: WorkerPool) -> list[str]:
+    """Upload one file; return what is said."""
+    said = take_uploads([(name, content)], folder, workers=workers)
+    assert all(("not taken" in line.text) == (line.tone == "refused") for line in said)
+    return [line.text for line in said]
 
 
 def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
@@ -71,7 +74,7 @@ def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
     (folder / "report" / "report.html").write_text("<p>the report</p>", encoding="utf-8")
     (folder / "report" / "report.pdf").write_bytes(b"%PDF")
     asked = [{"id": id_, "text": "Why?"} for id_ in ids]
-    told = {"questions": asked, "failed": [], "changes": "", "made_of": sources(folder)}
+    told = {"questions": asked, "failed": [], "changes": "", "made_of": stat_sources(folder)}
     (folder / "report" / "questions.json").write_text(json.dumps(told), encoding="utf-8")
     return ids
 
@@ -93,7 +96,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     """Without any script: files become a submission, it a report, answers notes, all a hand-in."""
     visitor, folder = room
     assert "Begin with your files" in visitor.get(HERE).text
-    assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE
+    assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE + "#files"
     page = visitor.get(HERE)
     assert page.text.count("<polyline") >= len(some_files())
     assert {e.file for e in load_submission(folder).experiments} == {
@@ -102,7 +105,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     given = {"title": "One <cart>", "system.position.unit": "cm", "reported.final.K": "28.90",
              "system.springs.shown": "1", "system.springs": "0"}  # fmt: skip
     saved = visitor.post(HERE + "save", seen=page.value("seen"), **given)
-    assert (saved.status, saved.headers["location"]) == (303, HERE)
+    assert (saved.status, saved.headers["location"]) == (303, HERE + "#details")
     submission = load_submission(folder)
     assert (submission.title, submission.system.springs) == ("One <cart>", (True, False))
     assert submission.reported is not None
@@ -122,11 +125,11 @@ def test_from_an_empty_folder_to_the_zip(room):
     asked = json.loads(told.read_text(encoding="utf-8"))
     asked["questions"].append({"id": "zeta", "text": "Why?"})
     told.write_text(json.dumps(asked), encoding="utf-8")
-    seen = visitor.get(HERE + "report").value("seen")
+    seen = visitor.get(HERE + "questions").value("seen")
     answered = visitor.post(HERE + "answer", id="zeta", answer="So.\r\nAnd so.", seen=seen)
     assert answered.status == 303
     assert (folder / "notes.md").read_text(encoding="utf-8").endswith("## zeta\n\nSo.\nAnd so.\n")
-    assert "And so.</textarea>" in visitor.get(HERE + "report").text
+    assert "And so.</textarea>" in visitor.get(HERE + "questions").text
 
     before = visitor.get(HERE + "report/report.pdf").body
     seen = visitor.get(HERE).value("seen")
@@ -251,7 +254,7 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
     said = "'a\\xa0b.csv': taken as a-b.csv; no name may have characters that do not show"
     assert said in page
     assert {e.file for e in load_submission(folder).experiments} <= {f"data/{n}" for n in names}
-    assert all(f"{name}<small>" in page for name in names)
+    assert all(f"{name} <small>" in page for name in names)
 
 
 @pytest.mark.parametrize("named", [True, False])
@@ -283,7 +286,7 @@ def test_handing_in_warns_of_open_questions(filled):
     ask_for(folder, "zeta", "level")
     for answered, open_ in ((None, "2 questions"), ("zeta", "1 question "), ("level", "")):
         if answered:
-            seen = visitor.get(HERE + "report").value("seen")
+            seen = visitor.get(HERE + "questions").value("seen")
             visitor.post(HERE + "answer", id=answered, answer="So.", seen=seen)
         page = visitor.get(HERE).text
         assert bool(re.search(r"have not answered", page)) == bool(open_)
@@ -301,7 +304,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
         seen = visitor.get(HERE).value("seen")
         visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "1.25"})
     elif change == "answer":
-        seen = visitor.get(HERE + "report").value("seen")
+        seen = visitor.get(HERE + "questions").value("seen")
         visitor.post(HERE + "answer", id="zeta", answer="So.", seen=seen)
     elif change == "older":
         file.write_bytes(file.read_bytes() + b"\n")
@@ -326,7 +329,7 @@ def test_what_is_handed_in_is_shown_before(filled):
     (folder / NAME).write_text(bare, encoding="utf-8")
     (folder / "notes.md").unlink(missing_ok=True)
     page = handed_in(visitor)
-    names = re.findall(r'<tr><th scope="row">(.*?)</th><td>([\d,]+)</td>', page)
+    names = re.findall(r"<li>(\S+) <small>([\d,]+) bytes</small></li>", page)
     with zipped(visitor) as archive:
         held = {info.filename: f"{info.file_size:,}" for info in archive.infolist()}
     assert dict(names) == held
@@ -336,7 +339,7 @@ def test_what_is_handed_in_is_shown_before(filled):
                                          "system.input.unit", "system.input.sign"}  # fmt: skip
     assert dict(taken)["system.position.unit"].startswith(": count")
     asked = json.loads((folder / "report" / "questions.json").read_bytes())["questions"]
-    assert page.count(f'href="{HERE}report#question-') == len(asked)
+    assert page.count(f'href="{HERE}questions#question-') == len(asked)
 
 
 def test_only_a_report_of_these_files_says_what_was_assumed(filled):
@@ -484,7 +487,7 @@ def test_of_two_answers_at_once_none_is_lost(filled):
     """Either both stand in the notes, or one is told of the other."""
     visitor, folder = filled
     asked = ask_for(folder, *(f"zeta_{i}" for i in range(6)))
-    seen = visitor.get(HERE + "report").value("seen")
+    seen = visitor.get(HERE + "questions").value("seen")
     with ThreadPoolExecutor(6) as pool:
         sent = {
             id_: pool.submit(visitor.post, HERE + "answer", id=id_, answer=f"of {id_}", seen=seen)
@@ -501,7 +504,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
     visitor, folder = filled
     ask_for(folder, "zeta")
     (folder / "notes.md").write_text("## level\n\nMine.\n", encoding="utf-8")
-    seen = visitor.get(HERE + "report").value("seen")
+    seen = visitor.get(HERE + "questions").value("seen")
     for words in ("Because.\n```", "# Aha", "x" * 1_000_001):
         page = visitor.post(HERE + "answer", id="zeta", answer=words, seen=seen)
         assert page.status == 422
@@ -557,13 +560,13 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
 
 
 @pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
-def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, hand):
+def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, workers):
     """By the limit of what is read."""
     for name in ("notes.md", "there/notes.md"):
-        (said,) = take_upload(name, io.BytesIO(broken), tmp_path, hand=hand)
+        (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
         assert "not taken" in said
     (tmp_path / "notes.md").write_bytes(broken)
-    assert take_upload("notes.md", io.BytesIO(b"So."), tmp_path, hand=hand) == []
+    assert take_upload("notes.md", io.BytesIO(b"So."), tmp_path, workers=workers) == []
     assert (tmp_path / "notes.md").read_bytes() == b"So."
 
 
@@ -579,10 +582,10 @@ NAMES = {
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_file_goes_nowhere_but_into_data(name, tmp_path, hand):
+def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
     """Whatever it is called."""
     (tmp_path / "team").mkdir()
-    take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", hand=hand)
+    take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", workers=workers)
     found = [path.relative_to(tmp_path / "team") for path in tmp_path.rglob("*.csv")]
     if NAMES[name]:
         assert found == [Path("data") / str(NAMES[name])]
@@ -590,47 +593,47 @@ def test_a_file_goes_nowhere_but_into_data(name, tmp_path, hand):
         assert [path.parent for path in found] == [Path("data")]
 
 
-def test_nothing_is_written_over(tmp_path, hand):
+def test_nothing_is_written_over(tmp_path, workers):
     """The same file again is none; another of its name gets another name; links stay links."""
     for raw in (b"one", b"one", b"two", b"two"):
-        take_upload("a.csv", io.BytesIO(raw), tmp_path, hand=hand)
+        take_upload("a.csv", io.BytesIO(raw), tmp_path, workers=workers)
     assert {p.name: p.read_bytes() for p in (tmp_path / "data").iterdir()} == {
         "a.csv": b"one", "a-2.csv": b"two",
     }  # fmt: skip
     secret = tmp_path / "secret"
     secret.write_bytes(b"secret")
     (tmp_path / "data" / "b.csv").symlink_to(secret)
-    take_upload("b.csv", io.BytesIO(b"mine"), tmp_path, hand=hand)
+    take_upload("b.csv", io.BytesIO(b"mine"), tmp_path, workers=workers)
     assert secret.read_bytes() == b"secret"
     assert (tmp_path / "data" / "b-2.csv").read_bytes() == b"mine"
 
 
-def test_files_of_one_name_at_once_are_all_kept(tmp_path, hand):
+def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
     """Each under a name of its own."""
     raws = [str(i).encode() * 200_000 for i in range(8)]
 
     def take(raw: bytes) -> list[str]:
-        return take_upload("a.csv", io.BytesIO(raw), tmp_path, hand=hand)
+        return take_upload("a.csv", io.BytesIO(raw), tmp_path, workers=workers)
 
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(take, raws))
     assert sorted(p.read_bytes() for p in (tmp_path / "data").iterdir()) == raws
 
 
-def test_a_linked_data_folder_is_refused(tmp_path, hand):
+def test_a_linked_data_folder_is_refused(tmp_path, workers):
     """What a link points at may be anybody's."""
     (tmp_path / "theirs").mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs")
     try:
-        said = take_upload("a.csv", io.BytesIO(b"x"), tmp_path / "mine", hand=hand)
+        said = take_upload("a.csv", io.BytesIO(b"x"), tmp_path / "mine", workers=workers)
     except Exception as error:
         said = [str(error)]
     assert "link" in said[0]
     assert list((tmp_path / "theirs").iterdir()) == []
 
 
-def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, hand):
+def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
     """Recordings of a zip are taken; a bomb, a link and a way out are refused with their reason."""
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
@@ -641,42 +644,42 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, hand):
         return io.BytesIO(buffer.getvalue())
 
     good = zipped(("team/data/a.csv", b"x"), ("team/plot.py", b"import os"), ("__MACOSX/a", b"y"))
-    (said,) = take_upload("a.zip", good, tmp_path, hand=hand)
+    (said,) = take_upload("a.zip", good, tmp_path, workers=workers)
     assert "plot.py" in said
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["a.csv"]
     for wrong in (
         zipped(("big.csv", bytes(30_000_000))), zipped(("../out.csv", b"x")), io.BytesIO(b"PK"),
     ):  # fmt: skip
-        (said,) = take_upload("b.zip", wrong, tmp_path, hand=hand)
+        (said,) = take_upload("b.zip", wrong, tmp_path, workers=workers)
         assert "not taken" in said
     assert [path.name for path in tmp_path.rglob("*.csv")] == ["a.csv"]
 
 
-def test_a_folder_has_room_for_a_hand_in(tmp_path, hand, monkeypatch):
+def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
     """Then nothing more is taken."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
-    (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, hand=hand)
+    (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=workers)
     assert "larger than 10 bytes" in said
     limits = uploads.HAND_IN.__class__(members=2, total=15)
     monkeypatch.setattr(uploads, "HAND_IN", limits)
-    assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, hand=hand) == []
-    (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, hand=hand)
+    assert take_upload("a.csv", io.BytesIO(b"x" * 10), tmp_path, workers=workers) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y" * 6), tmp_path, workers=workers)
     assert "at most 2 files and 15 bytes" in said
     three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
-    (said,) = take_uploads(three, tmp_path / "whole", hand=hand)
-    assert said.startswith("'6.csv': not taken: a hand-in has at most 2 files")
+    (said,) = take_uploads(three, tmp_path / "whole", workers=workers)
+    assert said.text.startswith("'6.csv': not taken: a hand-in has at most 2 files")
 
 
-def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, hand, monkeypatch):
+def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
     """What was set aside, reports, a bench's raw files; what the zip holds counts."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes(bytes(100))
     monkeypatch.setattr(uploads, "HAND_IN", uploads.HAND_IN.__class__(members=2, total=50))
     (tmp_path / "notes.md").write_bytes(b"So.")
-    assert take_upload("a.csv", io.BytesIO(b"x"), tmp_path, hand=hand) == []
-    (said,) = take_upload("b.csv", io.BytesIO(b"y"), tmp_path, hand=hand)
+    assert take_upload("a.csv", io.BytesIO(b"x"), tmp_path, workers=workers) == []
+    (said,) = take_upload("b.csv", io.BytesIO(b"y"), tmp_path, workers=workers)
     assert "at most 2 files" in said
 
 
@@ -732,13 +735,13 @@ def test_the_gap_is_looked_for_as_a_job(filled):
     assert json.loads((folder / "gap" / "gap.json").read_bytes())["schema"] == "cartlab-gap/1"
 
 
-def test_a_task_says_why_it_came_to_nothing(tmp_path, hand):
+def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
     """In the words of the command; the process goes on."""
     with pytest.raises(Failed, match="no recording in it"):
-        hand.do("fill", folder=str(tmp_path))
+        workers.do("fill_tables", folder=str(tmp_path))
     with pytest.raises(Failed, match="leaves"):
-        hand.do("look", folder=str(tmp_path), file="../x.csv", columns={})
-    assert hand.do("files", folder=str(tmp_path)) == []
+        workers.do("look_at_file", folder=str(tmp_path), file="../x.csv", columns={})
+    assert workers.do("list_files", folder=str(tmp_path)) == []
 
 
 def test_saving_what_is_not_valid_changes_nothing(tmp_path):
@@ -762,3 +765,97 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
     assert "<b>data/book.xlsx</b>: a spreadsheet; save each sheet as .csv" in page
     assert "put the file itself here in place of the link" in page
     assert "&lt;b&gt;.docx" in visitor.get(HERE).text
+
+
+# ------------------------------------------------------------- what one click answers
+
+
+def answers(page: str) -> dict[str, str]:
+    """Return the buttons that answer a doubt: what each types, by its words."""
+    found = re.findall(r'<button name="answer" value="([^"]*)">([^<]*)</button>', page)
+    return {unescape(label): unescape(value) for value, label in found}
+
+
+def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
+    """The button saves the whole form; the doubt is gone from the page and from the file."""
+    visitor, folder = room
+    visitor.upload(HERE + "files", some_files())
+    page = visitor.get(HERE)
+    found = {"seen": page.value("seen"), "title": "Mine", "answer": answers(page.text)["Use cm"]}
+    assert visitor.post(HERE + "save", **found).status == 303
+    submission = load_submission(folder)
+    assert (submission.system.position.unit, submission.title) == ("cm", "Mine")
+    assert "Use cm" not in answers(visitor.get(HERE).text)
+    assert "a count has no fractions" not in (folder / NAME).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("There is one", True)])
+def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
+    """Either way: the doubt goes, though the answer may be what stood there."""
+    visitor, folder = room
+    visitor.upload(HERE + "files", some_files("two-cart"))
+    page = visitor.get(HERE)
+    assert "unsure" in (folder / NAME).read_text(encoding="utf-8").partition("[system]")[2]
+    answer = answers(page.text)[label]
+    assert visitor.post(HERE + "save", seen=page.value("seen"), answer=answer).status == 303
+    assert load_submission(folder).system.springs == (there, True, True)
+    assert label not in answers(visitor.get(HERE).text)
+
+
+def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
+    """A sign is turned, while the report is of the files as they are."""
+    visitor, folder = filled
+    ask_for(folder)
+    asked = folder / "report" / "questions.json"
+    wrong = {"key": "system.input.sign", "about": "", "value": 1.0, "support": "contradicted",
+             "taken": "+1", "why": "all steps go down"}  # fmt: skip
+    told = json.loads(asked.read_bytes()) | {"contradicted": [wrong]}
+    asked.write_text(json.dumps(told), encoding="utf-8")
+    page = visitor.get(HERE)
+    assert "all steps go down" in page.text
+    answer = answers(page.text)["Turn the sign"]
+    assert visitor.post(HERE + "save", seen=page.value("seen"), answer=answer).status == 303
+    assert load_submission(folder).system.input.sign == -1
+    assert "Turn the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
+
+
+def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
+    """By one click in its row, which takes the mark out of the file too."""
+    visitor, folder = room
+    rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(400)]
+    visitor.upload(HERE + "files", [("a.csv", "\n".join(["time,input,x1,x2", *rows]).encode())])
+    page = visitor.get(HERE)
+    found = answers(page.text)
+    assert "cart 2 hardly moves" in page.text
+    assert "# unsure: cart 2 hardly moves" in (folder / NAME).read_text(encoding="utf-8")
+    answer, seen = found["It was held"], page.value("seen")
+    assert visitor.post(HERE + "experiments/0", seen=seen, answer=answer).status == 303
+    assert load_submission(folder).experiments[0].carts == (1,)
+    assert "It was held" not in answers(visitor.get(HERE).text)
+    assert "hardly moves" not in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_what_was_not_taken_does_not_look_like_what_was(room):
+    """Where it was dropped: done, changed and refused differ in looks and in words."""
+    visitor, _ = room
+    raw = some_files(most=1)[0][1]
+    sent = [("a.csv", raw), ("a.csv", raw + b"\n"), ("plot.py", b"import os")]
+    visitor.upload(HERE + "files", sent)
+    files = unescape(visitor.get(HERE).text).partition('id="files"')[2]
+    said = dict(re.findall(r'<p class="said (\w+)">(.*?)</p>', files))
+    assert "written into" in said["done"]
+    assert said["changed"] == "'a.csv': taken as a-2.csv"
+    assert "'plot.py': not taken" in files
+    assert said["refused"]
+
+
+def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
+    """A dwell has its frequency; a group in which something is wrong is open."""
+    visitor, folder = filled
+    page = visitor.get(HERE).text
+    kinds = {e.kind for e in load_submission(folder).experiments}
+    assert {f'id="kind-{kind}"><summary>' in page for kind in kinds} == {True}
+    (folder / "data" / "bad.csv").write_bytes(b"")
+    page = visitor.get(HERE).text
+    assert 'id="kind-unknown" open><summary>' in page
+    assert "1 need" in page

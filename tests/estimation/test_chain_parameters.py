@@ -15,6 +15,7 @@ from pipeline.estimation.chain.parametrisation import (
 )
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.set_up import Bench
 
 
 @st.composite
@@ -33,7 +34,7 @@ def chains(draw: st.DrawFn) -> Chain:
 @given(chain=chains())
 def test_pack_and_unpack_are_inverse(chain):
     """A chain survives the way to theta and back, to the rounding of log and exp."""
-    P = Parametrisation(n=chain.n, springs=(True,) * (chain.n + 1))
+    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
 
     back = P.unpack(P.pack(chain))
 
@@ -44,7 +45,7 @@ def test_pack_and_unpack_are_inverse(chain):
 @given(chain=chains())
 def test_matrices_are_the_sum_of_the_directions(chain):
     """Parameters times their derivative matrices give M, C and K."""
-    P = Parametrisation(n=chain.n, springs=(True,) * (chain.n + 1))
+    P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
 
     for derivative, matrix in zip(P.matrix_derivatives, chain.matrices()[:3], strict=True):
         built = np.einsum("pij,p->ij", derivative, P.physical(chain))
@@ -55,7 +56,7 @@ def test_matrices_are_the_sum_of_the_directions(chain):
 def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
     """dp/dtheta agrees with a central difference."""
     chain = PRESETS["throne-3dof"]
-    P = Parametrisation(n=3, springs=(True,) * 4)
+    P = Parametrisation(bench=Bench(springs=(True,) * 4))
     theta, h = P.pack(chain), 1e-6
 
     for i, e in enumerate(np.eye(theta.size)):
@@ -66,8 +67,8 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
 def test_only_a_spring_that_may_be_missing_is_linear():
     """k_1 enters as it is where the far wall holds the carts, else as a logarithm."""
-    both = Parametrisation(n=2, springs=(True, True, True))
-    near = Parametrisation(n=2, springs=(True, True, False))
+    both = Parametrisation(bench=Bench(springs=(True, True, True)))
+    near = Parametrisation(bench=Bench(springs=(True, True, False)))
 
     assert [n for n, log in zip(both.names, both.logarithmic, strict=True) if not log] == ["k_1"]
     assert near.logarithmic.all()
@@ -76,7 +77,7 @@ def test_only_a_spring_that_may_be_missing_is_linear():
 
 def test_zero_parameters_leave_the_vector():
     """A parameter held at zero has no entry and stays zero."""
-    P = Parametrisation(n=2, springs=(True,) * 3).holding_at_zero("c_2", "k_1")
+    P = Parametrisation(bench=Bench(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
 
     chain = P.unpack(P.pack(PRESETS["throne-2dof"]))
 
@@ -87,14 +88,14 @@ def test_zero_parameters_leave_the_vector():
 
 def test_one_cart_has_one_stiffness_whichever_springs_hold_it():
     """One cart on the far spring alone has the same vector as on the near one."""
-    assert Parametrisation(n=1, springs=(False, True)).names == ("m_1", "c_1", "k_1")
-    assert Parametrisation(n=1, springs=(False, False)).names == ("m_1", "c_1")
+    assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
+    assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
 
 
 def test_carts_that_nothing_drives_are_refused():
     """A missing spring between carts is an error that names them."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
-        Parametrisation(n=3, springs=(True, True, False, True))
+        Parametrisation(bench=Bench(springs=(True, True, False, True)))
 
 
 def test_standard_errors_of_one_cart_follow_its_formulas():
@@ -120,7 +121,7 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
 def test_standard_errors_agree_with_a_sample():
     """Over a sample of chains the named parameters scatter as their standard errors say."""
     chain = PRESETS["throne-3dof"]
-    P = Parametrisation(n=3, springs=(True,) * 4)
+    P = Parametrisation(bench=Bench(springs=(True,) * 4))
     p = P.physical(chain)
     std = 1e-3 * np.where(p > 0, p, 0.05)
     got = named_estimates(chain, names=P.names, covariance=np.diag(std**2), source="bode_fit")
@@ -140,7 +141,7 @@ def test_a_start_is_a_possible_chain():
     """A negative spring is raised, the mask respected, the damping set; masses stay."""
     found = Chain(m=np.array([3e-4, 2e-4]), c=np.array([-1.0, 1.0]), k=np.array([-0.01, 0.1, 0.05]))
 
-    got = physical_start(found, springs=(True, True, False))
+    got = physical_start(found, bench=Bench(springs=(True, True, False)))
 
     assert np.all(got.k[:2] > 0)
     assert got.k[2] == 0
@@ -152,7 +153,7 @@ def test_a_start_is_a_possible_chain():
 @given(n=st.integers(1, 4), gain=st.floats(0.1, 1e4), omega=st.floats(0.5, 300.0))
 def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
     """The stand-in has cart 1's gain, and its lowest mode is the one given."""
-    got = even_chain({"K_1": gain, "omega_a": omega}, n=n, springs=(True,) * (n + 1))
+    got = even_chain({"K_1": gain, "omega_a": omega}, bench=Bench(springs=(True,) * (n + 1)))
 
     values = got.parameters()
     # Exact but for some ten roundings in the solve; the damping put in does not move omega_a.
@@ -163,4 +164,4 @@ def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
 def test_an_even_chain_needs_something_to_go_by():
     """Without a gain or without a resonance there is no scale to take."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
-        even_chain({"K_1": 1.0}, n=2, springs=(True,) * 3)
+        even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))

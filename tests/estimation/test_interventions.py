@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.interventions import between, find_interventions
-from pipeline.results_of_runs import Intervention
+from pipeline.results import Intervention
 from tests.truth.bench import Hand
 from tests.truth.cases import EFFECTS, Case, make_case
 

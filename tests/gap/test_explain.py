@@ -2,32 +2,32 @@
 
 import json
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.errors import DataError
 from pipeline.gap.data.runs import make_run
-from pipeline.gap.document import gap_json
-from pipeline.gap.explain import _may_be_half, explain_gap
-from pipeline.gap.fit.levenberg_marquardt import fit_model
+from pipeline.gap.explain import explain_gap
+from pipeline.gap.fit.levenberg_marquardt import Fitting, fit_model
 from pipeline.gap.fit.linearise import linearise
 from pipeline.gap.fit.structure import Structure
 from pipeline.gap.types import Gap
 from pipeline.gap.verdict.account import repeatability
+from pipeline.json_files import plain
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect, make_term
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
 from pipeline.results import Record
+from pipeline.set_up import Bench
+from tests.helpers.effects import make_term
 from tests.truth.bench import Hidden, simulate_truth
 from tests.truth.cases import COUNT, make_case
 
 
 def explain(case, **options) -> Gap:
     """Run the workflow on a case."""
-    return explain_gap(case.records, springs=case.springs, **options)
+    return explain_gap(case.records, Bench(springs=case.springs), **options)
 
 
 def names(gap: Gap) -> list[tuple[str, int]]:
@@ -167,7 +167,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(said):
         alone.append(replace(alone[0], id=f"step-{number}", kind="step", t=t, u=u, y=y))
     records = [replace(r, free=said) if r.kind == "step" else r for r in alone]
 
-    gap = explain_gap(records, springs=(True, True, True))
+    gap = explain_gap(records, Bench(springs=(True, True, True)))
 
     assert gap.verdict == "named"
     assert names(gap) == [("coulomb_friction", 1)]
@@ -184,7 +184,7 @@ def one_gap() -> Gap:
 
 def test_document_is_what_was_agreed(one_gap):
     """`gap.json` has the agreed keys, no NaN, and consistent figures."""
-    document = json.loads(json.dumps(gap_json(one_gap), allow_nan=False))
+    document = json.loads(json.dumps(plain(one_gap), allow_nan=False))
 
     assert document["schema"] == "cartlab-gap/1"
     assert document["verdict"] == "named"
@@ -204,12 +204,12 @@ def test_document_is_what_was_agreed(one_gap):
 
 
 def test_same_records_give_the_same_document(one_gap):
-    """The workflow has no chance in it: same records, same bytes, whatever the threads."""
+    """The workflow has no chance in it: same records, same bytes."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
-    again = explain(case, workers=1)
+    again = explain(case)
 
-    assert json.dumps(gap_json(again)) == json.dumps(gap_json(one_gap))
+    assert json.dumps(plain(again)) == json.dumps(plain(one_gap))
 
 
 def test_duplicate_files_do_not_judge_their_twin():
@@ -218,7 +218,7 @@ def test_duplicate_files_do_not_judge_their_twin():
     twin = case.records[0]
     copy = Record(**{**vars(twin), "id": "copy-of-a"})
 
-    gap = explain_gap([*case.records, copy], springs=case.springs)
+    gap = explain_gap([*case.records, copy], Bench(springs=case.springs))
 
     assert "copy-of-a" not in (*gap.training, *gap.held_out)
     assert any("duplicate" in note for note in gap.notes)
@@ -228,7 +228,7 @@ def test_single_run_is_cut_in_time():
     """With one run its last part is held out, and that is said."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
-    gap = explain_gap(case.records[:1], springs=case.springs)
+    gap = explain_gap(case.records[:1], Bench(springs=case.springs))
 
     assert gap.held_out
     assert any("40 %" in note for note in gap.notes)
@@ -249,7 +249,7 @@ def test_no_motion_is_one_clear_error():
     )
 
     with pytest.raises(DataError, match="free cart moves, found none"):
-        explain_gap([still], springs=(True, False))
+        explain_gap([still], Bench(springs=(True, False)))
 
 
 def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
@@ -305,7 +305,7 @@ def test_a_rigid_body_under_feedback(friction):
         positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
     ]
 
-    gap = explain_gap(records, springs=(False, False))
+    gap = explain_gap(records, Bench(springs=(False, False)))
 
     assert any("as a whole" in note for note in gap.notes)
     assert [run.experiment for run in gap.free_run] == [record.id for record in records]
@@ -324,7 +324,7 @@ def test_a_constant_force_without_springs():
         for i, r in enumerate(REFERENCES)
     ]
 
-    gap = explain_gap(records, springs=(False, False))
+    gap = explain_gap(records, Bench(springs=(False, False)))
 
     assert gap.verdict == "named"
     assert sorted(names(gap)) == [("coulomb_friction", 1), ("force_offset", 1)]
@@ -338,7 +338,7 @@ def test_a_single_decay_is_cut_where_it_still_moves():
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
     (decay, *_) = (r for r in case.records if r.kind == "decay")
 
-    gap = explain_gap([decay], springs=case.springs)
+    gap = explain_gap([decay], Bench(springs=case.springs))
 
     assert 0.0 < gap.noise_floor < 0.5  # the motion stands out of the noise
     assert all(r.noise_floor < 0.5 for r in gap.by_record)
@@ -349,7 +349,7 @@ def test_carts_that_no_run_shows_do_no_harm():
     case = make_case(seed=48, n=2, effects=[], rate=113.1)
     decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
 
-    gap = explain_gap(decays, springs=case.springs)
+    gap = explain_gap(decays, Bench(springs=case.springs))
 
     assert gap.verdict == "none"
 
@@ -360,7 +360,7 @@ def test_a_run_without_its_input_is_left_out_and_said():
     first, *others = case.records
     unknown = Record(**{**vars(first), "u": None})
 
-    gap = explain_gap([unknown, *others], springs=case.springs)
+    gap = explain_gap([unknown, *others], Bench(springs=case.springs))
 
     assert first.id not in (*gap.training, *gap.held_out)
     assert any(first.id in note for note in gap.notes)
@@ -386,7 +386,7 @@ def _late(*, seed: int) -> Record:
 
 def test_what_acts_in_the_held_out_data_alone_is_found_there():
     """Training and held-out data change sides, and it is said."""
-    gap = explain_gap([_late(seed=0)], springs=[True, False])
+    gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]
     assert gap.verdict == "named"
     assert gap.final < 1.05 * gap.noise_floor
@@ -404,17 +404,5 @@ def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
     start = Structure(springs=(True, False)).start(
         Chain(m=np.array([4e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     )
-    fit = fit_model(start, [run], iterations=5)
+    fit = fit_model(start, [run], Fitting(iterations=5))
     assert np.array_equal(fit.theta, start.theta)
-
-
-@pytest.mark.parametrize(
-    ("error", "contact", "repeatability", "said"),
-    [(0.014, False, 0.0, True), (0.012, False, 0.0, False), (0.014, True, 0.0, False),
-     (0.014, False, 0.01, False)],
-)  # fmt: skip
-def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """Not beside a contact, whose own law is not the model's, nor within what repeats differ by."""
-    chosen: Any = SimpleNamespace(error=error, has_contact=contact)
-    study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
-    assert _may_be_half(chosen, study) == said

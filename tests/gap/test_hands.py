@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
+from pipeline.json_files import plain
+from pipeline.set_up import Bench
 from tests.truth.cases import Case, make_case
 
 
@@ -14,7 +15,7 @@ def explained(request) -> tuple[Case, Gap]:
     """A linear bench on which every decay is plucked, one step nudged, no hold firm."""
     n = request.param
     case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
-    return case, explain_gap(case.records, springs=case.springs)
+    return case, explain_gap(case.records, Bench(springs=case.springs))
 
 
 def test_a_linear_bench_with_hands_is_linear(explained):
@@ -29,7 +30,7 @@ def test_hands_are_reported(explained):
     """In `gap.json` each has its record, cart and times."""
     case, gap = explained
     hands = [(name, h) for name, laid in case.hands.items() for h in laid if h.end < 1e9]
-    told = gap_json(gap)["interventions"]
+    told = plain(gap)["interventions"]
 
     assert len(told) == len(hands)
     for name, hand in hands:

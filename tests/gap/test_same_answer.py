@@ -4,8 +4,9 @@ import json
 import subprocess
 import sys
 
-from pipeline.gap.document import gap_json
 from pipeline.gap.explain import explain_gap
+from pipeline.json_files import plain
+from pipeline.set_up import Bench
 from tests.truth.cases import make_case
 
 
@@ -14,8 +15,8 @@ def test_two_busy_processes_change_no_byte():
     case = make_case(seed=61, n=2, effects=("coulomb_friction",), rate=113.1)
 
     def answer() -> str:
-        gap = explain_gap(case.records, springs=case.springs)
-        return json.dumps(gap_json(gap))
+        gap = explain_gap(case.records, Bench(springs=case.springs))
+        return json.dumps(plain(gap))
 
     alone = answer()
     busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]

@@ -8,15 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.class_lines import Line, wrong_springs
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.publish.class_page import class_page
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.chain import Chain
-from pipeline.schemas.grade import Grade
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench, write_bench
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import SLIPS, scaled
 
@@ -138,7 +139,7 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
 def test_a_decay_with_friction_is_no_wrong_logarithm(tmp_path):
     """Any ratio fits a reference so wide; the team's own final value says that it is not that."""
     bench = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:cart=1,force=0.003",))
-    write_bench(tmp_path / "team", bench, seed=3, reported=True)
+    write_submission(tmp_path / "team", bench, seed=3, reported=True)
     submission = load_submission(tmp_path / "team")
     rubric = load_rubric(Path("throne-1dof"))
     grade = grade_submission(submission, rubric=rubric, name="team").grade

@@ -11,16 +11,15 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.grade_class import grade_class
-from pipeline.grading.batch.runner import Limits
+from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.batch.so_far import class_so_far
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.history import history_text
-from pipeline.grading.gradings import Batch, Member
+from pipeline.grading.gradings import Batch
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.resources import RUBRICS
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.grades import (
     failed_grade,
     in_this_process,
@@ -40,11 +39,11 @@ def school(tmp_path_factory) -> Path:
     for seed, name in enumerate(("A/team-1", "B/team-1", "B/team-2")):
         write_submission(
             folder / name,
-            chain="throne-1dof",
+            "throne-1dof",
             seed=seed,
-            authors=(f"s{seed}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{seed}",)),
         )
     step = (folder / "A/team-1/data/step-1.csv").read_bytes()
     (folder / "B/team-2/data/step-2.csv").write_bytes(step)
@@ -64,11 +63,7 @@ def grade(*paths: Path, out: Path, rubric: Path = Path("throne-1dof")):
         paths,
         rubric_file=rubric,
         out=out,
-        jobs=1,
-        cluster=None,
-        limits=Limits(),
-        figures=False,
-        progress=lambda done, total, last: None,
+        options=Options(figures=False),
     )
 
 
@@ -204,7 +199,7 @@ def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
                 make_outcome(make_grade(n, authors=(who,)), key=f"{run} {n}", fingerprints=b"")
                 for n, who in names
             ]
-            found = class_so_far({o.submission: Member.of(o) for o in outcomes}, book)
+            found = class_so_far({o.submission: o.member for o in outcomes}, book)
             assert (dict(found.kept), found.taken_over) == ({}, ())
             assert found.moved == ({"a": "b", "b": "a"} if run else {})
             for outcome in outcomes:
@@ -230,7 +225,7 @@ def test_what_makes_two_the_same_submission(tmp_path):
             found = {}
             for name, (who, key, owner) in others.items():
                 new = make_outcome(make_grade(name, authors=who), key=key, owner=owner)
-                found[name] = Member.of(replace(new, fingerprints=b""))
+                found[name] = replace(new, fingerprints=b"").member
             return class_so_far(found, book).moved.get("old", "")
 
         number = (("ann l",), "1-x", "A (canvas 7)")
@@ -250,7 +245,7 @@ def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)
         book.finish(Batch(keys=(old.key,), shared={}), rubric=RUBRIC)
-        new = [Member.of(replace(old, submission=name)) for name in ("team-9", "class-team-3")]
+        new = [replace(old, submission=name).member for name in ("team-9", "class-team-3")]
         rows = {row.submission: row for row in new}
         assert class_so_far(rows, book).moved == {"team-3": "class-team-3"}
         assert class_so_far({"team-9": new[0]}, book).moved == {}

@@ -9,15 +9,15 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.batch.runner import code_version, grade_batch
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.worker import Setup, Task, grade_task
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
+from pipeline.simulated.submission import Students, write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
 from tests.helpers.grades import in_this_process
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -30,11 +30,11 @@ def school(tmp_path_factory):
     for number in (0, 2):
         write_submission(
             folder / f"team-{number}",
-            chain="throne-1dof",
+            "throne-1dof",
             seed=number,
-            authors=(f"s{number}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{number}",)),
         )
     step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
     (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
@@ -109,9 +109,8 @@ def test_what_was_handed_out_is_no_copy(school, tmp_path):
         with Gradebook(tmp_path, create=True) as book:
             batch = grade_batch(
                 find_hand_ins([school], scratch=tmp_path),
-                rubric=RUBRIC,
+                setup=Setup(rubric=RUBRIC, scratch=tmp_path),
                 book=book,
-                scratch=tmp_path,
                 execute=in_this_process,
                 examples=lambda examples=examples: examples,
             )

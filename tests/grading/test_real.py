@@ -12,7 +12,7 @@ from pipeline.grading.judge.run import grade_analysis, under_rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Analysis
-from pipeline.submission import Reported, StateSpace, Submission, load_submission
+from pipeline.submission import Reported, ReportedStateSpace, Submission, load_submission
 from pipeline.workflow import analyse
 from tests.helpers.grading_students import typed
 from tests.helpers.textbook_student import decay, initial_table
@@ -26,13 +26,15 @@ class Bench:
     submission: Submission
     analysis: Analysis
 
-    def flags(self, *, initial: dict, final: dict, space: StateSpace | None = None) -> list[str]:
+    def flags(
+        self, *, initial: dict, final: dict, space: ReportedStateSpace | None = None
+    ) -> list[str]:
         """Grade what is reported; return the flags but for what was not handed in."""
         reported = Reported(initial=initial, final=final, state_space=space)
         submission = self.submission.model_copy(update={"reported": reported})
         rubric = load_rubric(Path("ucsd-mae171a"))
-        grade = grade_analysis(submission, self.analysis, rubric=rubric, name="team-1")
-        return [f"{f.code}: {f.message}" for f in grade.flags if f.code != "missing"]
+        graded = grade_analysis(submission, self.analysis, rubric=rubric, name="team-1")
+        return [f"{f.code}: {f.message}" for f in graded.grade.flags if f.code != "missing"]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +68,7 @@ def test_textbook_numbers_get_no_flag(bench, sign, digits):
     final = {name: written(name, value) for name, value in chain.parameters().items()}
     initial = {name: written(name, float(v)) for name, v in first_estimates(bench).items()}
     A, B, _, _ = chain.state_space()
-    space = StateSpace(
+    space = ReportedStateSpace(
         A=tuple(tuple(typed(a) if a else Decimal(0) for a in row) for row in A.tolist()),
         B=tuple(typed(sign * b) if b else Decimal(0) for b in B[:, 0].tolist()),
     )

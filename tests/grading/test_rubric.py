@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.errors import ConfigError
+from pipeline.grading.grade import CODES
 from pipeline.grading.rubric import FlagCosts
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.rubric_text import rubric_dict, rubric_text
 from pipeline.resources import RUBRICS
-from pipeline.schemas.grade import CODES
 
 SHIPPED = sorted(RUBRICS.glob("*.toml"))
 GOOD = """\
@@ -179,7 +179,7 @@ def test_a_rubric_that_is_not_there_names_the_shipped_ones():
 def test_every_remark_has_its_cost():
     """Each code may be given a cost, but for the one that a person decides."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
-    assert all(load_rubric(path).flags.wrong_state_space == 0.5 for path in SHIPPED)
+    assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
 
 
 def test_toml_that_is_none_says_where(tmp_path):

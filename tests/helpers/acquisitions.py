@@ -7,14 +7,14 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from pipeline.bench.live.observer import Anomalies, RunOutcome
-from pipeline.bench.planning.plan import Limits, Plan, Recording
-from pipeline.bench.planning.plan_file import save_plan
 from pipeline.bench.protocol.messages import Reading
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_file import save_plan
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until
 
-LIMITS = Limits(input=0.5, travel=2.5)  # V, cm: what the virtual benches state as theirs
+LIMITS = PlanLimits(input=0.5, travel=2.5)  # V, cm: what the virtual benches state as theirs
 
 
 def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:
@@ -32,7 +32,7 @@ def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0
 
 
 def write_work(
-    folder: Path, recordings: Sequence[Recording], *, limits: Limits = LIMITS, scales: str = ""
+    folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits = LIMITS, scales: str = ""
 ) -> Path:
     """Write a submission of two carts with this plan; its scales are the bench's to state."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -19,15 +19,18 @@ from pipeline.results import (
     Estimate,
     FeedbackDesign,
     FrequencyResponse,
+    FrictionTest,
     HardwareCheck,
     LogDecrement,
     ParameterRow,
     Record,
     SinePoint,
     Skipped,
+    Stage,
+    StepEdge,
     StepGain,
 )
-from pipeline.results_of_runs import FrictionTest, StepEdge
+from pipeline.set_up import PAPER_UNITS, Bench
 
 NOTES = "## What we saw\n\nThe *dampings* differ, as `zeta_a` shows:\n\n- friction\n- play\n"
 _SAMPLE_TIME = 0.00884  # s, the ECP controller's
@@ -52,10 +55,7 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
         title=f"The {carts}-cart system, bench 4",
         section="03",
         authors=(("s1024", "Ada Lovelace"), ("s1025", "Émilie du Châtelet")),
-        carts=carts,
-        springs=(True,) * (carts + 1),
-        position_unit="cm",
-        input_unit="V",
+        bench=Bench(springs=(True,) * (carts + 1)),
         records=records,
         log_decrements=tuple(decay for _, decay in decays),
         step_gains=gains,
@@ -66,7 +66,9 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
         checks=_checks(carts),
         feedback=feedback,
         hardware=hardware,
-        skipped=(Skipped(stage="sweep", reason="sweep: needs a record, found none"),),
+        skipped=(
+            Skipped(stage=Stage.FREQUENCY_RESPONSE, reason="sweep: needs a record, found none"),
+        ),
         warnings=("decay-1-1: the release was found at 0.62 s; what lies before is not used",),
         files={f"data/{record.id}.csv": f"{i:064x}" for i, record in enumerate(records)},
         discussion=NOTES,
@@ -285,7 +287,7 @@ def _rows(fit: ChainFit, rng: np.random.Generator) -> tuple[ParameterRow, ...]:
         rows.append(
             ParameterRow(
                 name=name,
-                unit=read_name(name).unit(position="cm", input="V"),
+                unit=read_name(name).unit(PAPER_UNITS),
                 initial=initial,
                 final=final,
                 change_percent=100 * (final.value / initial.value - 1),
@@ -300,15 +302,16 @@ def _rows(fit: ChainFit, rng: np.random.Generator) -> tuple[ParameterRow, ...]:
 def _checks(carts: int) -> tuple[Check, ...]:
     return (
         Check(
-            id="order_omega", outcome="pass", value=0.0, limit=None,
+            kind="order", parameter="omega_1", outcome="pass", value=0.0, limit=None,
             message="omega_a lies below omega_1, as it must",
         ),
         Check(
-            id="R1", outcome="fail" if carts > 1 else "pass", value=0.041, limit=0.03,
+            kind="redundancy", parameter="R1", outcome="fail" if carts > 1 else "pass",
+            value=0.041, limit=0.03,
             message="the two routes to the s coefficient differ by 4.1 %",
         ),
         Check(
-            id="statics", outcome="skip", value=None, limit=None,
+            kind="step", run="step-a", outcome="skip", value=None, limit=None,
             message="the static gains need a step record",
         ),
     )  # fmt: skip

@@ -10,13 +10,13 @@ import numpy as np
 from pipeline.plant.loop.sampled_loop import StateFeedback
 from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.results import Record
+from pipeline.simulated import claims, runs
+from pipeline.simulated.bench import COUNT, BenchRun, SimulatedBench, TrueMotion
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.stages.state_feedback import design_feedback
-from pipeline.synthesis import COUNT, SAMPLE_TIME, claims, runs
-from pipeline.synthesis.hidden import prepare_bench
-from pipeline.synthesis.rig import Motion, Rig, Run
+from pipeline.submission import Design
 
 USUAL_NOISE = 0.2  # counts, as `cartlab simulate` has it
-_ZERO_ERROR = 2.0  # counts
 
 BENCHES = [
     (preset, effect.key)
@@ -28,8 +28,8 @@ BENCHES = [
 class Moved:
     """What the carts of a class did: for each team its runs and their motions."""
 
-    rig: Rig
-    teams: Sequence[Sequence[tuple[Run, Motion]]]
+    bench: SimulatedBench
+    teams: Sequence[Sequence[tuple[BenchRun, TrueMotion]]]
 
 
 def move_class(
@@ -37,55 +37,33 @@ def move_class(
 ) -> Moved:
     """Return how the carts moved for as many teams as there are seeds, all on one bench."""
     bench = prepare_bench(preset=preset, hide=(hide,) if hide else ())
-    chain = bench.chain
-    rig = Rig(
-        chain=chain,
-        sample_time=SAMPLE_TIME,
-        count=count,
-        noise=USUAL_NOISE * count,
-        zero_error=_ZERO_ERROR * count,
-        effects=bench.effects,
-    )
-    session = runs.Session(
-        sample_time=SAMPLE_TIME,
-        travel=bench.travel,
-        input_limit=bench.input_limit,
-        repeats=2,
-        n_dwells=dwells,
-        transients=True,
-        sweep_time=20.0,
-    )
+    bench = replace(bench, count=count)
+    session = runs.SimulatedSession(bench=bench, repeats=2, n_dwells=dwells)
     programme = [
-        *runs.steps(chain, session),
-        *runs.dwells(chain, session),
-        runs.sweep(chain, session),
+        *runs.plan_steps(session),
+        *runs.plan_dwells(session),
+        runs.plan_sweep(session),
     ]
-    same = {run.u.tobytes(): rig.move(run) for run in programme}
+    same = {run.u.tobytes(): bench.move(run) for run in programme}
     teams = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        controller = _controller(claims.believed_chain(chain, rng), rig=rig, session=session)
+        controller = _controller(claims.believed_chain(bench.chain, rng), bench)
         own = [
-            *runs.decays(chain, session, rng),  # no two hands let go alike
-            runs.closed_loop(
-                chain,
-                session,
-                cart=min(2, chain.n),
-                reference=session.travel,
-                controller=controller,
-            ),
+            *runs.plan_decays(session, rng),  # no two hands let go alike
+            runs.plan_closed_loop(session, cart=min(2, bench.chain.n), controller=controller),
         ]
-        moved = [(run, rig.move(run)) for run in own]
+        moved = [(run, bench.move(run)) for run in own]
         teams.append([*moved, *((run, same[run.u.tobytes()]) for run in programme)])
-    return Moved(rig=rig, teams=teams)
+    return Moved(bench=bench, teams=teams)
 
 
 def read_class(
     moved: Moved, *, seed: int, count: float | None = None, noise: float = USUAL_NOISE
 ) -> list[tuple[Record, ...]]:
     """Return what each team's encoders say of it, with noise in counts, as its files have it."""
-    count = moved.rig.count if count is None else count
-    rig = replace(moved.rig, count=count, noise=noise * count, zero_error=_ZERO_ERROR * count)
+    count = moved.bench.count if count is None else count
+    bench = replace(moved.bench, count=count, noise_counts=noise)
     decimals = max(0, math.ceil(-math.log10(count)) + 1)
     rng = np.random.default_rng(seed)
     return [
@@ -95,12 +73,12 @@ def read_class(
                 kind=run.kind,
                 t=run.t,
                 u=np.round(motion.u, runs.INPUT_DECIMALS),
-                y=np.round(rig.read(motion, run=run, rng=rng), decimals),
-                carts=tuple(range(1, rig.chain.n + 1)),
+                y=np.round(bench.read(motion, run=run, rng=rng), decimals),
+                carts=tuple(range(1, bench.chain.n + 1)),
                 free=run.free,
                 reference=run.reference,
                 omega=None if run.frequency is None else 2 * np.pi * run.frequency,
-                resolution=np.full(rig.chain.n, count),
+                resolution=np.full(bench.chain.n, count),
             )
             for run, motion in team
         )
@@ -108,16 +86,18 @@ def read_class(
     ]
 
 
-def _controller(believed, *, rig: Rig, session: runs.Session) -> StateFeedback:
+def _controller(believed, bench: SimulatedBench) -> StateFeedback:
     design = design_feedback(
         believed,
-        cart=min(2, rig.chain.n),
-        reference=session.travel,
-        overshoot_percent=10.0,
-        settling_time=1.0,
-        input_limit=session.input_limit,
-        sample_time=SAMPLE_TIME,
-        method="lqr",
+        Design(
+            cart=min(2, bench.chain.n),
+            reference=bench.travel,
+            overshoot_percent=10.0,
+            settling_time=1.0,
+            input_limit=bench.input_limit,
+            sample_time=bench.sample_time,
+            method="lqr",
+        ),
     )
     return StateFeedback(
         gains=np.array([float(f"{gain:.4g}") for gain in design.gains]),

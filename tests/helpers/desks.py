@@ -2,7 +2,6 @@
 
 import http.client
 import json
-import queue
 import re
 import shutil
 import threading
@@ -13,9 +12,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode, urlsplit
 
-from pipeline.desk.worker import answer
+from pipeline.desk.tasks import do
+from pipeline.processes import attempt
 from pipeline.resources import EXAMPLES
 from pipeline.submission.load import NAME
+from pipeline.words.progress import Progress, silent
 from tests.helpers.waiting import PATIENCE
 
 BOUNDARY = "----cartlab"
@@ -113,38 +114,24 @@ class Visitor:
 
 
 class WorkerHere:
-    """What a desk's worker does, in a thread of this process: another takes a second to start.
+    """What a desk's worker does, in this process: another takes a second to start.
 
     One task at a time; it is waited for, not killed.
     """
 
-    memory, runs = 0, True
     _turn = threading.Lock()
 
-    def __init__(self, module: str) -> None:
-        self._lines: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-        self._threads: list[threading.Thread] = []
+    def __init__(self, module: str, **_: object) -> None:
+        pass
 
-    def send(self, line: bytes) -> None:
-        """Begin a task."""
-        self._threads.append(threading.Thread(target=self._do, args=(line,)))
-        self._threads[-1].start()
-
-    def line(self, *, timeout: float) -> bytes:
-        """Return the next line about it."""
-        return self._lines.get(timeout=timeout)
+    def do(self, task: Any, *, tell: Progress = silent, **_: object) -> Any:
+        """Do a task, which comes and goes as JSON."""
+        with self._turn:
+            plain = json.loads(json.dumps(task))
+            return json.loads(json.dumps(attempt(lambda: do(plain, tell))))
 
     def close(self) -> None:
-        """Wait for its end."""
-        for thread in self._threads:
-            thread.join()
-
-    def _do(self, task: bytes) -> None:
-        def say(**line: Any) -> None:
-            self._lines.put(json.dumps(line).encode())
-
-        with self._turn:
-            answer(task, say)
+        """Have nothing to end."""
 
 
 def through_proxy(port: int, name: str, **given: str) -> Visitor:

@@ -1,5 +1,11 @@
 """A size for every effect, on `throne-2dof`: plain to see, and safely simulated."""
 
+from collections.abc import Mapping
+
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import Effect, EffectTerm
+from pipeline.plant.nonlinear.effects.base import chain_scales
+
 SIZES = {
     "coulomb_friction": {"force": 0.001},
     "stiction": {"force": 0.001, "static_force": 0.002, "velocity": 1.0},
@@ -21,3 +27,15 @@ SIZES = {
     "backlash": {"gap": 0.05},
     "cogging": {"force": 0.003, "pitch": 0.3, "phase": 1.0},
 }
+
+
+def make_term(
+    effect: Effect, *, place: int, values: Mapping[str, float], chain: Chain
+) -> EffectTerm:
+    """Return an effect with named values; contact details not given get a usual size."""
+    scales = chain_scales(chain, place=effect.place, at=place)
+    light = {"motor_mass": 0.1}
+    details = [p for p in effect.parameters if not p.reported]
+    usual = {p.name: light.get(p.name, p.typical) * p.size(scales) for p in details} | {**values}
+    sizes = tuple(float(usual[name]) for name in effect.names)
+    return EffectTerm(effect=effect, place=place, values=sizes)

@@ -1,4 +1,4 @@
-"""The firmware's core, compiled here: a controller as `pipeline.bench.emulator.core` is one."""
+"""The firmware's core, compiled here: a controller as `pipeline.simulated.emulator.core` is one."""
 
 import ctypes
 import shutil

@@ -1,9 +1,11 @@
-"""Kill a process again and again while it puts grades into a gradebook; say what was lost.
+"""Kill a process again and again while it writes into a gradebook; say what was lost.
 
-    python -m tests.helpers.gradebook_kills PLACE KILLS
+    python -m tests.helpers.gradebook_kills PLACE KILLS [answers]
 
 A child puts outcomes in and tells each through a pipe once `put` has returned. What it told must
-be there afterwards, whole, and beside it at most the one that it had no time to tell.
+be there afterwards, whole, and beside it at most the one that it had no time to tell. With
+`answers` it answers requests instead, each with other points: of these both must be there, or
+neither.
 """
 
 import os
@@ -11,9 +13,12 @@ import random
 import signal
 import sys
 import time
+from collections.abc import Callable
 
 from pipeline.grading.gradebook.book import Gradebook
-from tests.helpers.grades import hertz_flag, make_grade, make_outcome
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradings import Batch
+from tests.helpers.grades import hertz_flag, make_grade, make_outcome, two_cart_rubric
 
 _MOST_PUTS = 4  # that are waited for
 _LONGEST = 0.03  # s after that: a put takes some milliseconds
@@ -34,23 +39,71 @@ def put_until_killed(place: str, first: int, pipe: int) -> None:
         number += 1
 
 
+def answer_until_killed(place: str, first: int, pipe: int) -> None:
+    """Ask, answer with other points, reopen: each round tells its number once it is over."""
+    book, number = RequestBook(place), first
+    while True:
+        asked = book.queue().waiting
+        if not asked:
+            for done in book.queue().settled:
+                if done.request.state == "answered":
+                    book.reopen("team", "laws", by="Ada", seen=done.version)
+            book.ask("team", "laws", why=f"reason {number}", by="s1")
+            asked = book.queue().waiting
+        points = number % 10 / 10
+        book.answer("team", "laws", points, text=f"{number}", by="Ada", seen=asked[0].version)
+        os.write(pipe, f"{number}\n".encode())
+        number += 1
+
+
+def kill_once(child_does: Callable[[int], None], rng: random.Random) -> list[bytes]:
+    """Return the whole lines that a child told before it was killed."""
+    ours, theirs = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(ours)
+        child_does(theirs)
+    os.close(theirs)
+    with os.fdopen(ours, "rb") as pipe:
+        heard = [pipe.readline() for _ in range(rng.randint(0, _MOST_PUTS))]
+        time.sleep(_LONGEST * rng.random())
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+        heard += pipe.readlines()
+    return [line for line in heard if line.endswith(b"\n")]
+
+
+def kill_answers(place: str, kills: int) -> None:
+    """Kill who answers requests; every answer must be there with its points."""
+    outcome = make_outcome(make_grade("team", share=0.5))
+    with RequestBook(place, assignment="lab", create=True) as book:
+        book.put(outcome)
+        book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
+        book.release(True, by="prof")
+    rng, told, killed_within = random.Random(7), 0, 0
+    for _ in range(kills):
+        first = told
+        lines = kill_once(lambda pipe, n=first: answer_until_killed(place, n, pipe), rng)
+        killed_within += bool(lines)
+        told = int(lines[-1]) + 1 if lines else told
+        with RequestBook(place) as book:
+            events = book.history("team")[1]
+        answers = [(e.points, e.text) for e in events if e.what == "answered"]
+        given = [(e.points, e.text) for e in events if e.what == "override"]
+        assert answers == given, (answers[-2:], given[-2:])
+        numbers = [int(text) for _, text in answers]
+        assert numbers[:told] == list(range(told)), told
+        assert len(numbers) <= told + 1
+        told = len(numbers)
+    print(f"kills {kills} within {killed_within} told {told} there {told}")  # noqa: T201
+
+
 def main(place: str, kills: int) -> None:
     rng = random.Random(5)
     told, killed_within = 0, 0
     for _ in range(kills):
-        ours, theirs = os.pipe()
-        child = os.fork()
-        if child == 0:
-            os.close(ours)
-            put_until_killed(place, told, theirs)
-        os.close(theirs)
-        with os.fdopen(ours, "rb") as pipe:
-            heard = [pipe.readline() for _ in range(rng.randint(0, _MOST_PUTS))]
-            time.sleep(_LONGEST * rng.random())
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            heard += pipe.readlines()
-        lines = [line for line in heard if line.endswith(b"\n")]
+        first = told
+        lines = kill_once(lambda pipe, n=first: put_until_killed(place, n, pipe), rng)
         told = int(lines[-1]) + 1 if lines else told
         killed_within += bool(lines)
         with Gradebook(place, assignment="lab", create=True) as book:
@@ -66,4 +119,4 @@ def main(place: str, kills: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]))
+    (kill_answers if "answers" in sys.argv else main)(sys.argv[1], int(sys.argv[2]))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.gradings import Batch, Grading
@@ -24,7 +25,7 @@ from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
 from pipeline.resources import RUBRICS
 from pipeline.results import FrequencyResponse
-from pipeline.schemas.grade import Criterion, Flag, Grade, grade_text
+from pipeline.set_up import PAPER_UNITS
 
 
 def two_cart_rubric() -> Rubric:
@@ -32,11 +33,11 @@ def two_cart_rubric() -> Rubric:
     return load_rubric(RUBRICS / "throne-2dof.toml")
 
 
-def in_this_process(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
+def in_this_process(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
     """Run tasks without a worker, which takes longer to start than to grade a small class."""
-    rubric = Rubric.model_validate_json(setup.rubric)
+    how = {"rubric": setup.rubric, "scratch": setup.scratch, "figures": setup.figures}
     for task in tasks:
-        yield grade_task(task, rubric=rubric, scratch=Path(setup.scratch), figures=setup.figures)
+        yield grade_task(task, **how)
 
 
 def make_grade(name: str, *, share: float = 1.0, days_late: float = 0.0, **changes: Any) -> Grade:
@@ -126,6 +127,27 @@ def write_class(folder: Path, *, anonymous: bool = False) -> Path:
     return folder
 
 
+def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
+    """Grade a class called `lab`: a team with all points, and one that is late with a gain off.
+
+    The gradebook keeps what the checks found, as that of a real grading does.
+    """
+    from pipeline.grading.judge.reweigh import findings_text
+    from tests.helpers.grading_students import student  # simulates a bench and analyses it
+
+    honest = student(1)
+    rubric = honest.rubric.model_copy(update={"anonymous": anonymous})
+    wrong = honest.reporting(final={"K": 1.1 * honest.value("final", "K")})
+    folder.mkdir()
+    with Gradebook(folder, create=True, assignment="lab") as book:
+        for name, team, days_late in (("team-1", honest, 0.0), ("team-2", wrong, 1.3)):
+            graded = team.graded(days_late=days_late)
+            named = {"submission": name, "authors": (f"s {name}",)}
+            grade = graded.grade.model_copy(update=named)
+            book.put(make_outcome(grade, findings=findings_text(graded.verdicts)))
+        book.finish(Batch(keys=("key of team-1", "key of team-2"), shared={}), rubric=rubric)
+
+
 @cache
 def _class_files(*, anonymous: bool) -> dict[str, bytes]:
     """Return the files of such a folder by their names, made once a process."""
@@ -174,7 +196,7 @@ def _figure(name: str) -> tuple[tuple[str, str], ...]:
     values = {**chain.parameters(), "omega_a": chain.parameters()["omega_a"] / 2}
     with drawing():
         figure = reported_bode_figure(
-            measured, chain=chain, reported=transfer_functions(values), units=("cm", "V")
+            measured, chain=chain, reported=transfer_functions(values), units=PAPER_UNITS
         )
         svg = to_svg(figure, name="response-1", alt="Response of cart 1.")
     return (("response-1.svg", svg),)

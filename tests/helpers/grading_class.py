@@ -18,13 +18,23 @@ from pipeline.errors import DataError
 from pipeline.grading.judge.run import under_rubric
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.springs import with_all_springs
-from pipeline.grading.rubric import Rubric, is_damping
+from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import Term, find_effect
+from pipeline.plant.nonlinear.effects import EffectTerm, find_effect
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.hidden import preset_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.stages.state_feedback import design_feedback
-from pipeline.submission import Design, Feedback, Reported, StateSpace, Submission, load_submission
-from pipeline.synthesis import preset_chain, write_submission
+from pipeline.submission import (
+    Design,
+    Reported,
+    ReportedFeedback,
+    ReportedStateSpace,
+    Submission,
+    load_submission,
+)
 from pipeline.workflow import analyse
 from tests.helpers.grading_students import Student
 from tests.helpers.textbook_student import by_eye, final_table, initial_table
@@ -65,19 +75,21 @@ class Bench:
         """Which springs there are."""
         return tuple(bool(k > 0) for k in self.chain.k)
 
-    def effects(self) -> list[Term]:
+    def effects(self) -> list[EffectTerm]:
         """Return the dry friction."""
         if not self.friction:
             return []
         effect = find_effect("coulomb_friction")
         step = 0.5 * self.travel / float(np.max(self.chain.static_gains()))
         force = (self.friction * step,)
-        return [Term(effect=effect, place=i, values=force) for i in range(1, self.chain.n + 1)]
+        return [
+            EffectTerm(effect=effect, place=i, values=force) for i in range(1, self.chain.n + 1)
+        ]
 
 
 def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
     """Draw a bench from the whole range; every second one has dry friction."""
-    preset = preset_chain(f"throne-{carts}dof")
+    preset = preset_bench(f"throne-{carts}dof").chain
     m = preset.m * rng.uniform(0.7, 1.4, carts)
     k = preset.k * rng.uniform(0.7, 1.4, carts + 1)
     if carts > 1 and rng.random() < 0.5:
@@ -168,11 +180,13 @@ def _team(
 ) -> Team:
     write_submission(
         folder,
-        chain=bench.chain,
-        effects=bench.effects(),
+        SimulatedBench(
+            chain=bench.chain,
+            effects=tuple(bench.effects()),
+            count=bench.count,
+            travel=bench.travel,
+        ),
         seed=seed,
-        count=bench.count,
-        travel=bench.travel,
         compact=seed % 2 == 0,
         reported=True,
     )
@@ -237,7 +251,7 @@ def report(team: Team) -> Team:
         pass
     first = {x: _first(team, x, read.get(x, np.nan), right) for x, right in truth.items()}
     believed = {x: float(v) for x, v in team.reported.final.items()}
-    spread = {x: 0.1 if is_damping(x) else 0.01 for x in truth}
+    spread = {x: 0.1 if read_name(x).is_damping else 0.01 for x in truth}
     one_by_one = {x: v * (1 + spread[x] * _error(rng)) for x, v in truth.items()}
     final = [_fitted(team, first) or believed, believed, one_by_one][int(rng.integers(3))]
     table = {x: written(v, digits) for x, v in final.items()}
@@ -302,12 +316,12 @@ def is_real(chain: Chain) -> bool:
 
 def _first(team: Team, name: str, read: float, right: float) -> float:
     """Return a first estimate: as read, where that is honest, else as a careful student reads."""
-    guessed = team.bench.chain.n > 1 and is_damping(name) and not name[-1].isdigit()
+    guessed = team.bench.chain.n > 1 and read_name(name).is_damping and not name[-1].isdigit()
     if guessed:
         return 0.1
     by_hand = team.bench.chain.n > 1 and name.startswith("omega") and not name[-1].isdigit()
     limit = HONEST_BY_EYE if by_hand else HONEST_FIRST
-    limit = HONEST_FIRST_DAMPING if is_damping(name) else limit
+    limit = HONEST_FIRST_DAMPING if read_name(name).is_damping else limit
     if abs(np.log(max(read, 1e-300) / right)) <= np.log1p(limit):
         return read
     return right * float(np.exp(0.3 * limit * _error(team.rng)))
@@ -324,7 +338,7 @@ def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
     near = all(
         x in found
         and abs(np.log(found[x] / right))
-        <= np.log1p(HONEST_FINAL_DAMPING if is_damping(x) else HONEST_FINAL)
+        <= np.log1p(HONEST_FINAL_DAMPING if read_name(x).is_damping else HONEST_FINAL)
         for x, right in truth.items()
     )
     return {x: found[x] for x in truth} if near else None
@@ -335,28 +349,28 @@ def written(value: float, digits: int) -> Decimal:
     return Decimal(f"{value:#.{digits}g}".removesuffix("."))
 
 
-def state_space(A: Array, B: Array, *, digits: int) -> StateSpace:
+def state_space(A: Array, B: Array, *, digits: int) -> ReportedStateSpace:
     """Return A and B as typed."""
 
     def entry(value: float) -> Decimal:
         return Decimal(f"{value:g}") if value in (0.0, 1.0) else written(value, digits)
 
-    return StateSpace(
+    return ReportedStateSpace(
         A=tuple(tuple(map(entry, row)) for row in A.tolist()),
         B=tuple(map(entry, B[:, 0].tolist())),
     )
 
 
-def designed(submission: Submission, chain: Chain) -> Feedback | None:
+def designed(submission: Submission, chain: Chain) -> ReportedFeedback | None:
     """Return a controller made for a team's own carts, as typed."""
     task = submission.design or Design(cart=chain.n)
     try:
-        design = design_feedback(chain, **dict(task))
+        design = design_feedback(chain, task)
     except DataError:
         return None
     if design.settling_time is None:
         return None
-    return Feedback(
+    return ReportedFeedback(
         gains=tuple(written(g, 4) for g in design.gains.tolist()),
         prefilter=written(design.prefilter, 4),
         overshoot_percent=Decimal(f"{design.overshoot_percent:.1f}"),

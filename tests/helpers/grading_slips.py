@@ -11,8 +11,9 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.results import FrequencyResponse
+from pipeline.set_up import Bench
 from pipeline.stages.bode_fit import fit_bode
-from pipeline.submission import Feedback, Reported
+from pipeline.submission import Reported, ReportedFeedback
 from tests.helpers.grading_class import Team, written
 
 TURN = 2 * np.pi
@@ -188,8 +189,7 @@ def transient_used(team: Team) -> Team:
         try:
             fit = fit_bode(
                 _early(team, float(cycles)),
-                n=team.bench.chain.n,
-                springs=team.bench.springs,
+                bench=Bench(springs=team.bench.springs),
                 initial=truth,
             )
         except DataError:  # nothing fits such amplitudes; they would try others
@@ -249,7 +249,7 @@ def wrong_state_space(team: Team) -> Team:
     return reporting(team, team.reported.model_copy(update={"state_space": space}))
 
 
-def _feedback(team: Team) -> Feedback:
+def _feedback(team: Team) -> ReportedFeedback:
     assert team.reported.feedback is not None
     return team.reported.feedback
 

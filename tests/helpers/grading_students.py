@@ -8,14 +8,20 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from pipeline.grading.judge.run import grade_analysis, under_rubric
+from pipeline.grading.grade import Grade
+from pipeline.grading.judge.run import Graded, grade_analysis, under_rubric
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.results import Analysis
-from pipeline.schemas.grade import Grade
-from pipeline.submission import Feedback, Reported, StateSpace, Submission, load_submission
-from pipeline.synthesis import write_submission
-from pipeline.synthesis.hidden import prepare_bench
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import (
+    Reported,
+    ReportedFeedback,
+    ReportedStateSpace,
+    Submission,
+    load_submission,
+)
 from pipeline.workflow import analyse
 
 
@@ -42,8 +48,8 @@ class Student:
         *,
         initial: Mapping[str, float] | Mapping[str, Decimal] = MappingProxyType({}),
         final: Mapping[str, float] | Mapping[str, Decimal] = MappingProxyType({}),
-        state_space: StateSpace | None = None,
-        feedback: Feedback | None = None,
+        state_space: ReportedStateSpace | None = None,
+        feedback: ReportedFeedback | None = None,
     ) -> "Student":
         """Return the student with other numbers in the tables, typed to three digits."""
         update: dict = {
@@ -63,6 +69,10 @@ class Student:
 
     def grade(self, *, days_late: float = 0.0) -> Grade:
         """Grade what is reported against the recordings."""
+        return self.graded(days_late=days_late).grade
+
+    def graded(self, *, days_late: float = 0.0) -> Graded:
+        """Grade what is reported, with what the checks found."""
         return grade_analysis(
             self.submission, self.analysis, rubric=self.rubric, name="team-07", days_late=days_late
         )
@@ -82,13 +92,6 @@ def student(carts: int, *, hide: tuple[str, ...] = ()) -> Student:
     bench = prepare_bench(preset=preset, hide=hide)
     rubric = load_rubric(Path(preset))
     with tempfile.TemporaryDirectory() as folder:
-        write_submission(
-            Path(folder),
-            chain=bench.chain,
-            effects=bench.effects,
-            seed=3,
-            compact=True,
-            reported=True,
-        )
+        write_submission(Path(folder), bench, seed=3, compact=True, reported=True)
         submission, _ = under_rubric(load_submission(Path(folder)), rubric)
         return Student(submission=submission, analysis=analyse(submission), rubric=rubric)

@@ -10,17 +10,18 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_analysis, under_rubric
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, Term
+from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, EffectTerm
 from pipeline.results import Analysis, Estimate
-from pipeline.schemas.grade import Grade
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.hidden import default_values, preset_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import Reported, Submission, load_submission
-from pipeline.synthesis import preset_chain, write_submission
-from pipeline.synthesis.hidden import default_values
 from pipeline.workflow import analyse
 from tests.helpers.grading_class import designed, is_real, state_space, written
 from tests.helpers.textbook_student import by_eye, final_table, initial_table
@@ -37,7 +38,7 @@ _GROWS = {
 _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
-def draw_effect(chain: Chain, seed: int) -> Term:
+def draw_effect(chain: Chain, seed: int) -> EffectTerm:
     """Return the effect of a seed: nineteen seeds in a row have all of the catalogue."""
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
@@ -50,7 +51,7 @@ def draw_effect(chain: Chain, seed: int) -> Term:
     at = int(rng.choice(places))
     size = MOST if seed % 3 == 0 else float(np.exp(rng.uniform(*np.log((LEAST, MOST)))))
     values = _sized(effect, default_values(effect, chain, place=at, travel=1.0), size)
-    return Term(effect=effect, place=at, values=tuple(values[name] for name in effect.names))
+    return EffectTerm(effect=effect, place=at, values=tuple(values[name] for name in effect.names))
 
 
 def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str, float]:
@@ -65,22 +66,29 @@ def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str,
     return values
 
 
-def grade_honest_team(folder: Path, *, preset: str, seed: int) -> tuple[Grade, Analysis, Term]:
+def grade_honest_team(
+    folder: Path, *, preset: str, seed: int
+) -> tuple[Grade, Analysis, EffectTerm]:
     """Return the grade of the honest team of a seed, the analysis, and what its bench does."""
-    chain, rubric = preset_chain(preset), load_rubric(Path(preset))
+    chain, rubric = preset_bench(preset).chain, load_rubric(Path(preset))
     term = draw_effect(chain, seed)
     write_submission(
-        folder, chain=chain, effects=[term], seed=seed, compact=seed % 2 == 1, reported=True
+        folder,
+        SimulatedBench(chain=chain, effects=(term,)),
+        seed=seed,
+        compact=seed % 2 == 1,
+        reported=True,
     )
     submission, _ = under_rubric(load_submission(folder), rubric)
     analysis = with_all_springs(submission, analyse(submission, design=False))[0]
     submission = submission.model_copy(update={"reported": textbook_report(submission, analysis)})
-    return grade_analysis(submission, analysis, rubric=rubric, name="team"), analysis, term
+    graded = grade_analysis(submission, analysis, rubric=rubric, name="team")
+    return graded.grade, analysis, term
 
 
 def textbook_report(submission: Submission, analysis: Analysis) -> Reported:
     """Return what a student reads off these recordings in place of what the bench is said to be."""
-    claimed, n = submission.reported, analysis.carts
+    claimed, n = submission.reported, analysis.bench.n
     assert claimed is not None
     rows = {row.name: row for row in analysis.rows}
     before = {name: row.initial or row.final for name, row in rows.items()}

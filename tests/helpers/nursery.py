@@ -29,8 +29,8 @@ def order(**bench: Any) -> None:
 
 def be(*, words: list[str], watchdog: float, port: int) -> None:
     """Be the command of these words, whose stderr is a line to that port; first comes its pid."""
-    from pipeline.bench.emulator import core
     from pipeline.cli import main
+    from pipeline.simulated.emulator import core
 
     core.WATCHDOG = watchdog
     with socket.create_connection(("127.0.0.1", port)) as line:
@@ -65,7 +65,7 @@ def fork_benches() -> None:
 
 def load_bench() -> None:
     """Import all that a bench needs, and compile its simulator where nobody has yet."""
-    from pipeline.bench.emulator.assemble import open_bench
-    from pipeline.synthesis.hidden import prepare_bench
+    from pipeline.simulated.emulator.server import EmulatorOptions, Server
+    from pipeline.simulated.hidden import prepare_bench
 
-    open_bench(prepare_bench(preset="throne-1dof")).close()
+    Server(prepare_bench(preset="throne-1dof"), EmulatorOptions()).close()

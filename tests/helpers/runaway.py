@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from unittest.mock import patch
 
-from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.host.serial_line import SerialLine
 from pipeline.bench.protocol.command_reader import CommandReader
 from pipeline.bench.protocol.messages import (
@@ -28,6 +27,7 @@ from pipeline.bench.protocol.messages import (
     format_reading,
     parse_reading,
 )
+from pipeline.simulated.emulator.core import ReferenceCore
 
 PER_COUNT = 0.002  # cm
 BENCH = Description(

@@ -5,8 +5,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.results import Record
-from pipeline.results_of_runs import Hold, Kind
+from pipeline.results import Hold, Kind, Record
 
 COUNT = 0.00227  # cm, an ECP 210 encoder count
 RATE = 113.0  # Hz, the ECP's usual

@@ -7,17 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.bench.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
-from pipeline.bench.emulator.core import ReferenceCore
-from pipeline.bench.explore.explore import Recorded
 from pipeline.bench.host.experiments import add_experiment, recorded_entry
+from pipeline.bench.host.orders import make_order
 from pipeline.bench.host.record import data_file, log_text
-from pipeline.bench.planning.gains import Scales
-from pipeline.bench.planning.orders import make_order
-from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
-from pipeline.bench.planning.plan_words import session_time
-from pipeline.bench.planning.propose import propose_plan
 from pipeline.bench.protocol.messages import (
     EXTENSIONS,
     Description,
@@ -27,11 +19,19 @@ from pipeline.bench.protocol.messages import (
     encode,
     parse_reading,
 )
+from pipeline.experiments.exploring.exploration import Recorded
+from pipeline.experiments.gains import CountScales
+from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.plan_words import session_time
+from pipeline.experiments.propose import propose_plan
 from pipeline.output import write_file
 from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.simulated.bench import SimulatedBench
+from pipeline.simulated.emulator.carts import _NOISE, TRUE_PERIOD, VirtualCarts, input_per_count
+from pipeline.simulated.emulator.core import ReferenceCore
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
-from pipeline.synthesis.hidden import HiddenBench
 
 _PULL_OUT = 1700  # ticks a hand takes
 
@@ -43,7 +43,7 @@ class LimitPassed(AssertionError):
 class VirtualBench:
     """A bench at whose line somebody sits who never waits: ticks are run one after the other."""
 
-    def __init__(self, bench: HiddenBench, *, seed: int) -> None:
+    def __init__(self, bench: SimulatedBench, *, seed: int) -> None:
         self.carts = VirtualCarts(bench, seed=seed)
         self.description = Description(
             name=bench.name,
@@ -55,7 +55,7 @@ class VirtualBench:
             position_unit=bench.position_unit,
             position_per_count=bench.count,
         )
-        self.scales = Scales(input=input_per_count(bench), position=bench.count)
+        self.scales = CountScales(input=input_per_count(bench), position=bench.count)
         self._core, self._ticks = ReferenceCore(self.description), 0
         self.seconds = 0.0  # of the bench's clock, all told
 
@@ -82,7 +82,7 @@ class VirtualBench:
         return [replace(line, counts=tuple(counts[tick].tolist())) for tick, line in lines]
 
     def carry_out(
-        self, recording: Recording, *, submission: Submission, limits: Limits
+        self, recording: Recording, *, submission: Submission, limits: PlanLimits
     ) -> list[Reading]:
         """Return the lines of one recording; raise LimitPassed where it passes a limit."""
         n = submission.system.carts
@@ -117,7 +117,7 @@ class VirtualBench:
                 raise LimitPassed(f"{recording.id}: {why}")
         return lines
 
-    def record(self, folder: Path, recordings: Sequence[Recording], *, limits: Limits) -> None:
+    def record(self, folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits) -> None:
         """Carry out recordings into a submission, as `acquire` does."""
         submission = load_submission(folder)
         for recording in recordings:

@@ -3,6 +3,7 @@
 import hashlib
 from io import BytesIO
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -10,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.recognise import parse_table, read_table
-from pipeline.ingest.formats.table import Table
+from pipeline.ingest.formats.table import FileTable
 
 N = 50
 TIME = np.round(0.00884 * np.arange(N), 3)
@@ -24,12 +25,12 @@ ROWS = [
 ]
 
 
-def table(content: str | bytes) -> Table:
+def table(content: str | bytes) -> FileTable:
     """Parse what a file would hold."""
     return parse_table(content.encode() if isinstance(content, str) else content, source="f")
 
 
-def column(of: Table, name: str) -> np.ndarray:
+def column(of: FileTable, name: str) -> np.ndarray:
     """Return a column by its heading."""
     return of.values[of.index(name)]
 
@@ -300,6 +301,68 @@ def test_a_matlab_table_is_told_by_its_name():
         table(raw)
 
 
+def mat73(**variables: np.ndarray) -> bytes:
+    """Write a version 7.3 file as MATLAB would: HDF5 behind a block of text, arrays turned."""
+    stream = BytesIO()
+    with h5py.File(stream, "w", userblock_size=512) as file:
+        for name, values in variables.items():
+            matrix = np.atleast_2d(values).T
+            data = file.create_dataset(name, data=matrix, compression="gzip")
+            word = {"f8": "double", "i2": "int16", "u2": "uint16"}[matrix.dtype.str[1:]]
+            data.attrs["MATLAB_class"] = np.bytes_(word)
+        file.create_group("#refs#")
+    heading = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    return heading + stream.getvalue()[128:]
+
+
+def test_a_matlab_7_3_log_is_read_like_any_other():
+    """The same variables as version 5 and as version 7.3 make the same table."""
+    log = {
+        "time": TIME,
+        "enc1": (65_500 + 3 * np.arange(N)).astype("u2"),
+        "duty": np.zeros(N, "i2"),
+    }
+    old, new = table(mat(**log)), table(mat73(**log))
+    assert (new.form, sorted(new.names)) == (old.form, sorted(old.names))
+    for name in log:
+        assert_array_equal(column(new, name), column(old, name))
+    matrix = np.column_stack([TIME, X1, U])
+    assert_array_equal(table(mat73(data=matrix)).values, matrix.T)
+
+
+def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
+    """A struct, text and an empty array are left out, and named."""
+    stream = BytesIO(mat73(time=TIME, x1=X1))
+    with h5py.File(stream, "r+") as file:
+        file.create_group("run")["P"] = 1.0
+        file["name"] = np.zeros((7, 1), "u2")
+        file["name"].attrs["MATLAB_class"] = np.bytes_("char")
+        file["none"] = np.zeros(2, "u8")
+        file["none"].attrs["MATLAB_empty"] = 1
+    got = table(stream.getvalue())
+    assert got.names == ("time", "x1")
+    unread = {v.name: v.kind for v in got.variables if not v.read}
+    assert unread == {"run": "struct", "name": "text", "none": "empty"}
+
+
+@pytest.mark.parametrize("spoil", ["huge", "elsewhere", "link", "cut"])
+def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
+    """Terabytes that are not there, the numbers of another file, half a file: one short error."""
+    stream = BytesIO(mat73(time=TIME, x1=X1))
+    (tmp_path / "secret").write_bytes(bytes(8 * N))
+    with h5py.File(stream, "r+") as file:
+        if spoil == "huge":
+            file.create_dataset("x2", shape=(10**12, 1), chunks=(1000, 1), dtype="f8")
+        if spoil == "elsewhere":
+            outside = [(str(tmp_path / "secret"), 0, 8 * N)]
+            file.create_dataset("x2", shape=(N, 1), dtype="f8", external=outside)
+        if spoil == "link":
+            file["x2"] = h5py.ExternalLink(str(tmp_path / "secret"), "/x")
+    raw = stream.getvalue()
+    with pytest.raises(SubmissionError, match="broken or cut short"):
+        table(raw[: len(raw) // 2] if spoil == "cut" else raw)
+
+
 def scipy_element(values: np.ndarray, *, name: str) -> bytes:
     """Return a variable's bytes as they stand in a file, under a name of the same length."""
     stream = BytesIO()
@@ -326,3 +389,27 @@ def test_a_mat_file_of_names_alone_is_refused():
     with pytest.raises(SubmissionError) as caught:
         table(bytes(raw))
     assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize(
+    "odd",
+    [
+        np.bytes_(b"xyz"),
+        np.array([("a", 1.0)], dtype=[("name", "S1"), ("value", "f8")]),
+        np.array([b"text", b"more"], dtype="S4"),
+    ],
+    ids=["text", "record", "texts"],
+)
+def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
+    """An attribute says double, the data say otherwise: it is named as not read."""
+    stream = BytesIO()
+    with h5py.File(stream, "w", userblock_size=512) as file:
+        file["time"], file["x1"] = np.arange(5.0)[None], np.arange(5.0)[None] ** 2
+        file["odd"] = odd
+        file["odd"].attrs["MATLAB_class"] = np.bytes_("double")
+    raw = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + stream.getvalue()[128:]
+
+    table = parse_table(raw, source="a.mat")
+
+    assert table.names == ("time", "x1")
+    assert [v.name for v in table.variables if not v.read] == ["odd"]

@@ -160,7 +160,7 @@ def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
     """Whoever forgets the unit is asked for it: an encoder has no fractions of a count."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
-    checks = check_units(data.records, system=load_submission(folder).system)
+    checks = check_units(data.records, bench=load_submission(folder).system.bench)
     assert [check.id for check in checks] == ["position_unit"] * asked
     assert all('position = { unit = "cm" }' in check.message for check in checks)
 
@@ -181,7 +181,7 @@ def test_a_unit_that_nobody_knows_is_asked_about(system, ids, tmp_path):
     """What benches are measured in is known; anything else is no unit in silence."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
-    checks = check_units(data.records, system=load_submission(folder).system)
+    checks = check_units(data.records, bench=load_submission(folder).system.bench)
     assert [check.id for check in checks] == ids
     assert all("is not known" in check.message for check in checks)
     if "CM" in system:
@@ -192,12 +192,12 @@ def test_a_heading_in_another_unit_is_asked_about(tmp_path):
     """Centimetres by their heading and counts by the file: somebody has to say which."""
     folder = tmp_path / "s"
     data = read(folder, "", STEP, csv(time=T, input__N=U, x1__cm=Y[0] / 440, x2=X2))
-    checks = check_units(data.records, system=load_submission(folder).system)
+    checks = check_units(data.records, bench=load_submission(folder).system.bench)
     assert [check.id for check in checks] == ["position_unit", "input_unit"]
     assert 'position = { unit = "cm" }' in checks[0].message
     assert 'input = { unit = "N" }' in checks[1].message
     whole = read(tmp_path / "t", "", STEP, csv(time=T, input__V=U, x1__mm=X1, x2__mm=X2))
-    (check,) = check_units(whole.records, system=load_submission(tmp_path / "t").system)
+    (check,) = check_units(whole.records, bench=load_submission(tmp_path / "t").system.bench)
     assert 'position = { unit = "mm" }' in check.message
 
 

@@ -16,9 +16,9 @@ from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.report.sections.questions import ask
 from pipeline.results import Record
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
-from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 
 T = 0.0088542 * np.arange(900, dtype=np.float64)
@@ -105,7 +105,7 @@ def bench(request, tmp_path_factory) -> Path:
     carts, late = request.param
     hidden = prepare_bench(preset=f"throne-{carts}dof", hide=(late,))
     folder = tmp_path_factory.mktemp("late") / "bench"
-    write_submission(folder, chain=hidden.chain, effects=hidden.effects, seed=5, compact=True)
+    write_submission(folder, hidden, seed=5, compact=True)
     toml = folder / "submission.toml"
     text = toml.read_text("utf-8")
     toml.write_text(text.replace(", sign = 1", ""), "utf-8")
@@ -173,7 +173,7 @@ def test_a_record_that_counts_the_other_way_is_found(bench):
 def test_the_report_asks_why_a_record_was_turned(tmp_path):
     """One step logged the other way round: it is turned, said, and asked about."""
     folder = tmp_path / "bench"
-    write_submission(folder, chain="throne-1dof", seed=5, compact=True)
+    write_submission(folder, "throne-1dof", seed=5, compact=True)
     toml, step = folder / "submission.toml", folder / "data" / "step-1.csv"
     toml.write_text(toml.read_text("utf-8").replace(", sign = 1", ""), "utf-8")
     head, *rows = step.read_text("utf-8").splitlines()

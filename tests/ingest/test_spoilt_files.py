@@ -4,6 +4,7 @@ import time
 from contextlib import contextmanager
 from io import BytesIO
 
+import h5py
 import numpy as np
 import pytest
 import scipy.io
@@ -60,6 +61,14 @@ def _mat(version: str, compress: bool) -> bytes:
     return stream.getvalue()
 
 
+def _mat73() -> bytes:
+    stream = BytesIO()
+    with h5py.File(stream, "w", userblock_size=512) as file:
+        for name, values in (("time", T), ("duty", U), ("enc1", X)):
+            file[name] = values[None, :]
+    return b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + stream.getvalue()[128:]
+
+
 def _matrix() -> bytes:
     stream = BytesIO()
     scipy.io.savemat(stream, {"data": np.column_stack([T, U, X])})
@@ -78,6 +87,7 @@ FILES = {
     "mat, compressed": _mat("5", True),
     "mat, version 4": _mat("4", False),
     "mat, matrix": _matrix(),
+    "mat, version 7.3": _mat73(),
 }
 
 positions = st.floats(0.0, 1.0, exclude_max=True)

@@ -14,6 +14,7 @@ from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
+from pipeline.set_up import PAPER_UNITS
 
 # The paper's final estimates: Tables 1 and 2 are kept by the presets, Table 3 by no real chain.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
@@ -112,7 +113,7 @@ def test_the_names_of_the_tables():
 def test_units_of_parameters():
     """Gains, frequencies and the rigid body's two carry units; damping ratios do not."""
     units = {
-        name: read_name(name).unit(position="cm", input="V")
+        name: read_name(name).unit(PAPER_UNITS)
         for name in ("K_2", "omega_a", "zeta_1", "mass", "damping")
     }
     assert units == {

@@ -13,11 +13,11 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.nonlinear.augmented import compile_simulator
-from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect, make_term
+from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect
 from pipeline.plant.nonlinear.simulator import contacts, kernel, laws, sensitivity, state, step
-from pipeline.plant.nonlinear.simulator.kernel import simulate_batch
+from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run
 from pipeline.plant.nonlinear.tables import Cart, Tables, linear_tables
-from tests.helpers.effects import SIZES
+from tests.helpers.effects import SIZES, make_term
 from tests.truth.bench import Hidden, simulate_truth
 
 COUNT = 0.00227  # cm, the encoder step
@@ -28,26 +28,16 @@ def sample_times(count: int, interval: float) -> Array:
     return np.linspace(0.0, (count - 1) * interval, count)
 
 
-def simulate(tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0, guided=None):
+def simulate(
+    tables: Tables, t, u, *, x0=None, v0=None, free=None, refine=1.0, guided=None, knots=None
+):
     """Return (n, samples) readings of one run that starts once."""
-    n = tables[0].shape[0]
-    x0 = np.zeros(n) if x0 is None else np.asarray(x0, dtype=float)
-    v0 = np.zeros(n) if v0 is None else np.asarray(v0, dtype=float)
-    return simulate_batch(
-        tables[0][None],
-        tables[1][None],
-        tables[2][None],
-        x0[None, None],
-        v0[None, None],
-        np.ones((1, n)),
-        np.array([free is None or i + 1 in free for i in range(n)]),
-        t,
-        t,
-        np.asarray(u, dtype=float),
-        np.array([0, t.size]),
-        refine,
-        guided=guided,
-    )[0]
+    n = tables.cart.shape[0]
+    x0, v0 = (np.zeros((1, n)) if one is None else np.array([one]) for one in (x0, v0))
+    moving = [free is None or i + 1 in free for i in range(n)]
+    run = describe_run(t, u, free=moving, guided=guided, knots=knots)._replace(refine=refine)
+    (y,), _ = kernel.simulate([(tables, StartState(x0, v0, np.ones(n)))], run)
+    return y
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
@@ -227,27 +217,17 @@ def test_batch_gives_what_single_runs_give():
     chain = PRESETS["throne-1dof"]
     t = sample_times(300, 0.005)
     u = np.where(t > 0.1, 0.03, 0.0)
-    tables = linear_tables(chain)
-    forces = (0.0, 0.001, 0.003)
-    carts = np.repeat(tables[0][None], 3, axis=0)
-    carts[:, 0, Cart.COULOMB_FRICTION_FORCE] = forces
-    together = simulate_batch(
-        carts,
-        np.repeat(tables[1][None], 3, axis=0),
-        np.repeat(tables[2][None], 3, axis=0),
-        np.zeros((3, 1, 1)),
-        np.zeros((3, 1, 1)),
-        np.ones((3, 1)),
-        np.array([True]),
-        t,
-        t,
-        u,
-        np.array([0, t.size]),
-        1.0,
+    still = StartState(np.zeros((1, 1)), np.zeros((1, 1)), np.ones(1))
+    variants = [linear_tables(chain) for _ in range(3)]
+    for tables, force in zip(variants, (0.0, 0.001, 0.003), strict=True):
+        tables.cart[0, Cart.COULOMB_FRICTION_FORCE] = force
+
+    together, _ = kernel.simulate(
+        [(tables, still) for tables in variants], describe_run(t, u, free=[True])
     )
-    for i, force in enumerate(forces):
-        tables[0][0, Cart.COULOMB_FRICTION_FORCE] = force
-        assert np.array_equal(together[i], simulate(tables, t, u))
+
+    for tables, y in zip(variants, together, strict=True):
+        assert np.array_equal(y, simulate(tables, t, u))
 
 
 def test_a_hidden_mass_starts_where_it_is_told_to():
@@ -294,10 +274,11 @@ before = [dict(one.cache_misses) for one in stats]
 
 chain = PRESETS["throne-2dof"]
 SteppedBench(AugmentedChain(chain=chain)).step(0.1, following=0.0, interval=0.004)
-t, still, moving = 0.004 * np.arange(10), np.zeros((1, 1, 2)), np.array([True, True])
-run = still, still, np.ones((1, 2)), moving, t, t, np.ones(10), np.array([0, 10]), 1.0
+t, still = 0.004 * np.arange(10), np.zeros((1, 2))
+run = kernel.describe_run(t, np.ones(10), free=[True, True])
 by_mass = np.array([[sensitivity.BY_MASS], [0]])
-kernel.simulate_with_derivatives(*(table[None] for table in linear_tables(chain)), *run, by_mass)
+start = kernel.StartState(still, still, np.ones(2))
+kernel.simulate([(linear_tables(chain), start)], run, of=by_mass)
 assert [dict(one.cache_misses) for one in stats] == before
 """
 
@@ -310,25 +291,17 @@ def test_once_compiled_nothing_is_left_to_compile():
 def test_arrays_of_any_kind_meet_the_same_simulator():
     """Views, whole numbers and what may not be written to cost no compilation of their own."""
     tables = linear_tables(PRESETS["throne-2dof"])
-    cart, spring, drive = (np.asfortranarray(table[None]) for table in tables)
     t = sample_times(50, 0.005)
     command = np.zeros(50, dtype=int)
     command.flags.writeable = False
     whole = simulate(tables, t, np.zeros(50), x0=(1.0, 0.5))
-    fixed = simulate_batch(
-        cart,
-        spring,
-        drive,
-        np.broadcast_to(np.array([1.0, 0.5]), (1, 1, 2)),
-        np.broadcast_to(0.0, (1, 1, 2)),
-        np.broadcast_to(1.0, (1, 2)),
-        np.array([True, True]),
-        np.repeat(t, 2)[::2],
-        t,
-        command,
-        np.array([0, 50], dtype=np.int32),
-        1,
+    run = describe_run(
+        np.repeat(t, 2)[::2], command, free=(1, 1), knots=t, shots=np.array([0, 50], dtype=np.int32)
     )
+    start = StartState(
+        np.array([[1.0, 0.5]]), np.broadcast_to(0.0, (1, 2)), np.broadcast_to(1.0, 2)
+    )
+    fixed, _ = kernel.simulate([(Tables(*map(np.asfortranarray, tables)), start)], run)
     assert np.array_equal(fixed[0], whole)
     modules = (contacts, kernel, laws, sensitivity, state, step)
     mine = {id(one): one for module in modules for one in vars(module).values()}
@@ -356,13 +329,8 @@ def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
     t = sample_times(3001, 0.001)
     u = 0.03 * np.sin(2 * np.pi * (0.5 + 2.0 * t) * t)
     coarse = np.arange(0, t.size, 4)
-    cart, spring, drive = linear_tables(chain)
 
-    got = simulate_batch(
-        cart[None], spring[None], drive[None], np.zeros((1, 1, chain.n)),
-        np.zeros((1, 1, chain.n)), np.ones((1, chain.n)), np.ones(chain.n, dtype=bool),
-        t[coarse], t, u, np.array([0, coarse.size]), 1.0,
-    )[0]  # fmt: skip
+    got = simulate(linear_tables(chain), t[coarse], u, knots=t)
 
     exact = simulate_linear(chain, t, u)[:, coarse]
     assert_allclose(got, exact, atol=1e-4 * np.abs(exact).max())
@@ -372,16 +340,12 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
     """Whatever the steps: friction brakes the cart from the edge on, not from the step's begin."""
     chain = PRESETS["throne-1dof"]
     dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
-    cart, spring, drive = AugmentedChain(chain=chain, terms=(dry,)).tables()
+    tables = AugmentedChain(chain=chain, terms=(dry,)).tables()
     t, edge = sample_times(100, 4e-3), 0.0411
     knots, command = np.array([0.0, edge]), np.array([0.0, 0.02])
 
     def run(refine):
-        starts = np.array([0, t.size])
-        rest, ones = np.zeros((1, 1, 1)), np.ones((1, 1))
-        tables = cart[None], spring[None], drive[None]
-        free = np.array([True])
-        return simulate_batch(*tables, rest, rest, ones, free, t, knots, command, starts, refine)
+        return simulate(tables, t, command, knots=knots, refine=refine)
 
     assert np.abs(run(1.0) - run(64.0)).max() < 0.02 * COUNT
 
@@ -389,13 +353,8 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
 def test_what_stands_behind_the_last_sample_is_no_time():
     """A shot ends with its samples: driven on to a time behind them, the cart would be far away."""
     chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
-    cart, spring, drive = AugmentedChain(chain=chain, terms=()).tables()
     t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
-    rest, free = np.zeros((1, 1, 1)), np.array([True])
-    (x,) = simulate_batch(
-        cart[None], spring[None], drive[None], rest, rest, np.ones((1, 1)), free,
-        t, t, np.full(t.size, 0.02), np.array([0, t.size]), 1.0,
-    )  # fmt: skip
+    x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))
     assert_allclose(x[0], 0.5 * (0.02 / 1e-4) * t**2, rtol=1e-6, atol=1e-12)
 
 
@@ -407,17 +366,11 @@ def test_what_is_late_is_as_late_in_long_steps(key, values):
     """Of a fast sweep, four ticks a step: of a lag as of a delay less than a tenth of a count."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(find_effect(key), place=0, values=values, chain=chain)
-    cart, spring, drive = AugmentedChain(chain=chain, terms=(term,)).tables()
+    tables = AugmentedChain(chain=chain, terms=(term,)).tables()
     ticks = sample_times(4000, 1e-3)
     u = 0.16 * np.sin(2 * np.pi * (7 * ticks + 13 / 8 * ticks**2))
-    rest, free = np.zeros((1, 1, 1)), np.array([True])
 
     def run(every: int, refine: float):
-        t = ticks[::every]
-        (x,) = simulate_batch(
-            cart[None], spring[None], drive[None], rest, rest, np.ones((1, 1)), free,
-            t, ticks, u, np.array([0, t.size]), refine,
-        )  # fmt: skip
-        return x[0]
+        return simulate(tables, ticks[::every], u, knots=ticks, refine=refine)[0]
 
     assert np.abs(run(4, 1.0) - run(1, 64.0)[::4]).max() < 0.1 * COUNT

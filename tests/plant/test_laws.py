@@ -15,18 +15,19 @@ from docs.codegen.__main__ import MADE, ROOM
 from docs.codegen.laws import columns_source, laws_source, terms_source
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect, find_effect
 from pipeline.plant.nonlinear.effects.law import (
-    Contact,
-    Force,
-    Friction,
-    Hysteresis,
-    Input,
+    ContactLaw,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
     evaluate,
 )
 from pipeline.plant.nonlinear.simulator import laws, terms
 from pipeline.plant.nonlinear.tables import TABLES
+from pipeline.words.math import to_tex
 from tests.helpers.effects import SIZES
 
-FOLLOWED = [e for e in CATALOGUE if isinstance(e.law, Force | Friction | Contact)]
+FOLLOWED = [e for e in CATALOGUE if isinstance(e.law, ForceLaw | FrictionLaw | ContactLaw)]
 STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0)]  # x, v, u, on
 
 
@@ -75,7 +76,7 @@ def test_contacts_are_those_of_the_law(key):
     """Stiffness, damping and where it begins give the force of the law, either side of it."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
-    assert isinstance(law, Contact)
+    assert isinstance(law, ContactLaw)
     row = np.zeros((1, len(TABLES[effect.place])))
     row[0, 0] = 0.1  # the spring's stiffness
     values = {"r": 0.5, "s": 0.4} if key == "slack_spring" else {"k": 2.0, "p": 0.4, "c": 0.1}
@@ -99,7 +100,7 @@ def test_hysteresis_settles_as_its_rate_says(v):
     """Its state goes to a place at a pace; both simulators have the same, and its derivatives."""
     effect = find_effect("presliding_friction")
     law = effect.law
-    assert isinstance(law, Hysteresis)
+    assert isinstance(law, HysteresisLaw)
     kind, p = CATALOGUE.index(effect), np.array([0.3, 0.8])
 
     def settled(p, v):
@@ -127,13 +128,15 @@ def test_hysteresis_settles_as_its_rate_says(v):
 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize(
-    "effect", [e for e in FOLLOWED if not isinstance(e.law, Contact)], ids=lambda effect: effect.key
+    "effect",
+    [e for e in FOLLOWED if not isinstance(e.law, ContactLaw)],
+    ids=lambda effect: effect.key,
 )
 def test_simulator_and_follower_have_the_same_law(effect, state):
     """The parameters that go with coordinates give, in the tables, the force that those give."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
-    within = {"F": 0.2} if isinstance(effect.law, Friction) and effect.law.beyond else {}
+    within = {"F": 0.2} if isinstance(effect.law, FrictionLaw) and effect.law.beyond else {}
     named = dict(zip(effect.grown.coordinates, p.tolist(), strict=True))
     values = effect.grown_values(within | named)
     shared = {q.name: within[q.symbol] for q in effect.parameters if q not in effect.own}
@@ -146,7 +149,7 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
         got = laws.spring_force(rows, 0, x, v) + damping
     elif effect.place == "input":
         got = laws.drive_force(row, x, v, u, on) + laws.motor_force(row, x, v, u, on)
-    elif isinstance(effect.law, Friction):
+    elif isinstance(effect.law, FrictionLaw):
         got = laws.sliding(rows, 0, u) + laws.dropping(rows, 0, v, u) - sum(shared.values())
     else:
         got = laws.cart_force(rows, 0, x, v, u)
@@ -175,7 +178,7 @@ def test_dead_zone_and_saturation_shape_the_input():
 def test_friction_at_rest_is_what_the_law_says():
     """Where `at_rest` differs from the size, it is the size at no speed."""
     for effect in CATALOGUE:
-        if isinstance(effect.law, Friction) and effect.law.at_rest:
+        if isinstance(effect.law, FrictionLaw) and effect.law.at_rest:
             row = np.zeros((1, len(TABLES["cart"])))
             values = SIZES[effect.key]
             for column, value in effect.columns(values).items():
@@ -199,9 +202,11 @@ def load(source: str, name: str, folder: Path):
 
 
 CUBIC_DRAG = replace(
-    find_effect("quadratic_drag"), key="cubic_drag", law=Force("-q * v**3", step=inf)
+    find_effect("quadratic_drag"), key="cubic_drag", law=ForceLaw("-q * v**3", step=inf)
 )
-WEAK_ZONE = replace(find_effect("dead_zone"), key="weak_zone", law=Input("u - w * u / (1 + u**2)"))
+WEAK_ZONE = replace(
+    find_effect("dead_zone"), key="weak_zone", law=InputLaw("u - w * u / (1 + u**2)")
+)
 
 
 def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
@@ -249,4 +254,4 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
 )
 def test_equations_read_as_in_a_book(key, equation):
     """Factors side by side, no bracket too many, details of a contact left out."""
-    assert find_effect(key).equation == equation
+    assert to_tex(find_effect(key).formula) == equation

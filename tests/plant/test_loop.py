@@ -10,6 +10,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.sampled_loop import (
+    LoopSetup,
     Pid,
     StateFeedback,
     discretise,
@@ -42,7 +43,7 @@ def test_without_gains_the_prefilter_drives_the_open_loop():
 @pytest.mark.parametrize("delay", [0, 1])
 def test_an_exact_prediction_makes_the_delayed_loop_the_undelayed_one(delay):
     """With the true model the loop runs as Phi - Gamma G does, later by the delay."""
-    run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, delay=delay)
+    run = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(delay=delay))
 
     phi, gamma = discretise(TWO, T)
     x, expected = np.zeros(4), np.zeros((2, CLOCK.size))
@@ -57,7 +58,7 @@ def test_the_loop_matrix_is_the_loop(model):
     """Powers of the loop matrix give the run of a loop released from a displaced start."""
     controller = StateFeedback(gains=GAINS, prefilter=1.0, model=model)
     x0 = np.array([0.5, 3.0, -0.2, 1.0])
-    run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, x0=x0)
+    run = simulate_loop(TWO, controller, t=CLOCK, reference=0.0, start=x0)
 
     matrix = loop_matrix(TWO, controller, sample_time=T)
     state = np.concatenate([x0, [0.5, 0.0, -0.2, 0.0], [0.0]])  # the observer starts at rest
@@ -81,8 +82,12 @@ def test_the_input_stays_within_its_limit():
     """A limit clips the input; one that is never reached changes nothing."""
     free = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0)
     peak = np.abs(free.u).max()
-    roomy = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, input_limit=1.01 * peak)
-    tight = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0, input_limit=0.5 * peak)
+    roomy = simulate_loop(
+        TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(input_limit=1.01 * peak)
+    )
+    tight = simulate_loop(
+        TWO, feedback(TWO), t=CLOCK, reference=1.0, setup=LoopSetup(input_limit=0.5 * peak)
+    )
 
     assert_allclose(roomy.x, free.x, rtol=0, atol=0)
     assert np.abs(tight.u).max() == 0.5 * peak
@@ -94,7 +99,7 @@ def test_proportional_control_holds_a_share_of_the_reference():
     """A proportional controller comes to rest at K kp / (1 + K kp) of the reference."""
     chain, kp = PRESETS["throne-1dof"], 0.02
     t = T * np.arange(1200.0)
-    run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, delay=0)
+    run = simulate_loop(chain, Pid(kp=kp), t=t, reference=2.0, setup=LoopSetup(delay=0))
 
     share = 28.9 * kp / (1 + 28.9 * kp)  # K of the preset is 28.9
     # Its poles have a real part of -1.2 with the zero-order hold: exp(-12) is 6e-6 at the end.
@@ -104,7 +109,9 @@ def test_proportional_control_holds_a_share_of_the_reference():
 def test_the_pid_terms_are_sum_and_difference():
     """The first two efforts follow the stated sums and differences of the error."""
     pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
-    run = simulate_loop(PRESETS["throne-1dof"], pid, t=CLOCK, reference=1.0, delay=0)
+    run = simulate_loop(
+        PRESETS["throne-1dof"], pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0)
+    )
 
     error = 1.0 - run.x[0, :2]
     kick = 0.1 * (0.3 * error[0] + 2.0 * error[0] * T + 0.004 * error[0] / T)
@@ -124,7 +131,9 @@ def test_integral_action_removes_the_error():
 def test_the_controller_sees_whole_encoder_steps():
     """Proportional efforts are multiples of the gain times the encoder step."""
     step = np.array([0.01, 0.0])
-    run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, encoder_step=step, delay=0)
+    run = simulate_loop(
+        TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(encoder_step=step, delay=0)
+    )
 
     counts = run.u / (0.02 * 0.01)
     assert_allclose(counts, np.round(counts), atol=1e-9)
@@ -134,7 +143,7 @@ def test_the_controller_sees_whole_encoder_steps():
 def test_positions_between_the_ticks_are_those_of_the_held_input():
     """Logged five times a tick, the run is the exact response to the logged input."""
     t = T / 5 * np.arange(1000.0)
-    run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, sample_time=T)
+    run = simulate_loop(TWO, feedback(TWO), t=t, reference=1.0, setup=LoopSetup(sample_time=T))
 
     assert np.count_nonzero(np.diff(run.u)) <= 200  # held over five samples
     # Cubic interpolation errs by (omega T)^4 / 384 of the fast mode's share: 0.36^4 / 384 = 4e-5.
@@ -145,7 +154,9 @@ def test_a_controller_faster_than_the_log_acts_between_its_samples():
     """A log of each tenth tick holds the same motion as the full one."""
     fine = T / 10 * np.arange(2001.0)
     full = simulate_loop(TWO, feedback(TWO), t=fine, reference=1.0)
-    logged = simulate_loop(TWO, feedback(TWO), t=fine[::10], reference=1.0, sample_time=T / 10)
+    logged = simulate_loop(
+        TWO, feedback(TWO), t=fine[::10], reference=1.0, setup=LoopSetup(sample_time=T / 10)
+    )
 
     assert_allclose(logged.x, full.x[:, ::10], atol=ROUNDING)
     assert_allclose(logged.u, full.u[::10], atol=ROUNDING)
@@ -166,7 +177,7 @@ def test_a_drive_of_the_other_sign_wants_the_other_gains():
     """Negative efforts through a negative drive are the same forces."""
     mirrored = Pid(kp=-0.02, kd=-0.0005)
     run = simulate_loop(TWO, Pid(kp=0.04, kd=0.001), t=CLOCK, reference=1.0)
-    other = simulate_loop(TWO, mirrored, t=CLOCK, reference=1.0, drive=-2.0)
+    other = simulate_loop(TWO, mirrored, t=CLOCK, reference=1.0, setup=LoopSetup(drive=-2.0))
 
     assert_allclose(other.x, run.x, atol=ROUNDING)
     assert_allclose(other.u, -run.u / 2, atol=ROUNDING)
@@ -175,7 +186,7 @@ def test_a_drive_of_the_other_sign_wants_the_other_gains():
 def test_the_rest_adds_to_the_readings():
     """An encoder zeroed off the rest shifts the readings and what the controller makes of them."""
     shift = np.array([0.3, -0.1])
-    run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, rest=shift)
+    run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(rest=shift))
     same = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0 - 0.3)
 
     assert_allclose(run.x, same.x + shift[:, None], atol=ROUNDING)
@@ -185,7 +196,7 @@ def test_held_carts_are_walls():
     """Two carts with the second held are one cart on both its springs."""
     alone = Chain(m=TWO.m[:1], c=TWO.c[:1], k=TWO.k[:2])
     pid = Pid(kp=0.02, kd=0.001)
-    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, free=[1])
+    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))
 
     assert_allclose(run.x, simulate_loop(alone, pid, t=CLOCK, reference=1.0).x, atol=ROUNDING)
 
@@ -193,7 +204,7 @@ def test_held_carts_are_walls():
 def test_a_replay_gives_the_efforts_that_were_logged():
     """On the readings of an undelayed PID run the law asks for the logged input."""
     pid = Pid(kp=0.02, ki=0.01, kd=0.0004, scale=0.7, cart=2)
-    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, delay=0)
+    run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0))
 
     stated = replay(pid, t=CLOCK, y=run.x, reference=np.ones(CLOCK.size), free=(1, 2))
 
@@ -209,4 +220,4 @@ def test_gains_that_do_not_fit_the_carts_are_refused():
 def test_a_pid_on_a_held_cart_is_refused():
     """A controller cannot steer a cart that is held."""
     with pytest.raises(DataError, match=r"its cart 2 free, found \[1\]"):
-        simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, free=[1])
+        simulate_loop(TWO, Pid(kp=1.0, cart=2), t=CLOCK, reference=1.0, setup=LoopSetup(free=[1]))

@@ -10,9 +10,10 @@ from scipy.integrate import solve_ivp
 from pipeline.errors import DataError
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect, make_term
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
 from pipeline.plant.nonlinear.effects.base import Effect, chain_scales
-from pipeline.plant.nonlinear.motion import STOP_TIME, Motion
+from pipeline.plant.nonlinear.motion import STOP_TIME, EquationsOfMotion
+from tests.helpers.effects import make_term
 
 CHAIN = PRESETS["throne-2dof"]
 T = np.arange(0.0, 1.5, 0.002)
@@ -23,10 +24,7 @@ def usual(effect: Effect) -> AugmentedChain:
     """Return the carts with one effect of a size that is plain to see."""
     place = (effect.places((True, True, True)) or (0,))[-1]
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=LEVEL)
-    values = {
-        p.name: p.scale(scales) * multiple
-        for p, multiple in zip(effect.parameters, effect.typical, strict=True)
-    }
+    values = {p.name: p.size(scales) * p.typical for p in effect.parameters}
     return AugmentedChain(
         chain=CHAIN, terms=(make_term(effect, place=place, values=values, chain=CHAIN),)
     )
@@ -34,7 +32,7 @@ def usual(effect: Effect) -> AugmentedChain:
 
 def respond(model: AugmentedChain, x0, *, driven: bool):
     """Return the readings (carts, samples) of python-control's system, by an adaptive solver."""
-    motion = Motion(model)
+    motion = EquationsOfMotion(model)
     system = motion.to_control()
     state, readings = motion.start(x0), []
     edges = [T[0], ON, OFF, T[-1]] if driven else [T[0], T[-1]]
@@ -75,7 +73,7 @@ def test_the_system_moves_as_the_simulator_does(effect, driven):
 def test_without_effects_it_is_the_linear_chain():
     """The rates of change are A x + B u."""
     rng = np.random.default_rng(1)
-    system = Motion(AugmentedChain(chain=CHAIN)).to_control()
+    system = EquationsOfMotion(AugmentedChain(chain=CHAIN)).to_control()
     A, B, *_ = CHAIN.state_space()
 
     for _ in range(5):
@@ -97,7 +95,7 @@ def test_effects_have_states_of_their_own():
         "coulomb_friction": [],
     }
     for key, names in own.items():
-        assert Motion(usual(find_effect(key))).states[4:] == names
+        assert EquationsOfMotion(usual(find_effect(key))).states[4:] == names
 
 
 def test_a_drive_that_leads_its_log_has_no_system():
@@ -105,4 +103,4 @@ def test_a_drive_that_leads_its_log_has_no_system():
     term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)
 
     with pytest.raises(DataError, match="leads its log"):
-        Motion(AugmentedChain(chain=CHAIN, terms=(term,)))
+        EquationsOfMotion(AugmentedChain(chain=CHAIN, terms=(term,)))

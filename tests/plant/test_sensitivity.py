@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect, make_term
-from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
+from pipeline.plant.nonlinear.effects import AugmentedChain, find_effect
+from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run
+from pipeline.plant.nonlinear.simulator.kernel import simulate as simulate_run
 from pipeline.plant.nonlinear.simulator.sensitivity import (
     BY_DAMPING,
     BY_FRICTION,
@@ -14,8 +15,8 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
     BY_STIFFNESS,
     BY_VELOCITY,
 )
-from pipeline.plant.nonlinear.tables import Cart, Spring
-from tests.helpers.effects import SIZES
+from pipeline.plant.nonlinear.tables import Cart, Spring, Tables
+from tests.helpers.effects import SIZES, make_term
 
 # Small enough that, of contacts and jumps, none is won or lost by a difference.
 CASES = {
@@ -66,11 +67,10 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
             tables[2 if by == BY_POSITION else 3][0, at] += change
         elif by == BY_FRICTION:
             tables[4][at] += change
-        y, derivatives = simulate_with_derivatives(
-            tables[0][None], tables[1][None], drive[None], tables[2][None], tables[3][None],
-            tables[4][None], np.ones(n, dtype=bool), t, t, u, np.array([0, t.size]), 1.0,
-            np.array(lanes).T,
-        )  # fmt: skip
+        start = StartState(tables[2], tables[3], tables[4])
+        run = describe_run(t, u, free=np.ones(n, dtype=bool))
+        acting = Tables(tables[0], tables[1], drive)
+        y, derivatives = simulate_run([(acting, start)], run, of=np.array(lanes).T)
         return y[0], derivatives
 
     _, derivatives = simulate()

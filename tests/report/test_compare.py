@@ -1,4 +1,4 @@
-"""Two drafts side by side: what moved, which checks turned, which files are others."""
+"""Two drafts side by side: what moved, and which checks fail now."""
 
 import json
 from dataclasses import replace
@@ -6,20 +6,26 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import ConfigError
-from pipeline.report.document import Table, plain
-from pipeline.report.draft.changes import change_blocks, changes_line, compare_drafts, read_results
+from pipeline.json_files import json_text
+from pipeline.report.document import Table
+from pipeline.report.draft.changes import (
+    Draft,
+    change_blocks,
+    changes_line,
+    compare_drafts,
+    read_results,
+)
 from pipeline.report.sections.page import Page
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate
-from pipeline.results_json import results_text
-from pipeline.schemas.results import Results
+from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.examples import analysed
 
 
-def draft_of(analysis: Analysis) -> Results:
-    return Results.model_validate_json(results_text(analysis))
+def draft_of(analysis: Analysis) -> Draft:
+    return json.loads(json_text(analysis))
 
 
 def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
@@ -38,8 +44,7 @@ def test_a_draft_does_not_differ_from_itself():
     analysis = make_analysis(3)
     changes = compare_drafts(draft_of(analysis), analysis)
     assert not changes.numbers
-    assert not changes.checks
-    assert not changes.files
+    assert not changes.failed
     assert changes_line(changes) == "since the earlier draft: nothing changed"
 
 
@@ -69,36 +74,30 @@ def test_a_number_that_moved_is_told_in_combined_standard_errors():
     assert line == "since the earlier draft: 1 final estimate moved, K_1 most (+2.0 %, 1.4 σ)"
 
 
-def test_checks_that_turned_and_files_that_changed_are_named():
-    """A check that now fails, a file with another hash, one gone and one new are each told."""
+def test_checks_that_fail_now_are_named():
+    """A check that failed before, or passes now, is no news; one that fails now is."""
     analysis = make_analysis(2)
-    checks = tuple(replace(c, outcome="pass") for c in analysis.checks)
-    names = sorted(analysis.files)
-    files = {name: digest for name, digest in analysis.files.items() if name != names[0]}
-    files |= {names[1]: "f" * 64, "data/added.csv": "0" * 64}
-    after = replace(
-        analysis, checks=checks, files=files, warnings=("step-2: does not settle",), skipped=()
-    )
-    changes = compare_drafts(draft_of(analysis), after)
-    turned = {change.id: (change.before, change.after) for change in changes.checks}
-    was = {check.id: check.outcome for check in analysis.checks}
-    assert turned == {id_: (outcome, "pass") for id_, outcome in was.items() if outcome != "pass"}
-    assert changes.files == {names[0]: "gone", names[1]: "changed", "data/added.csv": "new"}
-    assert changes.new_warnings == ("step-2: does not settle",)
-    assert changes.gone_warnings == analysis.warnings
-    assert changes.no_longer_skipped == ("sweep",)
+    passing = tuple(replace(check, outcome="pass") for check in analysis.checks)
+    first, *others = passing
+    failing = (replace(first, outcome="fail"), *others)
+    was, now = replace(analysis, checks=passing), replace(analysis, checks=failing)
+    assert compare_drafts(draft_of(was), now).failed == {first.id: first.message}
+    assert compare_drafts(draft_of(now), now).failed == {}
+    assert compare_drafts(draft_of(now), was).failed == {}
+    line = changes_line(compare_drafts(draft_of(was), now))
+    assert line == "since the earlier draft: 1 check now failed"
 
 
 def test_the_report_has_a_section_on_the_changes():
     """It has both values; without an earlier draft there is none."""
     before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
     changes = compare_drafts(draft_of(before), after)
-    blocks = change_blocks(Page.of(after), changes)
+    blocks = change_blocks(Page(after), changes)
     table = next(block for block in blocks if isinstance(block, Table))
     (row,) = table.rows
     assert plain(row[0].text) == "ω_b"
     assert "+10.0 %" in plain(row[-1].text)
-    assert change_blocks(Page.of(after), None) == []
+    assert change_blocks(Page(after), None) == []
 
 
 @pytest.mark.parametrize(
@@ -143,7 +142,7 @@ def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkey
         pytest.fail("the analysis ran")
 
     monkeypatch.setattr("pipeline.report.draft.write.analyse", analysed_after_all)
-    earlier = json.loads(results_text(analysed("one-cart")))
+    earlier = json.loads(json_text(analysed("one-cart")))
     earlier["submission"][key] = other
     path = tmp_path / "earlier.json"
     path.write_text(json.dumps(earlier), encoding="utf-8")
@@ -156,7 +155,7 @@ def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkey
 
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
     """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
-    earlier = json.loads(results_text(analysed("one-cart")))
+    earlier = json.loads(json_text(analysed("one-cart")))
     earlier["parameters"][0]["final"] *= 0.9
     path = tmp_path / "earlier.json"
     path.write_text(json.dumps(earlier), encoding="utf-8")

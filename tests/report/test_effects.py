@@ -6,8 +6,8 @@ import re
 import pytest
 
 from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
-from pipeline.report.effects.page import build_gallery, render_effects
-from pipeline.report.effects.words import catalogue_data, catalogue_text
+from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
+from pipeline.report.effects.gallery import build_gallery, render_effects
 from tests.helpers.commandline import cartlab_here
 
 
@@ -106,7 +106,7 @@ def test_the_page_is_the_same_every_time(page, tmp_path):
 @pytest.mark.parametrize("key", ["coulomb_friction", "sensor_gain", "input_delay"])
 def test_every_entry_shows_how_to_hide_it(key):
     """The command under a picture is one that `cartlab simulate` takes."""
-    from pipeline.synthesis.hidden import prepare_bench
+    from pipeline.simulated.hidden import prepare_bench
 
     document = build_gallery([find_effect(key)])
 

@@ -1,13 +1,20 @@
 """The diary of an exploration: what each turn says, and how its explanations are told apart."""
 
+import json
 import re
+from dataclasses import replace
+from html import unescape
 
-from pipeline.bench.explore.words import model_words
+import numpy as np
+from numpy.testing import assert_allclose
+
+from pipeline.experiments.exploring.turn_words import name_model
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.plant.nonlinear.effects import AugmentedChain, Term, find_effect
-from pipeline.report.exploration.page import write_diary
-from pipeline.report.exploration.turn import Explanation, Turn
+from pipeline.plant.nonlinear.effects import AugmentedChain, EffectTerm, find_effect
+from pipeline.report.exploration.diary import Turn, WeighedExplanation, write_diary
+from pipeline.report.gap.story import deciding_trace
 from tests.helpers.analysis_factory import make_analysis
+from tests.report.test_gap import make_gap, two_cart_analysis
 
 
 def make_turn(*weights: float) -> Turn:
@@ -18,7 +25,8 @@ def make_turn(*weights: float) -> Turn:
         errors={"K_1": 0.01},
         verdict="ambiguous" if len(weights) > 1 else "named",
         explanations=tuple(
-            Explanation(name=f"effect {i}", weight=weight) for i, weight in enumerate(weights)
+            WeighedExplanation(name=f"effect {i}", weight=weight)
+            for i, weight in enumerate(weights)
         ),
         left=0.1,
         floor=0.01,
@@ -31,6 +39,7 @@ def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tm
     """One that the criterion gives next to nothing has under 1 %; of one alone none is told."""
     turns = [make_turn(1e-7, 1.0), make_turn(1.0)]
     page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")
+    page = page.replace("\u00a0", " ")
     told = re.findall(r"Effect 0[^<]*", page)
     assert told == ["Effect 0 (in the model, under 1 %); effect 1 (100 %)", "Effect 0"]
 
@@ -39,8 +48,36 @@ def test_effects_are_called_what_they_are_called_elsewhere():
     """Names of people keep their capitals, and what is on a cart is not on it twice."""
     chain = PRESETS["throne-1dof"]
     mass, friction = (
-        Term(effect=effect, place=1, values=tuple(1.0 for _ in effect.names))
+        EffectTerm(effect=effect, place=1, values=tuple(1.0 for _ in effect.names))
         for effect in (find_effect("extra_mode"), find_effect("coulomb_friction"))
     )
-    told = model_words(AugmentedChain(chain=chain, terms=(mass, friction)))
+    told = name_model(AugmentedChain(chain=chain, terms=(mass, friction)))
     assert told == "a hidden mass on a cart (cart 1) and dry (Coulomb) friction on cart 1"
+
+
+def test_the_answer_comes_first_and_each_turn_has_the_run_that_decided(tmp_path):
+    """Parameters with errors and effects with sizes, then the turns; axes begin at zero."""
+    gap = make_gap()
+    runs = {trace.experiment for trace in gap.traces}
+    turns = [
+        replace(make_turn(1.0), seconds=20.0, recorded=(run,), gap=gap) for run in sorted(runs)[:1]
+    ]
+    turns.append(replace(turns[0], seconds=50.0, recorded=("another",)))
+
+    page = write_diary(turns, two_cart_analysis(), tmp_path, wanted=0.01).read_text("utf-8")
+
+    titles = re.findall(r"<h[23][^>]*>([^<]+)", page)
+    assert titles[:2] == ["What is known", "Turn by turn"]
+    assert titles[2].startswith("1. After 20")
+    answer, story = page.split('<section id="turns"')
+    assert "Coulomb" in answer
+    assert "The carts as they are known now" in answer
+    decided = deciding_trace(gap, turns[0].recorded)
+    assert decided is not None
+    assert f"Cart {decided.cart} in {turns[0].recorded[0]}" in story
+    panels = [json.loads(unescape(told)) for told in re.findall(r'data-panel="([^"]*)"', story)]
+    over_time = [panel for panel in panels if panel["titles"][0] == "time at the bench [s]"]
+    assert len(over_time) == 2
+    assert {panel["x"][0] for panel in over_time} == {0.0}
+    powers = [np.log10(limit) for panel in over_time for limit in panel["y"]]
+    assert_allclose(powers, np.round(powers), atol=1e-9)

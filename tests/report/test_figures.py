@@ -17,15 +17,16 @@ from matplotlib.patches import Rectangle
 from matplotlib.text import Text
 
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Picture, plain
+from pipeline.report.document import Picture
 from pipeline.report.figures.bode import bode_figure, overview_figure, plot_phase
 from pipeline.report.figures.grading import distribution_figure
 from pipeline.report.figures.style import (
-    CART_MARKS,
+    CARTS,
     drawing,
     panels,
     plot_measured,
     plot_model,
+    plot_points,
     small_multiples,
     thin,
 )
@@ -42,8 +43,11 @@ from pipeline.report.figures.time import (
 from pipeline.report.sections.measurements import step_blocks
 from pipeline.report.sections.page import Page
 from pipeline.results import FrequencyResponse
+from pipeline.set_up import PAPER_UNITS, Units
+from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis
 
+COUNTS = Units(position="count", input="V")
 SVG = "{http://www.w3.org/2000/svg}"
 
 
@@ -53,8 +57,7 @@ def bode_svg(carts: int = 2) -> str:
         figure = bode_figure(
             analysis.frequency_responses[0],
             chain=analysis.chain,
-            position_unit="cm",
-            input_unit="V",
+            units=PAPER_UNITS,
         )
         return to_svg(figure, name="bode", alt="Bode <plot>")
 
@@ -87,7 +90,7 @@ def test_measured_phase_lies_on_the_branch_of_the_fit():
     analysis = make_analysis(3)
     response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
     with drawing():
-        figure = bode_figure(response, chain=analysis.chain, position_unit="cm", input_unit="V")
+        figure = bode_figure(response, chain=analysis.chain, units=PAPER_UNITS)
     _, phase, _ = figure.axes
     line, points = (np.asarray(drawn.get_ydata(), dtype=float) for drawn in phase.lines[:2])
     assert response.phase is not None
@@ -113,7 +116,7 @@ def test_a_peak_without_end_does_not_hide_the_measurement():
         source="dwells",
     )
     with drawing():
-        figure = bode_figure(response, chain=chain, position_unit="cm", input_unit="V")
+        figure = bode_figure(response, chain=chain, units=PAPER_UNITS)
         ElementTree.fromstring(to_svg(figure, name="x", alt=""))
     assert figure.axes[0].get_ylim()[1] < 20 * np.log10(magnitude.max()) + 50
 
@@ -122,7 +125,7 @@ def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
     """The axis of an input without a model's line reaches as far as its samples."""
     with drawing():
         _, (ax,) = panels(1.0)
-        plot_measured(ax, np.linspace(0, 1, 5), np.array([-4.0, 0, 3, 0, 0]), in_legend=False)
+        plot_points(ax, np.linspace(0, 1, 5), np.array([-4.0, 0, 3, 0, 0]))
     low, high = ax.get_ylim()
     assert low <= -4
     assert high >= 3
@@ -146,7 +149,7 @@ def test_an_unstable_model_does_not_hide_the_measurement():
     for model in (1e12 * check.model, growth):
         with drawing():
             figure = hardware_figure(
-                [[replace(check, model=model)]], record=None, position_unit="cm", input_unit="V"
+                [[replace(check, model=model)]], record=None, units=PAPER_UNITS
             )
             to_svg(figure, name="x", alt="")
         low, high = figure.axes[0].get_ylim()
@@ -162,8 +165,7 @@ def test_a_zero_in_a_table_of_ratios_is_left_out():
         figure = bode_figure(
             replace(response, magnitude=magnitude, phase=None, phase_std=None),
             chain=None,
-            position_unit="cm",
-            input_unit="V",
+            units=PAPER_UNITS,
         )
         root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
     assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and the one in the legend
@@ -265,8 +267,7 @@ def figures_of(carts: int) -> dict[str, Figure]:
     assert analysis.feedback is not None
     return {
         "bode": bode_figure(
-            analysis.frequency_responses[0], chain=analysis.chain, position_unit="count",
-            input_unit="V",
+            analysis.frequency_responses[0], chain=analysis.chain, units=COUNTS,
         ),
         "decay": decay_figure(
             own, records=[next(r for r in records.values() if r.id == d.experiment) for d in own],
@@ -284,13 +285,12 @@ def figures_of(carts: int) -> dict[str, Figure]:
             position_unit="count",
         ),
         "hardware": hardware_figure(
-            checks, record=analysis.records[-1], position_unit="count", input_unit="V"
+            checks, record=analysis.records[-1], units=COUNTS
         ),
         "overview": overview_figure(
-            analysis.frequency_responses, chain=analysis.chain, position_unit="count",
-            input_unit="V",
+            analysis.frequency_responses, chain=analysis.chain, units=COUNTS,
         ),
-        "feedback": design_figure(analysis.feedback, position_unit="count", input_unit="V"),
+        "feedback": design_figure(analysis.feedback, units=COUNTS),
     }  # fmt: skip
 
 
@@ -393,8 +393,8 @@ def test_carts_of_a_step_are_told_apart_without_colour():
         figure = step_figure([gains], records=[record], position_unit="cm")
     lines = figure.axes[0].get_lines()
     marks = {str(line.get_label()): line.get_marker() for line in lines}
-    assert [marks[name] for name in ("x₁", "x₂", "x₃")] == list(CART_MARKS)[:3]
-    (picture,) = (b for b in step_blocks(Page.of(analysis)) if isinstance(b, Picture))
+    assert [marks[name] for name in ("x₁", "x₂", "x₃")] == [mark for _, _, mark, _ in CARTS[:3]]
+    (picture,) = (b for b in step_blocks(Page(analysis)) if isinstance(b, Picture))
     assert "Cart 1 circles, cart 2 squares, cart 3 triangles;" in plain(picture.caption)
 
 

@@ -11,7 +11,6 @@ import pytest
 from numpy.testing import assert_allclose
 
 from pipeline.errors import ConfigError
-from pipeline.gap.stored import gap_text, read_gap
 from pipeline.gap.types import (
     ForceAgainst,
     ForceFormula,
@@ -26,25 +25,34 @@ from pipeline.gap.types import (
     Rival,
     Trace,
     Verdict,
+    read_gap,
 )
 from pipeline.gap.verdict.residual_force import residual_forces
+from pipeline.json_files import json_text
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.augmented import simulate_augmented
-from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, Term, find_effect, make_term
+from pipeline.plant.nonlinear.effects import (
+    CATALOGUE,
+    AugmentedChain,
+    EffectTerm,
+    find_effect,
+)
 from pipeline.plant.nonlinear.effects.base import chain_scales
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, law
-from pipeline.report.gap.page import build_gap_document, render_gap
 from pipeline.report.gap.section import with_gap
-from pipeline.report.gap.words import terminal_verdict
-from pipeline.report.math.tex import from_tex
-from pipeline.report.math.tree import to_text
+from pipeline.report.gap.story import build_gap_document, render_gap
+from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.render.html import render_html
+from pipeline.results import Provenance
+from pipeline.set_up import Bench
 from pipeline.submission import load_submission
+from pipeline.words.math import to_text
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.commandline import cartlab_here
+from tests.helpers.effects import make_term
 from tests.report.test_report import HOSTILE, Page
 from tests.truth.cases import make_case
 
@@ -59,10 +67,7 @@ U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
 def usual_values(effect, place):
     """Return parameter values of a usual size."""
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=0.05)
-    return {
-        p.name: p.scale(scales) * multiple
-        for p, multiple in zip(effect.parameters, effect.trial_points[0], strict=True)
-    }
+    return {p.name: p.size(scales) * p.typical for p in effect.parameters}
 
 
 RESIDUAL = Residual(
@@ -86,7 +91,7 @@ RESIDUAL = Residual(
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
     """Return what the workflow could find on the two-cart bench; the first cart's runs drawn."""
-    terms: list[Term] = []
+    terms: list[EffectTerm] = []
     for key in keys:
         effect = find_effect(key)
         place = effect.places((True, True, True))[-1]
@@ -135,6 +140,9 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
         for i, term in enumerate(terms)
     )  # fmt: skip
     return Gap(
+        title="Two carts",
+        bench=Bench(springs=(True, True, True)),
+        provenance=Provenance(files={"data/step-a.csv": "0" * 64}),
         verdict=verdict,
         effects=effects,
         baseline=0.153,
@@ -236,7 +244,7 @@ def test_suspects_are_listed_as_such():
     text = page_of(gap).text
 
     assert "Suspected, though not proven: backlash between motor and cart 1 (leaves 12.0 %)" in text
-    assert read_gap(gap_text(gap, two_cart_analysis()))[0].suspects == gap.suspects
+    assert read_gap(json_text(gap)).suspects == gap.suspects
 
 
 def test_nothing_to_name_is_said():
@@ -399,27 +407,6 @@ def test_a_spring_pulls_both_its_carts():
     assert to_text(law(terms, 0).math) == "f_a = ad^3"
 
 
-@pytest.mark.parametrize(
-    ("tex", "text"),
-    [
-        (r"\frac{1}{2} \dot x^2", "(1)/(2)x′^2"),
-        (r"\left(F + (S - F)\right) \operatorname{sign} v", "(F + (S−F))\u2009sign\u2009v"),
-        (r"u_\text{at rest} \le \delta", "u_at\u00a0rest ≤ δ"),
-        (r"\unknown", "unknown"),
-        ("", ""),
-    ],
-)
-def test_tex_becomes_mathematics(tex, text):
-    """Fractions, scripts, brackets, upright words; what is unknown stands by its name."""
-    assert to_text(from_tex(tex)) == text
-
-
-def test_laws_are_all_formulas():
-    """No law leaves a brace or a backslash behind."""
-    for effect in CATALOGUE:
-        assert not set(to_text(from_tex(effect.equation))) & set("{}\\$"), effect.key
-
-
 def test_pdf_and_files_are_the_same_each_time(tmp_path):
     """Two renderings are equal byte for byte, and the PDF has the verdict on its first page."""
     for name in ("one", "two"):
@@ -475,13 +462,14 @@ def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
 def test_the_file_is_read_back_as_it_was(verdict):
     """What is read from `gap.json` writes the same file again, and tells the same verdict."""
     keys = () if verdict == "none" else ("end_stop", "input_delay")
-    gap, analysis = make_gap(verdict, keys), two_cart_analysis()
-    text = gap_text(gap, analysis)
+    gap = make_gap(verdict, keys)
+    text = json_text(gap)
 
-    again, files = read_gap(text)
+    again = read_gap(text)
 
-    assert gap_text(again, analysis) == text
-    assert files == analysis.files
+    assert json_text(again) == text
+    assert again.provenance == gap.provenance
+    assert again.bench == gap.bench
     assert terminal_verdict(again) == terminal_verdict(gap)
 
 
@@ -565,7 +553,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
     assert gap is not None
     assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
 
-    page = Page(render_html(build_document(analysis, gap=gap, progress=None)))
+    page = Page(render_html(build_document(analysis, gap=gap)))
 
     assert "What the linear model leaves out" in page.text
     assert "Dry (Coulomb) friction on cart 1 explains" in page.text
@@ -599,9 +587,9 @@ def test_hostile_words_in_a_gap_file_stay_words(bench):
     analysis = analyse(load_submission(bench.folder))
     text = (bench.folder / "gap" / "gap.json").read_text(encoding="utf-8")
     document = json.loads(text) | {"next_experiment": HOSTILE}
-    gap, _ = read_gap(json.dumps(document))
+    gap = read_gap(json.dumps(document))
 
-    page = Page(render_html(build_document(analysis, gap=gap, progress=None)))
+    page = Page(render_html(build_document(analysis, gap=gap)))
 
     assert not {tag for tag, _ in page.tags} & {"img", "iframe"}
     assert sum(tag == "script" for tag, _ in page.tags) == 1

@@ -16,7 +16,7 @@ from pipeline.report.equations.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.math.tree import Math, Term, number, row, symbol, to_mathml, to_text
+from pipeline.words.math import Math, Term, number, row, symbol, to_mathml, to_text
 
 FOUR = Chain(
     m=np.array([3e-4, 2.5e-4, 2e-4, 1.8e-4]),

@@ -15,13 +15,12 @@ from pipeline.report.document import (
     Paragraph,
     Quote,
     Section,
-    Span,
     Table,
-    plain,
 )
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import render_pdf
 from pipeline.report.sections.notes import even_headings, note_blocks
+from pipeline.words.spans import Span, plain
 
 
 def document_of(blocks: tuple[Block, ...]) -> Document:

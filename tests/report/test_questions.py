@@ -8,15 +8,7 @@ import numpy as np
 import pypdf
 import pytest
 
-from pipeline.report.document import (
-    Document,
-    Paragraph,
-    Question,
-    Section,
-    paragraph,
-    plain,
-    spans,
-)
+from pipeline.report.document import Document, Paragraph, Question, Section, paragraph
 from pipeline.report.draft.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import render_pdf
@@ -25,6 +17,7 @@ from pipeline.report.sections.questions import ask, open_line, placed, split_not
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Estimate, StepGain
 from pipeline.submission import load_submission, new_submission
+from pipeline.words.spans import plain, spans
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
@@ -244,7 +237,7 @@ def test_page_and_print_mark_the_place_and_show_the_answer():
     analysis = off("zeta_b", 65.0)
     pages, prints = {}, {}
     for name, discussion in (("open", None), ("done", "## zeta_b\n\n<b>Ours</b> & *more*\n")):
-        whole = build_document(replace(analysis, discussion=discussion), progress=None)
+        whole = build_document(replace(analysis, discussion=discussion))
         shown = [
             section for section in whole.sections if section.id in ("parameters", "discussion")
         ]

@@ -14,25 +14,18 @@ import pytest
 
 from pipeline.checks.recordings import check_files, check_left_out
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import (
-    Document,
-    Paragraph,
-    Picture,
-    Section,
-    Table,
-    cell,
-    plain,
-    spans,
-)
+from pipeline.report.document import Document, Paragraph, Picture, Section, Table, cell
 from pipeline.report.draft.content import build_document
-from pipeline.report.draft.write import render_report
+from pipeline.report.draft.write import Files, render_report
 from pipeline.report.render.html import render_html
 from pipeline.report.render.pdf import missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
 from pipeline.report.sections.summary import terminal_summary
-from pipeline.results import SIGN, Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped
+from pipeline.results import Analysis, Check, Estimate, LeftOut, ParameterRow, Skipped, Stage
+from pipeline.set_up import Bench, Units
+from pipeline.words.spans import plain, spans
 from tests.helpers.analysis_factory import make_analysis
 
 VOID = {"meta", "link", "br", "img", "hr", "input"}
@@ -66,7 +59,7 @@ class Page(HTMLParser):
     def handle_data(self, data):
         """Collect the text that a reader sees."""
         if self._open[-1:] not in (["style"], ["script"]):
-            self.text += data
+            self.text += data.replace("\u00a0", " ")
 
     def values(self, attribute: str) -> list[str]:
         """Return all values of one attribute."""
@@ -75,7 +68,7 @@ class Page(HTMLParser):
 
 def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, str]:
     """Render, and return the parsed page and the PDF's text."""
-    render_report(analysis, out, pdf=pdf)
+    render_report(analysis, out, files=Files(pdf=pdf))
     return read(out)
 
 
@@ -142,7 +135,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
     # One more than a page has room for:
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
     analysis = replace(make_analysis(1), files=files)
-    table = file_table(Shown.of(analysis))
+    table = file_table(Shown(analysis))
     document = Document("A", "", (), (Section("p", "Provenance", (table,)),), "")
 
     pages = pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages
@@ -189,7 +182,7 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
 def test_the_list_of_files_does_not_stand_alone_on_a_page():
     """Wherever a page ends, its heading and its sentence go with it."""
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
-    shown = Shown.of(replace(make_analysis(1), files=files))
+    shown = Shown(replace(make_analysis(1), files=files))
     blocks = tuple(provenance_blocks(shown, "Made by the program."))
     line = Paragraph(spans("A line."))
 
@@ -243,13 +236,13 @@ def test_the_page_can_be_found_and_heard(folders):
 def test_a_report_without_a_title_says_what_it_is_once():
     """What it is about is its title then, and stands nowhere above it."""
     analysis = make_analysis(2)
-    named = build_document(analysis, progress=None)
-    bare = build_document(replace(analysis, title=" "), progress=None)
+    named = build_document(analysis)
+    bare = build_document(replace(analysis, title=" "))
     assert (named.title, named.subtitle) == (
         "The 2-cart system, bench 4", "Section 03 · Identification and control of 2 carts",
     )  # fmt: skip
     assert (bare.title, bare.subtitle) == ("Identification and control of 2 carts", "Section 03")
-    nothing = build_document(replace(analysis, title="", section=""), progress=None)
+    nothing = build_document(replace(analysis, title="", section=""))
     assert nothing.subtitle == ""
     assert "kicker" not in render_html(nothing).split("<main", 1)[-1].split("<section", 1)[0]
 
@@ -301,12 +294,11 @@ def test_hostile_text_stays_text(tmp_path):
         title=HOSTILE,
         section=HOSTILE,
         authors=((HOSTILE, HOSTILE), ("'\"><img src=x>", "")),
-        position_unit="<i>c$m",
-        input_unit="#V",
+        bench=replace(analysis.bench, units=Units(position="<i>c$m", input="#V")),
         records=tuple(replace(r, id=HOSTILE) if r.id == "step-a" else r for r in analysis.records),
         step_gains=tuple(replace(g, experiment=HOSTILE, note=HOSTILE) for g in analysis.step_gains),
         warnings=(HOSTILE,),
-        skipped=(Skipped(stage=HOSTILE, reason=HOSTILE),),
+        skipped=(Skipped(stage=Stage.SINE, run=HOSTILE, reason=HOSTILE),),
         files={HOSTILE: "0" * 64},
         discussion=HOSTILE + '\n\n#read("report.typ")\n\n<iframe src=x>',
     )
@@ -371,7 +363,7 @@ def bare(analysis: Analysis, **parts) -> Analysis:
         checks=(),
         feedback=None,
         hardware=(),
-        skipped=(Skipped(stage="Bode fit", reason="no dwells: needs 8 points, found 0"),),
+        skipped=(Skipped(stage=Stage.BODE_FIT, reason="no dwells: needs 8 points, found 0"),),
         warnings=(),
         files={},
         discussion=None,
@@ -474,9 +466,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
         change_percent=None, change_sigmas=None, consistent=None,
     )  # fmt: skip
     springs = tuple(bool(k != 0) for k in chain.k)
-    page, pdf = render(
-        bare(analysis, carts=chain.n, springs=springs, fit=fit, rows=(row,)), tmp_path
-    )
+    page, pdf = render(bare(analysis, bench=Bench(springs=springs), fit=fit, rows=(row,)), tmp_path)
     assert "to the records in time" in page.text
     assert "The identified chain" in pdf
 
@@ -512,7 +502,7 @@ def test_a_cart_that_a_step_set_swinging_was_not_let_go():
     records = tuple(replace(r, kind="step") if r.id in ringing else r for r in analysis.records)
 
     let_go, stepped = (
-        "".join(plain(b.caption) for b in decay_blocks(Shown.of(one)) if isinstance(b, Picture))
+        "".join(plain(b.caption) for b in decay_blocks(Shown(one)) if isinstance(b, Picture))
         for one in (analysis, replace(analysis, records=records))
     )
 
@@ -547,9 +537,9 @@ def test_what_was_not_used_is_not_said_to_be():
 
 def test_a_file_that_cannot_be_read_asks_for_no_experiment():
     """What is asked for is that file; only other stages that were skipped ask for more."""
-    unread = Skipped(stage="reading step-1", reason="empty")
+    unread = Skipped(stage=Stage.READING, run="step-1", reason="empty")
     reason = "no closed-loop run was recorded"
-    other = Skipped(stage="hardware check", reason=reason, missing="a closed-loop run")
+    other = Skipped(stage=Stage.HARDWARE_CHECK, reason=reason, missing="a closed-loop run")
     analysis = replace(make_analysis(1, repeats=1), unreadable={"step-1": "empty"})
     asked = [
         "add a closed-loop run" in terminal_summary(replace(analysis, skipped=skipped))
@@ -560,8 +550,10 @@ def test_a_file_that_cannot_be_read_asks_for_no_experiment():
 
 def test_skipped_stages_are_told_apart():
     """The names of stages have commas in them, so what parts them is another sign."""
-    stages = [f"log decrement, decay-{i}, cart 1" for i in range(5)]
-    skipped = tuple(Skipped(stage=stage, reason="too short") for stage in stages)
+    skipped = tuple(
+        Skipped(stage=Stage.LOG_DECREMENT, run=f"decay-{i}", cart=1, reason="too short")
+        for i in range(5)
+    )
     text = terminal_summary(replace(make_analysis(1, repeats=1), skipped=skipped))
     (line,) = (line for line in text.splitlines() if "Skipped: " in line)
     assert line.count("cart 1; ") == 3
@@ -570,7 +562,8 @@ def test_skipped_stages_are_told_apart():
 
 def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
     """In the summary, on the terminal and in the list, as it stands in submission.toml."""
-    skipped = (Skipped(stage="log decrement, my_decay_1, cart 1", reason="too short"),)
+    decay = Skipped(stage=Stage.LOG_DECREMENT, run="my_decay_1", cart=1, reason="too short")
+    skipped = (decay,)
     analysis = replace(make_analysis(1), skipped=skipped)
     assert "my_decay_1" in terminal_summary(analysis)
     page, _ = render(analysis, tmp_path, pdf=False)
@@ -602,7 +595,7 @@ def test_one_swing_shows_no_rise_of_the_damping():
         for decay in analysis.log_decrements
     )
     alone = replace(analysis, log_decrements=one)
-    drawn = [[block.kind for block in decay_blocks(Shown.of(a))] for a in (analysis, alone)]
+    drawn = [[block.kind for block in decay_blocks(Shown(a))] for a in (analysis, alone)]
     assert drawn[0].count("picture") == drawn[1].count("picture") + 1
 
 
@@ -627,17 +620,28 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
     rows = tuple(replace(row, consistent=not row.name.startswith("K")) for row in analysis.rows)
     poor = replace(analysis.fit, chi_square_per_dof=1e6)
     asked = replace(
-        analysis, springs=(True, True, False), rows=rows, fit=poor, log_decrements=smooth
+        analysis,
+        bench=Bench(springs=(True, True, False)),
+        rows=rows,
+        fit=poor,
+        log_decrements=smooth,
     )
     assert "See whether springs is right" in terminal_summary(asked)
-    for other in ({"springs": (True, True, True)}, {"fit": analysis.fit}):
+    for other in ({"bench": Bench(springs=(True, True, True))}, {"fit": analysis.fit}):
         assert "See whether springs" not in terminal_summary(replace(asked, **other))
 
 
 def test_a_wrong_sign_is_said_first():
     """A stated sign that the data contradict comes first; what else fails may follow from it."""
     analysis = make_analysis(1, repeats=1)
-    wrong = Check(id=SIGN, outcome="fail", value=3.0, limit=0.0, message="set sign = 1 there")
+    wrong = Check(
+        kind="input",
+        part="sign",
+        outcome="fail",
+        value=3.0,
+        limit=0.0,
+        message="set sign = 1 there",
+    )
     off = tuple(replace(row, consistent=False) for row in analysis.rows)
     text = terminal_summary(replace(analysis, checks=(wrong, *analysis.checks), rows=off))
     findings, _, advice = text.partition("What to do next.")

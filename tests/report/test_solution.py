@@ -19,11 +19,10 @@ from pipeline.errors import ConfigError
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.report.document import Formula, plain
+from pipeline.report.document import Formula
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, shown, shown_with, value_term, work_out
 from pipeline.report.equations.derivation import work_state_model
-from pipeline.report.math.tree import to_text
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.questions import Asked, Kind, ask
 from pipeline.report.solution.design import work_design
@@ -36,7 +35,11 @@ from pipeline.report.solution.expected import (
 )
 from pipeline.report.solution.write import build_solution, model_answer
 from pipeline.resources import RUBRICS
+from pipeline.set_up import Bench
 from pipeline.stages.state_feedback import design_feedback
+from pipeline.submission import Design
+from pipeline.words.math import to_text
+from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.grading_students import student
 from tests.plant.test_chain import chains
@@ -273,7 +276,8 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
     """Riccati's equation and Ackermann's formula give the gains that the design stage found."""
     chain = PRESETS[preset]
     design = design_feedback(
-        chain, cart=chain.n, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method
+        chain,
+        Design(cart=chain.n, reference=1.0, overshoot_percent=10, settling_time=1.0, method=method),
     )
     worked = work_design(chain, design)
     # Six poles near 1: the controllability matrix of six states loses some nine digits.
@@ -446,7 +450,7 @@ def analyse_rigid():
     fit = replace(
         analysis.fit, chain=chain, names=("m_1", "c_1"), covariance=1e-12 * np.eye(2), parameters={}
     )
-    return replace(analysis, springs=(False, False), fit=fit, rows=(), feedback=None)
+    return replace(analysis, bench=Bench(springs=(False, False)), fit=fit, rows=(), feedback=None)
 
 
 def test_solution_json_is_the_reference_for_programs():

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from pipeline.report.document import Details, Table, plain
+from pipeline.report.document import Details, Table
 from pipeline.report.sections.housekeeping import check_blocks
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_blocks, parameter_table
@@ -15,6 +15,7 @@ from pipeline.report.sections.summary import terminal_summary
 from pipeline.resources import EXAMPLES
 from pipeline.results import Analysis, Check
 from pipeline.submission import load_submission
+from pipeline.words.spans import plain
 from pipeline.workflow import analyse
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
@@ -51,7 +52,7 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
     assert "decays of" not in text
     assert not any("the decay of cart" in check.message for check in analysis.checks)
     assert any(line.startswith("Record decays from two") for line in next_part(analysis))
-    sources = [plain(line[3].text) for line in parameter_table(Page.of(analysis)).rows]
+    sources = [plain(line[3].text) for line in parameter_table(Page(analysis)).rows]
     assert sources == ["step", "ringing after a step", "ringing after a step"]
     assert every_failed_check_is_named(analysis)
     assert any("a [design] table" in line for line in next_part(analysis))
@@ -86,7 +87,7 @@ def test_an_independent_check_is_not_called_the_same():
     text = terminal_summary(analysis)
     assert "identified from 23 sine dwells, by" in text
     assert "sweep" not in text.splitlines()[0]  # no number rests on it
-    notes = plain_of(parameter_blocks(Page.of(analysis)))
+    notes = plain_of(parameter_blocks(Page(analysis)))
     assert "ω_a, ω_b: initial and final estimate rest on the same recordings" in notes
 
 
@@ -108,17 +109,26 @@ def test_the_sources_of_the_table_are_those_there_are():
         replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
         for row in analysis.rows
     )
-    assert "free swing" in plain_of(parameter_blocks(Page.of(analysis)))
-    assert "free swing" not in plain_of(parameter_blocks(Page.of(replace(analysis, rows=without))))
+    assert "free swing" in plain_of(parameter_blocks(Page(analysis)))
+    assert "free swing" not in plain_of(parameter_blocks(Page(replace(analysis, rows=without))))
 
 
 def test_a_check_that_nobody_foresaw_is_named_too():
     """By its id and its message, before what the linear carts leave out."""
-    odd = Check.of("odd.run-1", False, "run-1: odd.", value=1.0, limit=0.5)
-    off = Check.of("fit.explains_data", False, "χ² is 9.", value=9.0, limit=2.0)
+    odd = Check(
+        kind="order", run="run-1", outcome="fail", value=1.0, limit=0.5, message="run-1: odd."
+    )
+    off = Check(
+        kind="fit",
+        part="explains_data",
+        outcome="fail",
+        value=9.0,
+        limit=2.0,
+        message="χ² is 9.",
+    )
     analysis = replace(make_analysis(1, repeats=1), checks=(off, odd), skipped=())
     first, second, *_ = next_part(analysis)
-    assert first == "Look into this check. run-1: odd. Failed: odd.run-1"
+    assert first == "Look into this check. run-1: odd. Failed: order.run-1"
     assert second.endswith("Failed: fit.explains_data")
 
 
@@ -149,7 +159,7 @@ def test_nothing_failed_is_named_in_no_list():
     """A good report has neither failed checks in its summary nor in its section."""
     analysis = analysed("one-cart")
     assert not any("Failed:" in line for line in next_part(analysis))
-    blocks = check_blocks(Page.of(analysis))
+    blocks = check_blocks(Page(analysis))
     assert [type(block) for block in blocks] == [Details]
     assert not any(isinstance(block, Table) for block in blocks)
 

@@ -28,7 +28,7 @@ def raw(html: str) -> list[str]:
 def test_reports_write_symbols(carts):
     """The report, the solution and the terminal; a key to be typed is set as code."""
     analysis = make_analysis(carts)
-    assert raw(render_html(build_document(analysis, progress=None))) == []
+    assert raw(render_html(build_document(analysis))) == []
     assert raw(render_html(build_solution(analysis))) == []
     assert raw(terminal_summary(analysis)) == []
 

@@ -3,17 +3,17 @@
 from dataclasses import replace
 from decimal import Decimal
 
-from pipeline.report.document import plain
 from pipeline.report.sections.measurements import dwell_table
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import parameter_table, reported_table
 from pipeline.report.sections.summary import terminal_summary
+from pipeline.words.spans import plain
 from tests.helpers.analysis_factory import make_analysis
 
 
 def page(rows, reported=None) -> Page:
     """Return a page of one cart with other rows, and with what is claimed."""
-    return Page.of(replace(make_analysis(1), rows=tuple(rows), reported=reported or {}))
+    return Page(replace(make_analysis(1), rows=tuple(rows), reported=reported or {}))
 
 
 def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
@@ -67,6 +67,6 @@ def test_a_dwell_that_did_not_settle_is_said():
     analysis = make_analysis(2)
     settled = [replace(point, settled=True) for point in analysis.sine_points]
     points = (replace(settled[0], settled=False), *settled[1:])
-    table = dwell_table(Page.of(replace(analysis, sine_points=points)))
+    table = dwell_table(Page(replace(analysis, sine_points=points)))
     assert len(table.rows) == len(points)
     assert [cell.tone for row in table.rows for cell in row if cell.tone] == ["bad"]

@@ -15,6 +15,7 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import Estimate, FrequencyResponse
+from pipeline.set_up import Bench
 from pipeline.stages.bode_fit import fit_bode
 
 BENCH_BAND = 2 * np.pi * np.geomspace(0.3, 7.0, 30)
@@ -62,7 +63,7 @@ def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[Fre
 @pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
 def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
     """From error-free magnitudes and nothing else, every named parameter is right."""
-    got = fit_bode(exact(chain), n=chain.n, springs=(True,) * (chain.n + 1))
+    got = fit_bode(exact(chain), bench=Bench(springs=(True,) * (chain.n + 1)))
 
     assert got.converged
     for name, value in chain.parameters().items():
@@ -91,7 +92,7 @@ def test_any_bench_is_found(chain):
     """Error-free magnitudes of random benches, without a start, give them back."""
     omega = 2 * np.pi * np.geomspace(0.5, 10.0, 40)
 
-    got = fit_bode(exact(chain, omega), n=chain.n, springs=(True,) * (chain.n + 1))
+    got = fit_bode(exact(chain, omega), bench=Bench(springs=(True,) * (chain.n + 1)))
 
     # As above; a wrong minimum would be off by per cents.
     assert_allclose(got.chain.m, chain.m, rtol=1e-4)
@@ -104,7 +105,7 @@ def test_the_position_unit_does_not_matter(unit):
     chain = PRESETS["throne-3dof"]
     scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
 
-    got = fit_bode(exact(scaled), n=3, springs=(True,) * 4)
+    got = fit_bode(exact(scaled), bench=Bench(springs=(True,) * 4))
 
     truth = chain.parameters()
     assert_allclose(got.parameters["omega_c"].value, truth["omega_c"], rtol=1e-5)
@@ -115,7 +116,7 @@ def test_a_rigid_body_has_mass_and_damping():
     """Without any spring the fit gives the mass and the damping of the cart."""
     cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
 
-    got = fit_bode(exact(cart), n=1, springs=(False, False))
+    got = fit_bode(exact(cart), bench=Bench(springs=(False, False)))
 
     assert_allclose(got.parameters["mass"].value, 3e-4, rtol=1e-5)
     assert_allclose(got.parameters["damping"].value, 1e-3, rtol=1e-5)
@@ -126,7 +127,7 @@ def test_the_staged_fit_is_reported_as_well():
     """On exact data the stage-by-stage fit finds the same parameters, recomputed ones included."""
     chain = PRESETS["throne-3dof"]
 
-    got = fit_bode(exact(chain), n=3, springs=(True,) * 4, initial=PAPER_STARTS[3])
+    got = fit_bode(exact(chain), bench=Bench(springs=(True,) * 4), initial=PAPER_STARTS[3])
 
     truth = chain.parameters()
     assert set(got.staged) == set(truth)
@@ -156,7 +157,8 @@ def test_intervals_cover_the_truth(preset, phases):
 def test_a_spring_that_is_not_there_is_held_at_zero():
     """With k_1 = 0 half the noisy sets want it negative: it is held at zero, and said."""
     fits = [
-        fit_bode(noisy("throne-2dof", seed=seed), n=2, springs=(True,) * 3) for seed in range(20)
+        fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
+        for seed in range(20)
     ]
 
     held = [fit for fit in fits if "k_1" not in fit.names]
@@ -171,7 +173,7 @@ def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
     chain = PRESETS["throne-2dof"]
     loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
 
-    got = fit_bode(exact(loose), n=2, springs=(True,) * 3)
+    got = fit_bode(exact(loose), bench=Bench(springs=(True,) * 3))
 
     assert_allclose(got.chain.k, loose.k, atol=1e-5)
     assert_allclose(got.chain.c, loose.c, atol=1e-7)
@@ -185,7 +187,7 @@ BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 
 def test_a_damping_at_its_bound_is_no_measurement():
     """Held at zero, it says so and has no standard error; gain and frequency are known."""
-    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True))
+    got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
 
     assert got.at_bound == ("c_1",)
     zeta = got.parameters["zeta"]
@@ -197,7 +199,7 @@ def test_a_damping_at_its_bound_is_no_measurement():
 def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
     """One of two dampings at zero: the modes keep an error that allows for it on both sides."""
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
-    got = fit_bode(exact(chain), n=2, springs=(False, True, True))
+    got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
 
     assert got.at_bound == ("c_2",)
     assert got.parameters["zeta_2"].at_bound
@@ -212,7 +214,7 @@ def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
 def test_the_decay_tells_a_damping_that_the_response_leaves_open():
     """Six points beside a sharp peak allow any small damping, so the decay's is the answer."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
-    got = fit_bode(exact(SHARP, BESIDE), n=1, springs=(True, True), decays={1: decay})
+    got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
 
     zeta = got.parameters["zeta"]
     assert zeta.std is not None
@@ -230,10 +232,10 @@ def test_where_one_damping_is_open_all_decays_are_fitted_along():
     }
     low = exact(replace(chain, c=np.array([0.0, 1.0]) * chain.c))
     vague = [replace(r, magnitude_std=0.3 * r.magnitude) for r in low]
-    alone = fit_bode(vague, n=2, springs=(False, True, True))
+    alone = fit_bode(vague, bench=Bench(springs=(False, True, True)))
     assert alone.at_bound == ("c_1",)
 
-    got = fit_bode(vague, n=2, springs=(False, True, True), decays=decays)
+    got = fit_bode(vague, bench=Bench(springs=(False, True, True)), decays=decays)
     assert got.at_bound == ("c_1", "c_2")
     # Two standard errors of the decays; a response 30 % uncertain adds nothing.
     assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
@@ -244,7 +246,7 @@ def test_a_decay_that_the_response_rules_out_is_not_used():
     """Points on a peak of 1 in 1000 damping contradict 0.05: the two are not mixed."""
     undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
     decay = Estimate(value=0.05, std=0.001, source="log_decrement")
-    got = fit_bode(undamped, n=1, springs=(True, True), decays={1: decay})
+    got = fit_bode(undamped, bench=Bench(springs=(True, True)), decays={1: decay})
 
     assert got.parameters["zeta"].at_bound
     assert got.chain.c[0] == 0
@@ -255,7 +257,7 @@ def test_a_decay_is_not_used_where_the_response_tells():
     responses = noisy("throne-1dof")
     decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
     alone, given = (
-        fit_bode(responses, n=1, springs=(True, True), decays=decays)
+        fit_bode(responses, bench=Bench(springs=(True, True)), decays=decays)
         for decays in (None, {1: decay})
     )
     assert given.parameters == alone.parameters
@@ -265,8 +267,8 @@ def test_a_spring_known_to_be_missing_is_not_fitted():
     """The mask takes the spring out, and the other errors get no larger."""
     responses = noisy("throne-3dof")
 
-    free = fit_bode(responses, n=3, springs=(True,) * 4)
-    known = fit_bode(responses, n=3, springs=(False, True, True, True))
+    free = fit_bode(responses, bench=Bench(springs=(True,) * 4))
+    known = fit_bode(responses, bench=Bench(springs=(False, True, True, True)))
 
     assert "k_1" not in known.names
     assert known.chain.k[0] == 0
@@ -287,10 +289,10 @@ def test_phases_that_contradict_the_magnitudes_are_left_out(change):
         if r.phase is not None
     ]
 
-    got = fit_bode(wrong, n=2, springs=(True,) * 3)
+    got = fit_bode(wrong, bench=Bench(springs=(True,) * 3))
 
     bare = [replace(r, phase=None, phase_std=None) for r in responses]
-    expected = fit_bode(bare, n=2, springs=(True,) * 3)
+    expected = fit_bode(bare, bench=Bench(springs=(True,) * 3))
     assert "the phases do not agree" in got.message
     assert got.parameters == expected.parameters
 
@@ -299,9 +301,10 @@ def test_good_phases_sharpen_the_dampings():
     """With phases as good as the magnitudes, the errors get smaller."""
     responses = noisy("throne-3dof", phases=True)
 
-    both = fit_bode(responses, n=3, springs=(True,) * 4)
+    both = fit_bode(responses, bench=Bench(springs=(True,) * 4))
     bare = fit_bode(
-        [replace(r, phase=None, phase_std=None) for r in responses], n=3, springs=(True,) * 4
+        [replace(r, phase=None, phase_std=None) for r in responses],
+        bench=Bench(springs=(True,) * 4),
     )
 
     for name in ("zeta_a", "zeta_b", "zeta_c", "omega_b"):
@@ -324,12 +327,11 @@ def test_a_misfit_widens_the_errors():
         for r in exact(chain)
     ]
 
-    got = fit_bode(scattered, n=2, springs=(True,) * 3)
+    got = fit_bode(scattered, bench=Bench(springs=(True,) * 3))
 
     honest = fit_bode(
         [replace(r, magnitude_std=1e-4 * r.magnitude) for r in exact(chain)],
-        n=2,
-        springs=(True,) * 3,
+        bench=Bench(springs=(True,) * 3),
     )
     assert "off the model" in got.message
     assert got.chi_square_per_dof > 1e4
@@ -352,7 +354,7 @@ def test_a_table_is_judged_by_its_own_scatter():
         for r in exact(chain)
     ]
 
-    got = fit_bode(rounded, n=3, springs=(True,) * 4)
+    got = fit_bode(rounded, bench=Bench(springs=(True,) * 4))
 
     gain = got.parameters["K_1"]
     assert gain.std is not None
@@ -364,7 +366,7 @@ def test_a_table_is_judged_by_its_own_scatter():
 def test_one_measured_cart_may_do():
     """The first cart alone determines two carts whose near spring is known to be missing."""
     got = fit_bode(
-        noisy("throne-2dof")[:1], n=2, springs=(False, True, True), initial=PAPER_STARTS[2]
+        noisy("throne-2dof")[:1], bench=Bench(springs=(False, True, True)), initial=PAPER_STARTS[2]
     )
 
     for name, value in PRESETS["throne-2dof"].parameters().items():
@@ -377,14 +379,14 @@ def test_one_measured_cart_may_do():
 def test_the_last_cart_alone_does_not_determine_two():
     """X_2/U has five coefficients, two carts have seven parameters: this is said."""
     with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
-        fit_bode(noisy("throne-2dof")[1:], n=2, springs=(True,) * 3)
+        fit_bode(noisy("throne-2dof")[1:], bench=Bench(springs=(True,) * 3))
 
 
 def test_few_points_are_refused():
     """Six points for seven parameters: the message counts both."""
     few = thinned(noisy("throne-2dof"), slice(0, 3))
     with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
-        fit_bode(few, n=2, springs=(True,) * 3)
+        fit_bode(few, bench=Bench(springs=(True,) * 3))
 
 
 @pytest.mark.parametrize(
@@ -399,13 +401,13 @@ def test_impossible_responses_are_refused(change, message):
     """Numbers that are none, negative frequencies and carts that do not exist are named."""
     (response,) = noisy("throne-1dof")
     with pytest.raises(DataError, match=message):
-        fit_bode([replace(response, **change)], n=1, springs=(True, True))
+        fit_bode([replace(response, **change)], bench=Bench(springs=(True, True)))
 
 
 def test_no_response_is_refused():
     """Without a response there is nothing to fit."""
     with pytest.raises(DataError, match="needs a frequency response, found none"):
-        fit_bode([], n=1, springs=(True, True))
+        fit_bode([], bench=Bench(springs=(True, True)))
 
 
 def test_residuals_belong_to_their_points():
@@ -415,7 +417,7 @@ def test_residuals_belong_to_their_points():
     raised[7] += 10 * responses[1].magnitude_std[7]
     responses[1] = replace(responses[1], magnitude=raised)
 
-    got = fit_bode(responses, n=3, springs=(True,) * 4)
+    got = fit_bode(responses, bench=Bench(springs=(True,) * 4))
 
     assert {name: z.shape for name, z in got.standardised.items()} == {
         str(r.cart): r.omega.shape for r in responses
@@ -428,7 +430,7 @@ def test_the_same_data_give_the_same_fit():
     """Two runs agree to the last bit, random starts included."""
     responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
 
-    first, second = (fit_bode(responses, n=3, springs=(True,) * 4) for _ in range(2))
+    first, second = (fit_bode(responses, bench=Bench(springs=(True,) * 4)) for _ in range(2))
 
     assert first.parameters == second.parameters
     assert first.n_starts == second.n_starts

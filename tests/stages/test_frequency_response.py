@@ -9,8 +9,7 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.results import FrequencyResponse, Record, SinePoint
-from pipeline.results_of_runs import Hold, Kind
+from pipeline.results import FrequencyResponse, Hold, Kind, Record, SinePoint
 from pipeline.stages.frequency_response import (
     collect_dwells,
     find_resonances,

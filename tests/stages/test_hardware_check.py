@@ -17,11 +17,17 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.plant.loop.sampled_loop import Controller, Pid, StateFeedback, simulate_loop
-from pipeline.results import FeedbackDesign, HardwareCheck, Record
-from pipeline.results_of_runs import Kind
+from pipeline.plant.loop.sampled_loop import (
+    Controller,
+    LoopSetup,
+    Pid,
+    StateFeedback,
+    simulate_loop,
+)
+from pipeline.results import FeedbackDesign, HardwareCheck, Kind, Record
 from pipeline.stages.hardware_check import check_hardware
 from pipeline.stages.state_feedback import design_feedback
+from pipeline.submission import Design
 
 T = 0.00884  # s
 COUNT = 0.00227  # cm
@@ -70,12 +76,12 @@ def record(
 
 def designed(chain: Chain, cart: int) -> FeedbackDesign:
     return design_feedback(
-        chain, cart=cart, reference=1.0, overshoot_percent=10.0, settling_time=1.0
+        chain, Design(cart=cart, reference=1.0, overshoot_percent=10.0, settling_time=1.0)
     )
 
 
-def stated(design: FeedbackDesign, factor: float = 1.0) -> submission.StateFeedback:
-    return submission.StateFeedback(
+def stated(design: FeedbackDesign, factor: float = 1.0) -> submission.StateFeedbackController:
+    return submission.StateFeedbackController(
         type="state_feedback",
         gains=tuple(factor * design.gains),
         prefilter=factor * design.prefilter,
@@ -100,9 +106,7 @@ def bench(
         law,
         t=CLOCK,
         reference=STEPS,
-        sample_time=sample_time,
-        input_limit=limit,
-        encoder_step=COUNT,
+        setup=LoopSetup(sample_time=sample_time, input_limit=limit, encoder_step=COUNT),
     )
     return encoder(run.x), run.u
 
@@ -199,7 +203,7 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
     checks = check_hardware(
         record(y, u=run.u, reference=STEPS),
         TWO,
-        controller=submission.Pid(type="pid", kp=2.0, kd=0.1),
+        controller=submission.PidController(type="pid", kp=2.0, kd=0.1),
         controlled_cart=1,
     )
 
@@ -215,7 +219,7 @@ def test_what_contradicts_the_run_fails_a_check(wrong):
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
     gains = stated(design).gains
-    swapped = submission.StateFeedback(
+    swapped = submission.StateFeedbackController(
         type="state_feedback", gains=(gains[1], gains[0], *gains[2:]), prefilter=design.prefilter
     )
     run = record(
@@ -243,10 +247,11 @@ def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
     t = 0.001 * np.arange(4000, dtype=np.float64)
     steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
     design = design_feedback(
-        TWO, cart=2, reference=1.0, overshoot_percent=10.0, settling_time=1.0, sample_time=0.001
+        TWO,
+        Design(cart=2, reference=1.0, overshoot_percent=10.0, settling_time=1.0, sample_time=0.001),
     )
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
-    run = simulate_loop(TWO, law, t=t, reference=steps, encoder_step=COUNT)
+    run = simulate_loop(TWO, law, t=t, reference=steps, setup=LoopSetup(encoder_step=COUNT))
     y = run.x + 0.01 * np.random.default_rng(5).standard_normal(run.x.shape)
 
     checks = check_hardware(
@@ -272,9 +277,11 @@ def test_the_timing_of_the_bench_is_found(law, sample_time):
     y, u = bench(TWO, law, sample_time=sample_time)
     controller: submission.Controller
     if isinstance(law, Pid):
-        controller = submission.Pid(type="pid", kp=law.kp, ki=law.ki, kd=law.kd, cart=law.cart)
+        controller = submission.PidController(
+            type="pid", kp=law.kp, ki=law.ki, kd=law.kd, cart=law.cart
+        )
     else:
-        controller = submission.StateFeedback(
+        controller = submission.StateFeedbackController(
             type="state_feedback", gains=tuple(law.gains), prefilter=law.prefilter
         )
 
@@ -294,7 +301,7 @@ def test_saturation_is_read_off_the_log():
     checks = check_hardware(
         record(y, u=u, reference=STEPS),
         TWO,
-        controller=submission.Pid(type="pid", kp=0.2, kd=0.01),
+        controller=submission.PidController(type="pid", kp=0.2, kd=0.01),
         controlled_cart=1,
     )
 
@@ -306,8 +313,8 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = record(y, u=u, reference=STEPS)
-    unnamed = submission.Pid(type="pid", kp=0.008, kd=0.0008)
-    named = submission.Pid(type="pid", kp=0.008, kd=0.0008, cart=2)
+    unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
+    named = submission.PidController(type="pid", kp=0.008, kd=0.0008, cart=2)
 
     for controller, cart in ((unnamed, 2), (named, 1), (named, None)):
         checks = check_hardware(run, TWO, controller=controller, controlled_cart=cart)
@@ -318,7 +325,7 @@ def test_only_the_cart_that_is_steered_has_the_set_point():
     """The others have nowhere to be; where nothing says which it is, none has."""
     y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
     run = record(y, u=u, reference=STEPS)
-    unnamed = submission.Pid(type="pid", kp=0.008, kd=0.0008)
+    unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
     for stated in (2, None):
         checks = check_hardware(run, TWO, controller=unnamed, controlled_cart=stated)
         told = {check.cart for check in checks if check.set_point is not None}
@@ -332,7 +339,7 @@ def test_a_pid_acts_on_the_files_own_counts():
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = replace(record(y, u=u, reference=STEPS), position_scale=COUNT)
-    per_count = submission.Pid(type="pid", kp=0.008 * COUNT, kd=0.0008 * COUNT, cart=2)
+    per_count = submission.PidController(type="pid", kp=0.008 * COUNT, kd=0.0008 * COUNT, cart=2)
     checks = check_hardware(run, TWO, controller=per_count)
     assert of(checks, "closed")[2].nrmse < 2 * noise_floor(y[1])
 
@@ -421,7 +428,8 @@ def test_without_an_input_the_loop_alone_is_checked():
 
 
 @pytest.mark.parametrize(
-    "controller", [None, submission.StateFeedback(type="state_feedback", gains=(), prefilter=1.0)]
+    "controller",
+    [None, submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0)],
 )
 def test_without_gains_the_measured_input_alone_is_checked(controller):
     """Nothing stated, or a state feedback without gains: the open check only."""
@@ -437,7 +445,7 @@ def test_without_gains_the_measured_input_alone_is_checked(controller):
 def test_an_unstable_statement_is_said():
     """Gains that cannot have run are said to be unstable, and the open check goes on."""
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
-    wild = submission.StateFeedback(
+    wild = submission.StateFeedbackController(
         type="state_feedback", gains=(-1.0, -0.5, 0.0, 0.0), prefilter=1.0
     )
     stub = record(y, u=None, reference=STEPS)
@@ -453,7 +461,9 @@ def test_an_unstable_statement_is_said():
 def test_gains_that_do_not_fit_leave_the_open_check():
     """Two gains for two carts: the loop is not simulated, and the open check says why."""
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
-    short = submission.StateFeedback(type="state_feedback", gains=(0.1, 0.01), prefilter=0.1)
+    short = submission.StateFeedbackController(
+        type="state_feedback", gains=(0.1, 0.01), prefilter=0.1
+    )
 
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=short)
 
@@ -519,7 +529,7 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     checks = check_hardware(
         run,
         UCSD,
-        controller=submission.Pid(type="pid", scale=5 / 512, **gains),
+        controller=submission.PidController(type="pid", scale=5 / 512, **gains),
         controlled_cart=1,
         input_limit=4.884,
     )
@@ -547,10 +557,14 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     controller=st.sampled_from(
         [
             None,
-            submission.Pid(type="pid", kp=1.0, ki=3.0, kd=-0.2),
-            submission.Pid(type="pid", kp=1.0, cart=3),
-            submission.StateFeedback(type="state_feedback", gains=(1.0, 1.0), prefilter=-2.0),
-            submission.StateFeedback(type="state_feedback", gains=(9.0,) * 4, prefilter=1e9),
+            submission.PidController(type="pid", kp=1.0, ki=3.0, kd=-0.2),
+            submission.PidController(type="pid", kp=1.0, cart=3),
+            submission.StateFeedbackController(
+                type="state_feedback", gains=(1.0, 1.0), prefilter=-2.0
+            ),
+            submission.StateFeedbackController(
+                type="state_feedback", gains=(9.0,) * 4, prefilter=1e9
+            ),
         ]
     ),
     seed=st.integers(0, 2**32 - 1),

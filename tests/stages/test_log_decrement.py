@@ -11,8 +11,7 @@ from pipeline.estimation.decay.ringing import Ringing
 from pipeline.ingest.read import read_data
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
-from pipeline.results import Record
-from pipeline.results_of_runs import Kind
+from pipeline.results import Kind, Record
 from pipeline.stages.log_decrement import fit_log_decrement
 from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission

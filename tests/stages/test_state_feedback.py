@@ -16,9 +16,16 @@ from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.step_response import overshoot_percent, settling_time
 from pipeline.plant.loop.gains import lqr_gains, place_poles
 from pipeline.plant.loop.robustness import level_error_percent, stays_stable
-from pipeline.plant.loop.sampled_loop import StateFeedback, discretise, loop_matrix, simulate_loop
+from pipeline.plant.loop.sampled_loop import (
+    LoopSetup,
+    StateFeedback,
+    discretise,
+    loop_matrix,
+    simulate_loop,
+)
 from pipeline.results import FeedbackDesign
 from pipeline.stages.state_feedback import Method, design_feedback
+from pipeline.submission import Design
 
 T = 0.00884  # s
 RIGID = Chain(m=np.array([2e-4]), c=np.array([1e-4]), k=np.zeros(2))
@@ -42,13 +49,15 @@ def design(
 ) -> FeedbackDesign:
     return design_feedback(
         chain,
-        cart=cart,
-        reference=reference,
-        overshoot_percent=overshoot,
-        settling_time=settling,
-        input_limit=limit,
-        sample_time=sample_time,
-        method=method,
+        Design(
+            cart=cart,
+            reference=reference,
+            overshoot_percent=overshoot,
+            settling_time=settling,
+            input_limit=limit,
+            sample_time=sample_time,
+            method=method,
+        ),
     )
 
 
@@ -171,7 +180,9 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
     assert got.gains.shape == (2 * chain.n,)
     t = T / 4 * np.arange(800.0)
     controller = StateFeedback(gains=got.gains, prefilter=got.prefilter, model=chain)
-    y = simulate_loop(chain, controller, t=t, reference=1.0, sample_time=T).x[cart - 1]
+    y = simulate_loop(chain, controller, t=t, reference=1.0, setup=LoopSetup(sample_time=T)).x[
+        cart - 1
+    ]
     overshoot = float(overshoot_percent(y, before=0.0, level=np.float64(1.0)))
     settled = float(settling_time(t, y, before=0.0, level=np.float64(1.0)))
     assert overshoot < 10.0

@@ -17,6 +17,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import ChainFit, Record
+from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 from pipeline.submission import load_submission
 from tests.helpers.time_records import COUNT, decay_record, measure, random_chain, step_record
@@ -61,7 +62,7 @@ def test_modes_and_simulation_agree(free, jitter):
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
     x0 = rng.standard_normal(2 * len(free))
     record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
-    parametrisation = Parametrisation(n=3, springs=(True, True, True, True))
+    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True, True)))
     left = misfit(record, chain, parametrisation, at_rest=False)
     # Intervals are rounded to 1e-12 s in the simulation: 1e-12 s times some 100 cm/s.
     sigma = open_window(record).sigma
@@ -75,7 +76,7 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
-    parametrisation = Parametrisation(n=2, springs=(True, True, True))
+    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True)))
     theta = parametrisation.pack(chain) + 0.01
 
     def cost(theta):
@@ -102,7 +103,7 @@ def test_a_band_limited_input_is_used_as_such():
     record = measure(
         y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.0, count=0.0, hold="band_limited"
     )
-    parametrisation = Parametrisation(n=2, springs=(True, True, True))
+    parametrisation = Parametrisation(bench=Bench(springs=(True, True, True)))
 
     def off(record):
         left = misfit(record, chain, parametrisation)
@@ -122,7 +123,7 @@ def test_exact_records_give_the_chain_back(n):
     rng = np.random.default_rng(n)
     chain, springs = random_chain(n, rng)
     record = step_record(chain, rng=rng, noise=0.0, count=0.0)
-    fit = fit_records([record], n=n, springs=springs)
+    fit = fit_records([record], bench=Bench(springs=springs))
     assert fit.converged
     assert fit.n_starts == 1
     # The search ends at 1e-9 of the cost left by sample times rounded to 1e-12 s.
@@ -142,7 +143,9 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
             step_record(chain, rng=rng, swing=swing, jitter=0.2, noise=0.001, id=f"step {swing}")
             for swing in (1.0, 0.6, -1.0)
         ]
-        fit = fit_records(records, n=n, springs=(True,) * (n + 1) if all_springs else springs)
+        fit = fit_records(
+            records, bench=Bench(springs=(True,) * (n + 1) if all_springs else springs)
+        )
         assert fit.converged
         # 3 × 4 × at most 17 numbers: none beyond 4.5 standard errors but in 1 of 700 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 4.5
@@ -161,10 +164,10 @@ def test_held_carts_and_hand_releases_join_in():
         decay_record(chain, free=(2,), rng=rng, id="second"),
         decay_record(chain, free=(2, 3), rng=rng, id="last two"),
     ]
-    fit = fit_records(records, n=3, springs=(True,) * 4)
+    fit = fit_records(records, bench=Bench(springs=(True,) * 4))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
-    alone = fit_records(records[:1], n=3, springs=(True,) * 4)
+    alone = fit_records(records[:1], bench=Bench(springs=(True,) * 4))
     # Decays of cart 3 tell more of it than a step that reaches it through two springs.
     assert std(fit, "zeta_3") < 0.8 * std(alone, "zeta_3")
 
@@ -178,7 +181,7 @@ def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
         step_record(chain, rng=rng, id="quiet"),
         step_record(chain, rng=rng, x0=x0, id="cut"),
     ]
-    fit = fit_records(records, n=2, springs=(True,) * 3)
+    fit = fit_records(records, bench=Bench(springs=(True,) * 3))
     assert "not at rest at their start: cut" in fit.message
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -189,7 +192,7 @@ def test_a_cart_that_was_not_measured_is_still_found():
     chain = PRESETS["throne-3dof"]
     whole = [step_record(chain, rng=rng, swing=swing, id=f"{swing}") for swing in (1.0, 0.5)]
     records = [replace(r, y=r.y[[0, 2]], carts=(1, 3), resolution=r.resolution[:2]) for r in whole]
-    fit = fit_records(records, n=3, springs=(False, True, True, True))
+    fit = fit_records(records, bench=Bench(springs=(False, True, True, True)))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -202,7 +205,7 @@ def test_a_long_fast_sweep_is_fitted_whole():
     u = 0.02 * np.sin(2 * np.pi * (0.2 * t + 0.17 * t**2))  # 0.2 to 7 Hz
     y = simulate_linear(chain, t, u)
     record = measure(y, t, u, kind="sweep", carts=(1, 2), rng=rng, noise=0.001)
-    fit = fit_records([record], n=2, springs=(True,) * 3)
+    fit = fit_records([record], bench=Bench(springs=(True,) * 3))
     assert fit.converged
     assert fit.n_starts == 1
     assert fit.n_points == 2 * t.size
@@ -218,7 +221,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
     rng = np.random.default_rng(6)
     record = measure(y, t, u, kind="step", carts=(1,), rng=rng, noise=0.0005)
     for springs in ((False, False), (True, True)):
-        fit = fit_records([record], n=1, springs=springs)
+        fit = fit_records([record], bench=Bench(springs=springs))
         assert np.max(np.abs(errors(fit, truth))) < 4
     assert "held at zero, their bound: k_1" in fit.message
 
@@ -227,7 +230,9 @@ def test_a_damping_at_its_bound_is_no_measurement():
     """An undamped cart's step: held at zero or not, the damping is never known to be zero."""
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
-        fit_records([step_record(chain, rng=np.random.default_rng(seed))], n=1, springs=(True,) * 2)
+        fit_records(
+            [step_record(chain, rng=np.random.default_rng(seed))], bench=Bench(springs=(True,) * 2)
+        )
         for seed in range(6)
     ]
     held = [fit for fit in fits if fit.at_bound]
@@ -244,7 +249,7 @@ def test_a_spring_that_is_not_there_is_held_at_zero():
     """The last spring, expected but missing, is found to be zero and said to be held there."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
-    fit = fit_records([step_record(chain, rng=rng)], n=2, springs=(True,) * 3)
+    fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
     spring = fit.chain.k[2]
@@ -257,7 +262,7 @@ def test_a_spring_that_is_not_there_is_held_at_zero():
 def test_the_same_records_give_the_same_fit():
     """Nothing in the search is random: two fits agree to the last bit."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(7))
-    first, second = (fit_records([record], n=2, springs=(True,) * 3) for _ in range(2))
+    first, second = (fit_records([record], bench=Bench(springs=(True,) * 3)) for _ in range(2))
     assert np.array_equal(first.chain.k, second.chain.k)
     assert np.array_equal(first.covariance, second.covariance)
 
@@ -269,21 +274,21 @@ def test_without_an_input_there_is_no_scale():
     """Decays alone give no mass in input units, and the fit says what it needs."""
     record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
     with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
-        fit_records([record], n=2, springs=(True,) * 3)
+        fit_records([record], bench=Bench(springs=(True,) * 3))
 
 
 def test_what_the_records_do_not_determine_is_named():
     """A step with cart 2 held says nothing about its mass."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
     with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
-        fit_records([record], n=2, springs=(True,) * 3)
+        fit_records([record], bench=Bench(springs=(True,) * 3))
 
 
 def test_a_broken_chain_is_refused():
     """No spring between the carts: the motor does not reach the second."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
     with pytest.raises(DataError, match="spring between carts 1 and 2"):
-        fit_records([record], n=2, springs=(True, False, True))
+        fit_records([record], bench=Bench(springs=(True, False, True)))
 
 
 def test_a_record_without_motion_is_left_out_and_said():
@@ -292,7 +297,7 @@ def test_a_record_without_motion_is_left_out_and_said():
     chain = PRESETS["throne-1dof"]
     good = step_record(chain, rng=rng)
     still = replace(good, id="still", kind="decay", u=None, y=np.zeros_like(good.y))
-    fit = fit_records([good, still], n=1, springs=(True, True))
+    fit = fit_records([good, still], bench=Bench(springs=(True, True)))
     assert "left out: still: time fit needs a cart that moves" in fit.message
     assert np.max(np.abs(errors(fit, chain))) < 4
 
@@ -302,7 +307,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
-    fit = fit_records([replace(record, u=-record.u)], n=1, springs=(True, True))
+    fit = fit_records([replace(record, u=-record.u)], bench=Bench(springs=(True, True)))
     assert not fit.converged
     assert "no chain was found that follows the records" in fit.message
 
@@ -313,7 +318,7 @@ def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
     windows = [open_window(replace(record, u=-record.u))]
-    P = Parametrisation(n=1, springs=(True, True))
+    P = Parametrisation(bench=Bench(springs=(True, True)))
     whole, short = (
         search(windows, P, given=None),
         search(windows, P, given=None, most_comparisons=1),
@@ -366,11 +371,13 @@ def test_a_long_rest_before_the_step_is_one_reading():
         record = measure(
             y + COUNT * rng.uniform(), t, u, kind="step", carts=(1,), rng=rng, noise=0.0005
         )
-        fit = fit_records([record], n=1, springs=(True, True))
+        fit = fit_records([record], bench=Bench(springs=(True, True)))
         off.append(errors(fit, chain))
         moving = t >= 5.0 - 1.5 / rate  # the same, no rest before it
         short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
-        white.append(std(fit, "K") / std(fit_records([short], n=1, springs=(True, True)), "K"))
+        white.append(
+            std(fit, "K") / std(fit_records([short], bench=Bench(springs=(True, True))), "K")
+        )
     # 24 draws tell a spread to 14 %.
     assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
     assert 0.5 < np.median(white) < 1.1
@@ -397,7 +404,7 @@ def test_real_repeats_give_the_masses_and_springs_found_before(real_data, tmp_pa
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
     steps = [record for record in records if record.kind == "step"]
-    fit = fit_records(steps, n=2, springs=(True, True, False))
+    fit = fit_records(steps, bench=Bench(springs=(True, True, False)))
     assert fit.converged
     # The reference is given to two digits, and a chain without friction is not the whole truth.
     assert_allclose(fit.chain.m, [5.5e-6, 3.7e-6], rtol=0.1)

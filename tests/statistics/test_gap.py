@@ -2,9 +2,10 @@
 
 import pytest
 
-from pipeline.gap.investigate import investigate
+from pipeline.gap.explain import investigate
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench, write_bench
 from pipeline.workflow import analyse
 from tests.gap.test_explain import explain, names
 from tests.truth.bench import Hidden
@@ -54,7 +55,7 @@ def test_names_the_hidden_effect(effect, n):
 def test_a_hidden_mass_that_moves_when_a_hand_lets_go(tmp_path):
     """In decays that hands release the hidden mass already moves; the gap closes all the same."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["extra_mode"])
-    write_bench(tmp_path / "bench", bench, seed=3, reported=False)
+    write_submission(tmp_path / "bench", bench, seed=3, reported=False)
 
     gap = investigate(analyse(load_submission(tmp_path / "bench")), progress=lambda text: None)
 
@@ -117,7 +118,7 @@ def test_friction_on_all_carts_is_found_at_once(n):
     case = make_rig(seed=1, n=n)
 
     told: list[str] = []
-    gap = explain(case, tell=told.append)
+    gap = explain(case, progress=told.append)
 
     assert gap.verdict == "named"
     assert names(gap) == sorted((h.effect, h.place) for h in case.hidden)

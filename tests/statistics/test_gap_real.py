@@ -10,6 +10,7 @@ from benchmarks.emps import emps_record, free_run
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
 from pipeline.results import Record
+from pipeline.set_up import Bench, Units
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.ucsd import ecp_record, write_two_cart_submission
@@ -24,7 +25,9 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
     records = [
         ecp_record(folder / f"{name}_test{i}.csv", column=column, kind=kind) for i in range(1, 6)
     ]
-    return explain_gap(records, springs=(True, False), position_unit="count")
+    return explain_gap(
+        records, Bench(springs=(True, False), units=Units(position="count", input="V"))
+    )
 
 
 def test_driven_cart_has_dry_friction(real_data):
@@ -59,7 +62,7 @@ def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
     analysis = analyse(load_submission(folder), design=False)
     records = [r for r in analysis.records if r.id.startswith("alone-1")]
 
-    gap = explain_gap(records, springs=analysis.springs, chain=analysis.chain)
+    gap = explain_gap(records, analysis.bench, chain=analysis.chain)
 
     assert gap.effects[0].effect.key in DRY
     assert gap.effects[0].where == {"cart": 1}
@@ -71,7 +74,7 @@ def test_all_runs_of_two_carts_have_friction_on_both(real_data, tmp_path):
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder), design=False)
 
-    gap = explain_gap(analysis.records, springs=analysis.springs, chain=analysis.chain)
+    gap = explain_gap(analysis.records, analysis.bench, chain=analysis.chain)
 
     assert gap.verdict in ("partial", "named", "ambiguous")
     assert {f.where.get("cart") for f in gap.effects if f.effect.key in DRY} == {1, 2}
@@ -86,7 +89,7 @@ def test_an_axis_on_no_spring_is_simulated_over_a_whole_record(real_data):
     assert real_data.exists()
     train, test = emps_record("train"), emps_record("test")
 
-    gap = explain_gap([train], springs=(False, False), position_unit="m")
+    gap = explain_gap([train], Bench(springs=(False, False), units=Units(position="m", input="V")))
 
     assert gap.verdict in ("named", "partial")
     keys = {found.effect.key for found in gap.effects}
@@ -118,7 +121,7 @@ def test_silverbox_has_a_hardening_spring(real_data):
         )
 
     records = [piece("a", 40650, 6000), piece("b", 60000, 4000), piece("c", 105712, 4000)]
-    gap = explain_gap(records, springs=(True, False), position_unit="V")
+    gap = explain_gap(records, Bench(springs=(True, False), units=Units(position="V", input="V")))
 
     assert gap.effects[0].effect.key == "cubic_spring"
     assert gap.effects[0].nrmse_after < 0.15 * gap.baseline

@@ -1,10 +1,12 @@
 """Honest records of many kinds of lab: nobody's is called spoilt."""
 
+from dataclasses import replace
+
 import pytest
 
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
-from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.grading.mistakes.test_faults import PRESET
 
@@ -27,19 +29,12 @@ LONG = "sticking at every small step"
         pytest.param(LONG, marks=[pytest.mark.slow, pytest.mark.sample]),
     ],
 )
-def test_no_honest_record_is_accused(case, tmp_path, monkeypatch):
+def test_no_honest_record_is_accused(case, tmp_path):
     """Without encoder noise carts rest exactly, stick, or stay within one coarse step."""
-    monkeypatch.setattr("pipeline.synthesis._NOISE_COUNTS", 0.0)
     force = HONEST[case].get("hide")
     hidden = [f"coulomb_friction:cart={cart},force={force}" for cart in (1, 2)] if force else []
     made = prepare_bench(preset=PRESET, hide=tuple(hidden))
-    write_submission(
-        tmp_path,
-        chain=made.chain,
-        effects=made.effects,
-        seed=5,
-        compact=True,
-        count=HONEST[case]["count"],
-    )
+    quiet = replace(made, count=HONEST[case]["count"], noise_counts=0.0)
+    write_submission(tmp_path, quiet, seed=5, compact=True)
     analysis = analyse(load_submission(tmp_path), design=False)
     assert [one for one in analysis.left_out if one.is_wrong] == []

@@ -7,7 +7,7 @@ import pytest
 from pipeline.grading.gradings import Member
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.grading.similarity.shared import find_shared
-from pipeline.synthesis import COUNT
+from pipeline.simulated.bench import COUNT
 from tests.helpers.bench_classes import BENCHES, USUAL_NOISE, move_class, read_class
 
 COPIED = ("decay-1a", "step-2", "sine-04", "sweep")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.plant.linear.presets import PRESETS
+from pipeline.set_up import Bench
 from pipeline.stages.time_fit import fit_records
 from tests.helpers.time_records import random_chain, step_record
 from tests.stages.test_time_fit import errors
@@ -30,7 +31,7 @@ def test_intervals_cover_the_truth_at_their_rate(preset, noise):
             )
             for swing in (1.0, 0.6)
         ]
-        fit = fit_records(records, n=chain.n, springs=(True,) * (chain.n + 1))
+        fit = fit_records(records, bench=Bench(springs=(True,) * (chain.n + 1)))
         assert fit.converged
         inside += np.abs(errors(fit, chain)) < 1.96
     # Each count is binomial, 120 draws at 0.95: standard error 0.02; the worst of 19 within 3.5.
@@ -59,7 +60,7 @@ def test_every_random_chain_is_found():
             )
             for swing in (1.0, 0.6, -1.0)
         ]
-        fit = fit_records(records, n=n, springs=springs)
+        fit = fit_records(records, bench=Bench(springs=springs))
         assert fit.converged
         # 200 × some 10 numbers: beyond 5.5 standard errors once in 10 000 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 5.5

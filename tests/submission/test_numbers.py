@@ -9,12 +9,18 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from pipeline.bench.planning.plan_file import load_plan, plan_path, save_plan
-from pipeline.bench.planning.propose import propose_plan
 from pipeline.bench.protocol.messages import Description, format_description, parse_description
-from pipeline.desk.student.form import Field, apply, experiment_fields, groups, read_document
+from pipeline.desk.student.form import (
+    Field,
+    fill_experiment,
+    fill_form,
+    read_document,
+    write_fields,
+)
 from pipeline.desk.users import read_users
 from pipeline.errors import PipelineError, SubmissionError
+from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.propose import propose_plan
 from pipeline.grading.rubric_file import parse_rubric
 from pipeline.ingest.fill import fill_submission
 from pipeline.resources import EXAMPLES, RUBRICS
@@ -94,9 +100,9 @@ def test_any_number_of_a_submission(number, at):
     text, key = with_number(SUBMISSION, number, at)
     assert_read_or_refused(lambda: parse_submission(text, folder=EXAMPLE), key, NAME)
     document = read_document(text)
-    shown = [field.value for group in groups(document) for field in group.fields]
+    shown = [field.value for group in fill_form(document) for field in group.fields]
     for index in range(len(document.get("experiments", []))):
-        shown += [field.value for field in experiment_fields(document, index)]
+        shown += [field.value for field in fill_experiment(document, index)]
     assert all(isinstance(value, str) for value in shown)
 
 
@@ -175,7 +181,7 @@ def test_a_column_typed_with_thousands_of_digits_is_refused(tmp_path):
     (tmp_path / NAME).write_text("version = 1\n[system]\ncarts = 2\n", encoding="utf-8")
     columns = Field(path="system.columns", label="", kind="columns", value=f"time = {'9' * 5000}")
     with pytest.raises(SubmissionError, match="a number has too many digits"):
-        edit_submission(tmp_path, lambda document: apply(document, [columns]))
+        edit_submission(tmp_path, lambda document: write_fields(document, [columns]))
 
 
 def test_numbers_that_are_sound_come_out_as_python_reads_them():

@@ -12,7 +12,12 @@ from hypothesis import strategies as st
 from pipeline.errors import ConfigError, SubmissionError
 from pipeline.ingest.read import read_data
 from pipeline.names import parameter_names
-from pipeline.submission import Pid, StateFeedback, load_submission, new_submission
+from pipeline.submission import (
+    PidController,
+    StateFeedbackController,
+    load_submission,
+    new_submission,
+)
 from pipeline.submission.load import InvalidSubmission
 
 FULL = """\
@@ -88,9 +93,9 @@ def test_every_table_of_the_format_is_read(folder):
     assert submission.design.input_limit == 5.0
     assert (decay.carts, control.carts) == ((1,), (1, 2))
     assert {e.file for e in submission.experiments} == {"data/a.csv"}
-    assert isinstance(control.controller, StateFeedback)
+    assert isinstance(control.controller, StateFeedbackController)
     assert control.controller.gains == (1.0, 2.0, 3.0, 4.5)
-    assert isinstance(pid.controller, Pid)
+    assert isinstance(pid.controller, PidController)
     assert pid.controller.cart == 1
     assert control.window == (0.0, 2.5)
     assert control.columns == {"time": 1, "x1": "Encoder 1 Pos"}

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 
 from pipeline.arrays import Array
 from pipeline.errors import PipelineError
+from pipeline.json_files import json_text
 from pipeline.resources import EXAMPLES
-from pipeline.results_json import results_text
 from pipeline.submission import Experiment, Submission, load_submission
 from pipeline.workflow import analyse
 
@@ -161,7 +161,7 @@ def check(case: Case) -> None:
             if "\n" in str(error):
                 raise
             return
-    json.loads(results_text(analysis), parse_constant=refuse)
+    json.loads(json_text(analysis), parse_constant=refuse)
 
 
 quick = settings(max_examples=5, deadline=None, suppress_health_check=[HealthCheck.data_too_large])

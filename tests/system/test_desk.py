@@ -13,6 +13,7 @@ import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
+from pipeline.identify.springs import fill
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.accessibility import violations
@@ -70,37 +71,58 @@ def fits(window) -> bool:
     return max(overhang) <= 0
 
 
+def unfold(window) -> None:
+    """Open all groups of files and of the set-up."""
+    for summary in window.locator("details.kind:not([open]) > summary").all()[::-1]:
+        summary.click()
+
+
 def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
-    """Files dropped, a mistake mended, the form, the report, the zip."""
+    """Files dropped, a doubt answered, a mistake mended, the form, the report, the zip."""
     folder = tmp_path / "team"
     with DeskServer() as server:
         window = show(server.url)
+        window.get_by_text("Type a path").click()
         window.get_by_label("Folder on this computer").fill(str(folder))
         with window.expect_navigation():  # to a page that has its scripts, which take the files
             window.get_by_role("button", name="Open").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("team")
+        stands = window.get_by_label("Where this stands")
 
         window.locator("#drop").set_input_files(FILES)
         expect(window.locator("table.files tbody tr")).to_have_count(len(FILES))
         assert len(load_submission(folder).experiments) == len(FILES)
+        expect(window.locator("#files").get_by_text("written into")).to_be_visible()
 
         window.get_by_label("Title of the report").fill("One <b>cart</b>")
-        window.get_by_label("Unit of positions").fill("cm")
+        window.get_by_label("You", exact=True).fill("s1")
+        window.get_by_role("button", name="Use cm").click()  # saves what was typed with it
+        expect(window.locator("#details").get_by_text("Saved.")).to_be_visible()
+        assert load_submission(folder).system.position.unit == "cm"
+        expect(window.get_by_role("button", name="Use cm")).to_have_count(0)
         window.get_by_text("The controller you are asked for").click()
         window.get_by_label("Cart whose position").fill("2")
         save = window.locator("#details").get_by_role("button", name="Save")
         save.click()
         expect(window.locator("#design-cart-wrong")).to_contain_text("there is no cart 2")
-        expect(window.get_by_label("Title of the report")).to_have_value("One <b>cart</b>")
         window.get_by_label("Cart whose position").fill("1")
+        window.get_by_label("K final").fill("28.9")
         save.click()
         expect(window.get_by_text("Saved.")).to_be_visible()
         step = next(e for e in load_submission(folder).experiments if e.kind == "step")
+        window.locator("#kind-step > summary").click()
         row = window.get_by_role("row").filter(has_text=Path(step.file).name)
         row.get_by_text(step.id, exact=True).click()
         row.get_by_label("Note").fill("the cart was bumped")
         row.get_by_role("button", name="Save").click()
         until(lambda: "bumped" in (folder / NAME).read_text(encoding="utf-8"))
+        expect(row).to_be_visible()  # what was unfolded stays so
+        expect(window.locator("#files").get_by_text("Saved.")).to_be_visible()
+        window.get_by_label("Controller", exact=True).select_option("state_feedback")
+        expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
+        expect(window.get_by_label("Prefilter").first).to_be_visible()  # nothing folds over it
+        assert fits(window)
+
         window.get_by_role("button", name="Make the report").click()
         expect(window.locator("[data-events]")).to_contain_text("The report")
         window.reload()
@@ -108,10 +130,14 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         report = window.frame_locator("iframe")
         expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
         expect(report.locator("figure .tools").first).to_be_attached()  # its own script runs
+        own = "document.documentElement.scrollHeight - innerHeight"
+        assert window.evaluate(own) <= 0  # the report alone scrolls
+        assert fits(window)
         window.get_by_role("link", name="Back to the files").click()
+        window.locator("#group-who > summary").click()
         window.get_by_label("Title of the report").fill("Two carts")
         window.locator("#details").get_by_role("button", name="Save").click()
-        expect(window.get_by_text("The report is out of date")).to_be_visible()
+        expect(stands).to_contain_text("The report is out of date")
         window.get_by_role("button", name="Hand in", exact=True).click()
         expect(window.get_by_text("The report in the zip is of the files")).to_be_visible()
         assert "Two carts" in (folder / "report" / "report.html").read_text(encoding="utf-8")
@@ -120,9 +146,74 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
             window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
             assert {NAME, "notes.md", "report/report.pdf"} <= set(archive.namelist())
+        window.reload()
+        way = window.get_by_label("The way").get_by_role("listitem")
+        expect(way.filter(has_text="Report")).to_contain_text("done")
     submission = load_submission(folder)
     assert submission.title == "Two carts"
     assert "bumped" in next(e for e in submission.experiments if e.id == step.id).note
+
+
+@pytest.mark.usefixtures("work_here")
+def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
+    """From the doubt about a unit to the zip: Tab, letters, Enter and the space bar."""
+    folder = tmp_path / "team"
+    (folder / "data").mkdir(parents=True)
+    for file in FILES:
+        if "control" not in file.name:  # of that one it asks what ran
+            (folder / "data" / file.name).write_bytes(file.read_bytes())
+    fill(folder)
+    with DeskServer(folder=folder) as server:
+        window = show(server.url, size=PHONE)
+
+        def go_to(locator):
+            for _ in range(200):
+                if locator.evaluate("it => it === document.activeElement"):
+                    return
+                window.keyboard.press("Tab")
+            raise AssertionError("no Tab leads there")
+
+        go_to(window.get_by_role("link", name="Complete the set-up"))
+        window.keyboard.press("Enter")
+        go_to(window.get_by_label("Title of the report"))
+        window.keyboard.type("Typed")
+        go_to(window.get_by_label("You", exact=True))
+        window.keyboard.type("s1")
+        go_to(window.get_by_role("button", name="Use cm"))
+        window.keyboard.press("Enter")
+        expect(window.locator("#details").get_by_text("Saved.")).to_be_visible()
+        go_to(window.get_by_label("K final"))
+        window.keyboard.type("28.9")
+        window.keyboard.press("Enter")
+        until(lambda: load_submission(folder).reported is not None)
+        button = window.get_by_role("button", name="Make the report")
+        expect(button).to_have_class("main")  # it is what comes next
+        go_to(button)
+        window.keyboard.press("Space")
+        stands = window.get_by_label("Where this stands")
+        answer = stands.get_by_role("link", name=re.compile("Answer . question"))
+        expect(answer.or_(stands.get_by_role("button", name="Hand in"))).to_be_visible()
+        if answer.count():
+            go_to(answer)
+            with window.expect_navigation():
+                window.keyboard.press("Enter")
+            assert fits(window)
+            for box in window.locator("textarea").all():
+                go_to(box)
+                window.keyboard.type("Because of friction.")
+                window.keyboard.press("Tab")
+                window.keyboard.press("Enter")
+                expect(window.get_by_text("Written into notes.md.")).to_be_visible()
+        go_to(stands.get_by_role("button", name="Hand in"))
+        with window.expect_navigation():
+            window.keyboard.press("Enter")
+        download = window.get_by_role("link", name="Download the zip")
+        expect(download).to_be_visible()
+        go_to(download)
+        with window.expect_download() as got:
+            window.keyboard.press("Enter")
+        with zipfile.ZipFile(got.value.path()) as archive:
+            assert "report/report.pdf" in archive.namelist()
 
 
 @pytest.mark.usefixtures("work_here")
@@ -132,6 +223,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
     with DeskServer(folder=folder) as server:
         window = show(server.url)
         title, details = window.get_by_label("Title of the report"), window.locator("#details")
+        unfold(window)
         title.fill("typed")
         details.get_by_role("checkbox").first.uncheck()
         window.locator("#row-1 summary").click()
@@ -168,10 +260,11 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
         asked = []
         window.on("request", lambda request: asked.append(request.url.rsplit("/", 1)[1]))
         title, held = window.get_by_label("Title of the report"), window.get_by_role("alert")
+        unfold(window)
         title.fill("typed")
         for section, name, role in (
             ("#hand-in", "Hand in", "button"),
-            ("#report", "Make the report", "button"),
+            (".now", "Make the report", "button"),
             ("#report", "Look for what", "button"),
         ):
             within = window.locator(section)
@@ -187,6 +280,8 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
             assert "typed" not in archive.read(NAME).decode()
 
         window.get_by_role("link", name="Back to the files").click()
+        expect(title).to_be_attached()
+        unfold(window)
         title.fill("typed")
         window.locator("#details").get_by_role("button", name="Save").click()
         expect(window.get_by_text("Saved.")).to_be_visible()
@@ -198,8 +293,10 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
             assert 'title = "typed"' in archive.read(NAME).decode()
 
         window.get_by_role("link", name="Back to the files").click()
+        expect(title).to_be_attached()
+        unfold(window)
         title.fill("typed again")
-        window.get_by_role("button", name="Make it anew").click()
+        window.get_by_role("button", name="Make the report again").click()
         window.get_by_role("button", name="go on without it").click()
         expect(window.locator("[data-events]")).to_contain_text("The report")
         expect(title).to_have_value("typed again")
@@ -211,15 +308,16 @@ def test_everybody_can_use_it(show, tmp_path):
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
-        table = window.locator(".wide").filter(has=window.locator("table.files"))
+        unfold(window)
+        table = window.locator(".wide").filter(has=window.locator("table.files")).first
         assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # nor sideways in it
         window.get_by_label("Position of one encoder count").fill("0")
         window.get_by_label("Position of one encoder count").press("Enter")
         expect(window.locator("#system-position-per_count-wrong")).to_be_visible()
-        for details in window.locator("#details details:not([open]) > summary").all():
-            details.press("Enter")
+        for summary in window.locator("details.kind:not([open]) > summary").all()[::-1]:
+            summary.press("Enter")
         assert fits(window)
-        for page in ("student/0/report", ""):
+        for page in ("student/0/report", "student/0/questions", "student/0/hand-in", ""):
             window.goto(f"{window.url.split('student')[0]}{page}")
             assert fits(window)
         window.keyboard.press("Tab")
@@ -232,6 +330,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url, java_script_enabled=False)
+        unfold(window)
         window.get_by_label("Title of the report").fill("Plain")
         window.locator("#details").get_by_role("button", name="Save").click()
         expect(window.get_by_text("Saved.")).to_be_visible()

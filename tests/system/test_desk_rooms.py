@@ -11,6 +11,7 @@ from pipeline.submission import load_submission
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator
 from tests.helpers.desks import a_recorded_cart
+from tests.helpers.grades import write_class_of_two
 from tests.helpers.waiting import until
 from tests.system import test_desk
 from tests.system.test_report_pages import PHONE, WIDE
@@ -19,21 +20,31 @@ show, fits = test_desk.show, test_desk.fits
 pytestmark = pytest.mark.usefixtures("work_here")
 
 
-def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
-    """Keep takes the run that is going on, the next one is recorded; then Esc ends another."""
+def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeypatch):
+    """From the first page to a session: keep a run, record the next, end another; then the rest."""
+    monkeypatch.chdir(tmp_path)
     work = write_work(
         tmp_path / "team",
-        [sine("long", seconds=300), sine("next", seconds=1), sine("last", seconds=300)],
+        [
+            sine("long", seconds=300),
+            sine("next", seconds=1),
+            sine("last", seconds=300),
+            sine("short", seconds=1),
+        ],
     )
-    with DeskServer(folder=work) as server:
+    with DeskServer() as server:
         window = show(server.url, size=PHONE)
         with window.expect_navigation():
-            window.get_by_role("link", name="team: bench").click()
+            window.get_by_role("link", name="Choose a folder to record into").press("Enter")
         assert fits(window)
-        window.locator("#port").fill(real.address)
+        with window.expect_navigation():
+            window.get_by_role("button", name="Record here team").press("Enter")
+        expect(window.get_by_text("0 of 4 recorded. Next: long.")).to_be_visible()
+        assert fits(window)
+        window.get_by_label("Port of the bench").first.select_option(real.address)  # virtual
         for name in ("long", "next", "last"):
             window.get_by_label(name, exact=True).check()
-        window.get_by_role("button", name="Acquire").click()
+        window.get_by_role("button", name="Start recording").click()
 
         status, stop = window.locator("#status"), window.get_by_role("button", name="Stop")
         expect(status).to_have_text("Recording long.")
@@ -50,9 +61,26 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real):
         window.keyboard.press("Escape")
         expect(status).to_have_text("The session is over.")
         until(lambda: (work / "data" / "last.partial.txt").exists())
+        over = window.get_by_role("button", name="Session over")
+        expect(over).to_be_disabled()
+        expect(window.get_by_role("button", name="Skip")).to_be_hidden()
+        assert fits(window)
+        expect(window.locator(".controls").get_by_role("link", name="Files")).to_be_visible()
         window.get_by_role("link", name="The plan as it is now").click()
         expect(window.get_by_text("Stopped. Begin again")).to_be_visible()
-    assert [e.id for e in load_submission(work).experiments] == ["long", "next"]
+        row = window.get_by_role("row").filter(has_text="last")
+        expect(row).to_contain_text("next")
+        expect(row).to_contain_text("An earlier run ended early")
+        window.get_by_text("2 recorded").click()
+        expect(window.get_by_role("row").filter(has_text="long")).to_contain_text("recorded")
+        assert fits(window)
+        assert window.locator("#port").input_value() == real.address  # remembered
+        window.get_by_label("short", exact=True).press("Space")
+        window.get_by_role("button", name="Start recording").press("Enter")
+        expect(over).to_be_disabled()
+        window.get_by_role("link", name="Files and hand-in").click()
+        expect(window.get_by_role("heading", level=1)).to_have_text("team")
+    assert [e.id for e in load_submission(work).experiments] == ["long", "next", "short"]
 
 
 def test_an_exploration_is_watched_and_steered(show, tmp_path):
@@ -61,9 +89,10 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
     with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:
         window = show(server.url, size=PHONE)
         with window.expect_navigation():
-            window.get_by_role("link", name="team: bench").click()
+            window.get_by_role("link", name="Bench").click()
         assert fits(window)
-        window.locator("#explore-port").fill(bench.address)
+        window.get_by_text("Explore: the bench records").click()
+        window.locator("#explore-port").select_option(bench.address)
         window.get_by_label("Until this is known").select_option(label="the damping ratio ζ")
         window.get_by_label("to within ± %").fill("0,0001")
         window.get_by_label("to within ± %").press("Enter")  # as its button does
@@ -90,7 +119,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
         window.keyboard.press("Escape")
         expect(window.locator("#status")).to_have_text("The session is over.")
         window.get_by_role("link", name="The plan as it is now").click()
-        window.get_by_role("link", name="The diary of the exploration").click()
+        window.get_by_role("link", name="Diary of the exploration").click()
         expect(window.locator("#turns")).to_contain_text("step-5, which was added by hand")
     assert chosen[1] not in {e.id for e in load_submission(work).experiments}
 
@@ -101,7 +130,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
     with DeskServer() as server:
         window = show(server.url, size=WIDE)
         with window.expect_navigation():
-            window.get_by_role("link", name="Exercises").click()
+            window.get_by_role("link", name="New exercise").click()
         window.locator('input[value="coulomb_friction"]').check()
         drawn = window.locator("#hidden img")
         expect(drawn).to_have_js_property("complete", True)
@@ -111,42 +140,73 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
         slider.fill("0.5")
         until(lambda: window.locator("#hidden img").get_attribute("src") != before)
         expect(window.locator("#hidden li")).to_contain_text("coulomb_friction on cart 1")
+        expect(window.locator("#result")).to_have_text("1 effect is hidden in throne-2dof.")
+        expect(window.get_by_label("Masses")).to_be_hidden()  # of an own chain
         assert fits(window)
         window.get_by_label("Folder").fill(str(out))
-        window.get_by_role("button", name="Make").click()
-        window.get_by_role("button", name="Open exercise").click()
+        window.get_by_role("button", name="Make it").click()
+        expect(window.get_by_text("The exercise is made:")).to_be_visible()
+        expect(window.locator(".previews svg").first).to_be_visible()
+        told = window.get_by_text("coulomb_friction on cart 1")
+        expect(told).to_be_hidden()
+        window.get_by_text("What is hidden in it (1), for you only").click()
+        expect(told).to_be_visible()
+        assert fits(window)
+        window.get_by_role("button", name="Open as a submission exercise").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("exercise")
     assert len(load_submission(out).experiments) > 10
 
 
-def test_a_rubric_is_edited_with_its_mistakes_beside_it(show, tmp_path):
-    """What is wrong shows as it is typed, and goes; what is right is saved."""
-    path = tmp_path / "rubric.toml"
-    with DeskServer() as server:
-        window = show(server.url)
-        window.goto(f"{window.url}rubric/")
-        window.get_by_label("Another rubric").fill(str(path))
-        window.get_by_label("A new one begins with").select_option("throne-1dof")
+def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_path, monkeypatch):
+    """From a shipped one; what is wrong shows as it is typed, and goes; no mouse is needed."""
+    monkeypatch.chdir(tmp_path)
+    write_class_of_two(tmp_path / "graded")
+    path = tmp_path / "lab.toml"
+    with DeskServer(folder=tmp_path / "graded") as server:
+        window = show(server.url, size=PHONE)
+        window.goto(f"{window.url.split('/grades')[0]}/rubric/")
+        assert fits(window)
+        window.get_by_role("link", name="Start from throne-1dof").focus()
         with window.expect_navigation():
-            window.get_by_role("button", name="Open").click()
+            window.keyboard.press("Enter")
+        result = window.locator(".now .result")
+        expect(result).to_have_text("20 points in 13 criteria; fits submissions with 1 cart")
+        window.get_by_label("Save it as").fill(str(path))
         text = window.locator("#text")
         good = text.input_value()
         text.fill(good.replace("\npoints", "\npionts", 1))
-        wrong = window.locator("#problems td.wrong").filter(has_text="unknown key; did you mean")
+        wrong = window.locator(".listing .bad").filter(has_text="unknown key; did you mean")
         expect(wrong.first).to_be_visible()
+        expect(result).to_contain_text(re.compile(r"^Line \d+: "))
         assert fits(window)
+        text.fill(good)
+        expect(result).to_contain_text("20 points")
+        expect(wrong).to_have_count(0)
+        window.get_by_label("Off for each day begun").fill("50")
+        assert fits(window)
+        window.get_by_role("button", name="Show the preview").focus()
         with window.expect_navigation():
-            window.get_by_role("button", name="Save").click()
-        expect(wrong.first).to_be_visible()
+            window.keyboard.press("Enter")
+        expect(result).to_contain_text("1 of 2 teams would have other points.")
+        drawn = window.locator("img.drawing")
+        until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)
+        assert fits(window)
         assert not path.exists()
-        window.locator("#text").fill(good)
-        expect(window.locator("#problems")).to_contain_text("Valid")
-        window.get_by_role("button", name="Save").click()
-        expect(window.get_by_text("Saved.")).to_be_visible()
-        assert load_rubric(path)
-        window.set_viewport_size({"width": 400, "height": 800})
+        window.get_by_role("button", name="Save the rubric").focus()
         with window.expect_navigation():
-            window.get_by_role("link", name="Effects").click()
+            window.keyboard.press("Enter")
+        expect(window.locator(".now .chip")).to_have_text("Saved")
+        expect(window.get_by_role("heading", name="Grade graded again with it")).to_be_visible()
+        assert fits(window)
+        assert load_rubric(path).late.percent_per_day == 50
+
+
+def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
+    """When its row is opened."""
+    with DeskServer() as server:
+        window = show(server.url)
+        window.goto(f"{window.url}effects/")
+        window.set_viewport_size({"width": 400, "height": 800})
         window.locator("#coulomb_friction summary").click()
         drawn = window.locator("#coulomb_friction img")
         until(lambda: drawn.evaluate("image => image.naturalWidth") > 100)

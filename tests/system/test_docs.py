@@ -73,7 +73,7 @@ def test_every_command_and_option_is_documented(command):
     """`docs/commands.md` has a section a command, and names each of its options there."""
     text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     sections = re.split(r"^## ", text, flags=re.MULTILINE)
-    (section,) = [s for s in sections if re.match(rf"`cartlab {command}\b", s)]
+    (section,) = [s for s in sections if re.match(rf"`cartlab {command}(?![\w-])", s)]
     for parameter in COMMANDS[command].params:
         for option in (*parameter.opts, *parameter.secondary_opts):
             if option.startswith("--") and option not in ("--help", "--pdf"):

@@ -12,8 +12,6 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.bench.emulator.assemble import open_bench
-from pipeline.bench.emulator.core import ReferenceCore
 from pipeline.bench.protocol.messages import (
     FULL_SCALE,
     ChirpEnd,
@@ -27,8 +25,10 @@ from pipeline.bench.protocol.messages import (
     parse_description,
     parse_reading,
 )
+from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.emulator.server import EmulatorOptions, Server
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.firmware_host import (
     COMPILER,
@@ -230,7 +230,7 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
-    server = open_bench(bench, port="pty", core=partial(SlowToBite, library))
+    server = Server(bench, EmulatorOptions(port="pty"), core=partial(SlowToBite, library))
     with closing(server), kept_going(lambda until: server.serve(until=until)):
         acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))

@@ -8,9 +8,6 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pipeline.bench.emulator.carts import VirtualCarts
-from pipeline.bench.emulator.core import ReferenceCore
-from pipeline.bench.emulator.links import Link, open_link
 from pipeline.bench.protocol.messages import (
     Description,
     PidGains,
@@ -23,8 +20,11 @@ from pipeline.bench.protocol.messages import (
     parse_description,
     parse_reading,
 )
+from pipeline.simulated.emulator.carts import VirtualCarts
+from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.emulator.links import Link, open_link
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.synthesis.hidden import prepare_bench
 from pipeline.workflow import analyse
 from tests.helpers.firmware_host import acquire, kept_going
 from tests.helpers.firmware_mega import Mega, build_sketch, memory, missing

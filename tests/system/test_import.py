@@ -9,9 +9,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pipeline.bench.host.importing import Importer
-from pipeline.bench.planning.plan import Recording
 from pipeline.cli import app
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import Recording
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
 from tests.helpers.acquisitions import Notes, sine, write_work

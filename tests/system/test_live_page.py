@@ -18,12 +18,12 @@ import psutil
 import pytest
 from playwright.sync_api import expect
 
+from pipeline.bench.live.live_page import LivePage
+from pipeline.bench.live.live_state import LiveState
 from pipeline.bench.live.observer import Anomalies, RunOutcome
-from pipeline.bench.live.page import LivePage
-from pipeline.bench.live.page_state import LiveState
-from pipeline.bench.planning.plan import Limits, Plan, Recording, StateLoop
 from pipeline.bench.protocol.messages import HEARTBEAT_EVERY, Reading
 from pipeline.errors import ConfigError, HardwareError
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from tests.helpers.accessibility import violations
 from tests.helpers.acquisitions import sine, write_work
 from tests.helpers.benches import emulator
@@ -61,7 +61,7 @@ LOOP = Recording(
     frequency=0.2,
     controller=StateLoop(cart=2),
 )
-PLAN = Plan(limits=Limits(input=0.4, travel=2.5), recordings=(DECAY, SINE, LOOP))
+PLAN = Plan(limits=PlanLimits(input=0.4, travel=2.5), recordings=(DECAY, SINE, LOOP))
 
 
 def lines(first: int, last: int) -> list[Reading]:
@@ -97,18 +97,19 @@ def test_points_are_few_in_units_and_of_this_run(folder):
     state.readings(lines(0, 1000), Anomalies(lost=2))
 
     found = state.points(run=0, start=0)
-    assert (found.run, found.start, found.end, len(found.points)) == (1, 0, 200, 200)
-    assert found.points[10] == (0.05, round(100 * np.sin(0.63)) * DUTY, 0.01, 0.1, -0.1)
-    assert found.counters == {
+    assert (found["run"], found["start"], found["end"], len(found["points"])) == (1, 0, 200, 200)
+    assert found["points"][10] == (0.05, round(100 * np.sin(0.63)) * DUTY, 0.01, 0.1, -0.1)
+    assert found["counters"] == {
         "lines": 1000, "lost": 2, "garbled": 0, "late": 0, "resets": 0, "stuck": 0,
     }  # fmt: skip
     state.readings(lines(1000, 1010), Anomalies(lost=2))
-    assert [p[0] for p in state.points(run=1, start=200).points] == [1.0, 1.005]
+    assert [p[0] for p in state.points(run=1, start=200)["points"]] == [1.0, 1.005]
 
     state.started(LOOP)
     state.readings(lines(0, 1), Anomalies())
     fresh = state.points(run=1, start=202)
-    assert (fresh.run, fresh.points) == (2, [(0.0, 0.0, 0.2, 0.0, 0.0)])  # a target of 100 counts
+    assert fresh["run"] == 2
+    assert fresh["points"] == [(0.0, 0.0, 0.2, 0.0, 0.0)]  # a target of 100 counts
 
 
 def test_a_slow_reader_gets_less_and_not_later(folder):
@@ -119,8 +120,8 @@ def test_a_slow_reader_gets_less_and_not_later(folder):
     for second in range(60):
         state.readings(lines(1000 * second, 1000 * second + 1000), Anomalies())
     found = state.points(run=1, start=10)
-    assert (found.end, len(found.points)) == (12_000, 2400)
-    assert found.points[0][0] == 48.0
+    assert (found["end"], len(found["points"])) == (12_000, 2400)
+    assert found["points"][0][0] == 48.0
 
 
 def test_the_plan_says_what_is_done_now_and_broken(folder):
@@ -334,7 +335,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
     """An idle connection ends by itself; one that has shown the secret goes on."""
-    monkeypatch.setattr("pipeline.web.strangers._TO_SHOW_IT", 0.2)
+    monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
         assert stream.readline() == b"event: state\n"

@@ -5,19 +5,23 @@ import re
 import shutil
 import subprocess
 from collections import Counter
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from unicodedata import normalize
 
 import html5lib
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 from pypdf import PdfReader
+from pypdf.generic import DictionaryObject
 
 from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.report.draft.write import render_report
-from pipeline.report.effects.page import render_effects
-from pipeline.report.gap.page import render_gap
+from pipeline.report.effects.gallery import render_effects
+from pipeline.report.gap.story import render_gap
 from pipeline.report.solution.write import render_solution
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
@@ -171,6 +175,87 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
         assert covered(words) == []
 
 
+# Of the height of a page's text; the last page ends where the report does.
+MOST_WHITE = 1 / 3
+PRINTED = ("one", "two", "three", "gap", "solution")
+
+
+@pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="no pdftoppm: poppler-utils")
+@pytest.mark.parametrize("case", PRINTED)
+def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
+    """Where a figure does not fit, those of the page are drawn smaller, or tables break."""
+    (pdf,) = folder(case, request).glob("*.pdf")
+    pages = subprocess.run(
+        ["pdftoppm", "-gray", "-r", "36", pdf], capture_output=True, check=True
+    ).stdout
+
+    whites = [white_stretch(page) for page in pictures(pages)]
+
+    assert len(whites) == len(PdfReader(pdf).pages)
+    assert [white for white in whites[:-1] if white > MOST_WHITE] == []
+
+
+def pictures(pgm: bytes) -> Iterator[NDArray[np.uint8]]:
+    """Yield the pages that pdftoppm wrote one after the other."""
+    while head := re.match(rb"P5\s+(\d+)\s+(\d+)\s+255\s", pgm):
+        width, height = map(int, head.groups())
+        end = head.end() + width * height
+        yield np.frombuffer(pgm[head.end() : end], np.uint8).reshape(height, width)
+        pgm = pgm[end:]
+
+
+def white_stretch(page: NDArray[np.uint8]) -> float:
+    """Return the longest stretch of a page without ink, as a share of the height of its text."""
+    body = page[round(0.064 * len(page)) : round(0.929 * len(page))]  # between the margins
+    inked = np.flatnonzero((body < 200).any(axis=1))
+    edges = np.concatenate([[0], inked, [len(body)]])
+    return float(np.diff(edges).max() / len(body))
+
+
+@pytest.mark.parametrize("case", PRINTED)
+def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
+    """With its caption stand at least its headings and four rows."""
+    (pdf,) = folder(case, request).glob("*.pdf")
+    tables = list(rows_by_page(PdfReader(pdf)))
+    assert len(tables) > 2
+    broken = [rows for rows in tables if len(rows) > 1]
+    assert [rows for rows in broken if rows[0] < 5] == []
+
+
+def rows_by_page(pdf: PdfReader) -> Iterator[list[int]]:
+    """Yield of each table how many of its rows stand on one page after the other."""
+    references = (page.indirect_reference for page in pdf.pages)
+    numbers = {at.idnum: n for n, at in enumerate(references) if at}
+    for table in elements(pdf.root_object["/StructTreeRoot"], "/Table"):
+        pages = [next(pages_of(row, numbers)) for row in elements(table, "/TR")]
+        yield [n for _, n in sorted(Counter(pages).items())]
+
+
+def elements(node: Any, kind: str) -> Iterator[Any]:
+    """Yield the elements of a kind inside a node of the structure, in order."""
+    node = node.get_object() if hasattr(node, "get_object") else node
+    if isinstance(node, list):
+        for one in node:
+            yield from elements(one, kind)
+    elif isinstance(node, dict):
+        if node.get("/S") == kind:
+            yield node
+        else:
+            yield from elements(node.get("/K", []), kind)
+
+
+def pages_of(node: Any, numbers: dict[int, int]) -> Iterator[int]:
+    """Yield the pages on which what is inside a node is drawn."""
+    node = node.get_object() if hasattr(node, "get_object") else node
+    if isinstance(node, list):
+        for one in node:
+            yield from pages_of(one, numbers)
+    elif isinstance(node, DictionaryObject):
+        if "/Pg" in node:
+            yield numbers[node.raw_get("/Pg").idnum]
+        yield from pages_of(node.get("/K", []), numbers)
+
+
 class Box(NamedTuple):
     """A text and where it stands."""
 
@@ -277,13 +362,68 @@ def test_everybody_can_read_it_on_every_screen(made, show):
 
 @pytest.mark.parametrize("case", ["class", "feedback"])
 def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
-    """The column of names stays in sight and takes at most half of the view."""
+    """The column of names stays in sight and takes at most half of the view, where there is one."""
     page = show(page_of(folder(case, request)), size=PHONE)
     widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
         (fold) => fold.open = true) && Array.from(
-        document.querySelectorAll('.numbered :is(th, td):first-child'),
+        document.querySelectorAll('.numbered:not(.told) :is(th, td):first-child'),
         (cell) => cell.getBoundingClientRect().width)""")
     assert 0 < max(widths) <= PHONE[0] / 2
+
+
+TALL = """() => Array.from(document.querySelectorAll('.numbered:not(.small) td'))
+    .map((e) => e.getBoundingClientRect().height).sort((a, b) => b - a)[0]"""
+SPLIT = """() => {
+  const found = [];
+  const walker = document.createTreeWalker(document.querySelector('main'), NodeFilter.SHOW_TEXT);
+  for (let node = walker.nextNode(); node; node = walker.nextNode()) {
+    const owner = node.parentElement;
+    if (owner.closest('math, svg, code, pre') || !owner.checkVisibility()) continue;
+    for (const match of node.textContent.matchAll(/\\d\\s(?:%|cm|V|s|Hz|rad\\/s)(?!\\w)/g)) {
+      const range = document.createRange();
+      range.setStart(node, match.index);
+      range.setEnd(node, match.index + match[0].length);
+      const [first, ...more] = range.getClientRects();
+      if (more.some((rect) => Math.abs(rect.top - first.top) > 4)) found.push(match[0]);
+    }
+  }
+  return found;
+}"""
+
+
+def test_a_phone_squeezes_no_column_and_splits_no_unit(three, show):
+    """No cell of a table is higher than five lines; a number and its unit stand in one line."""
+    page = show(page_of(three), size=PHONE)
+    page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+    assert 0 < page.evaluate(TALL) < 130
+    assert page.evaluate(SPLIT) == []
+
+
+SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg text'), (text) =>
+    text.ownerSVGElement.getScreenCTM().a * parseFloat(getComputedStyle(text).fontSize)))"""
+
+
+def test_figures_can_be_read_on_a_laptop(made, show):
+    """No letter of a figure is lower than ten pixels, of buttons on it none below the figure."""
+    page = show(page_of(made), size=LAPTOP)
+    assert page.evaluate(SMALLEST) >= 10
+    for plot in page.locator(".plot").all():
+        bounds, tools = plot.bounding_box(), plot.locator(".tools").bounding_box()
+        assert tools["x"] >= bounds["x"] + bounds["width"] / 2
+        # They hang over its edge by a few pixels.
+        assert tools["y"] + tools["height"] <= bounds["y"] + bounds["height"] + 10
+
+
+def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
+    """The distribution is in sight at once; flags come before criteria, which have their titles."""
+    page = show(page_of(folder("class", request)), size=LAPTOP)
+    first = page.locator("figure").first.bounding_box()
+    assert first["y"] + first["height"] < LAPTOP[1]
+    titles = page.locator("h2").all_inner_texts()
+    assert titles.index("Most common mistakes") < titles.index("Criteria")
+    drawn = page.locator("#criteria figure svg text").all_text_contents()
+    assert "static gains from the steps" in drawn
+    assert "initial-gains" not in drawn
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):

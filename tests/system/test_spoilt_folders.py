@@ -11,7 +11,7 @@ from random import Random
 import numpy as np
 import pytest
 
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.poison import poisoned
 from tests.system.test_any_submission import CHANNELS
@@ -35,9 +35,7 @@ ADDED = (
 def good(carts: int) -> dict[str, bytes]:
     """Return the files of a small submission: few dwells, few repeats."""
     with tempfile.TemporaryDirectory() as folder:
-        write_submission(
-            Path(folder), chain=f"throne-{carts}dof", seed=1, compact=True, reported=True
-        )
+        write_submission(Path(folder), f"throne-{carts}dof", seed=1, compact=True, reported=True)
         files = {
             path.relative_to(folder).as_posix(): path.read_bytes()
             for path in Path(folder).rglob("*.*")

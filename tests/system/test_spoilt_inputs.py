@@ -10,23 +10,23 @@ from random import Random
 import pytest
 
 from pipeline.bench.host.importing import Importer
-from pipeline.bench.planning.plan_file import load_plan, plan_path, plan_text
-from pipeline.bench.planning.propose import propose_plan
 from pipeline.errors import ConfigError
-from pipeline.gap.stored import gap_text, read_gap
+from pipeline.experiments.plan_file import load_plan, plan_path, plan_text
+from pipeline.experiments.propose import propose_plan
+from pipeline.gap.types import read_gap
 from pipeline.grading.intake.late_table import read_late_table
 from pipeline.grading.intake.lms_names import Platform, gradescope_metadata
 from pipeline.grading.publish.roster import Roster
 from pipeline.grading.publish.students import Student
 from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 from pipeline.grading.rubric_file import load_rubric
+from pipeline.json_files import json_text
 from pipeline.report.draft.changes import compare_drafts, read_results
-from pipeline.report.gap.words import terminal_verdict
+from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.resources import RUBRICS
-from pipeline.results_json import results_text
+from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
 from pipeline.submission.complaints import MOST_TOLD
-from pipeline.synthesis.hidden import prepare_bench
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
 from tests.helpers.grades import make_grade
@@ -58,7 +58,7 @@ def sound() -> dict[str, bytes]:
         plan = plan_text(propose_plan(submission), submission.system).encode()
         survey = write_paper(Path(folder) / "survey.csv").read_bytes()
     analysis = two_cart_analysis()
-    gap = gap_text(make_gap(keys=("coulomb_friction", "input_delay")), analysis).encode()
+    gap = json_text(make_gap(keys=("coulomb_friction", "input_delay"))).encode()
     return {
         "survey.csv": survey,
         **{f"{name}.csv": text.encode() for name, text in ROSTERS.items()},
@@ -66,7 +66,7 @@ def sound() -> dict[str, bytes]:
         "submission_metadata.yml": SENT.encode(),
         "rubric.toml": (RUBRICS / "throne-2dof.toml").read_bytes(),
         "plan.toml": plan,
-        "results.json": results_text(analysis).encode(),
+        "results.json": json_text(analysis).encode(),
         "gap.json": gap,
         "model.json": gap,
     }
@@ -100,7 +100,7 @@ def use(name: str, path: Path) -> None:
         survey_text(survey)
     elif path.stem in ROSTERS:
         roster = Roster.read(path, platform=path.stem)  # type: ignore[arg-type]
-        roster.filled([student], {"Lab 3": lambda student: "1"})
+        roster.fill([student], {"Lab 3": lambda student: "1"})
     elif name == "late.csv":
         read_late_table(path)
     elif name == "submission_metadata.yml":
@@ -114,9 +114,9 @@ def use(name: str, path: Path) -> None:
     elif name == "results.json":
         compare_drafts(read_results(path), two_cart_analysis())
     elif name == "gap.json":
-        gap, _ = read_gap(path.read_text(encoding="utf-8", errors="replace"))
+        gap = read_gap(path.read_text(encoding="utf-8", errors="replace"))
         terminal_verdict(gap)
-        gap_text(gap, two_cart_analysis())
+        json_text(gap)
     elif name == "model.json":
         prepare_bench(model=path)
     elif name == "import":

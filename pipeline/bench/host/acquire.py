@@ -13,25 +13,24 @@ from pipeline.bench.host.experiments import (
     recorded_entry,
     scale_remarks,
 )
+from pipeline.bench.host.orders import Order, order_on
 from pipeline.bench.host.raw import free_raw_path
 from pipeline.bench.host.record import save_left_over, save_record
-from pipeline.bench.host.run_watch import STOPPED
 from pipeline.bench.host.serial_line import Runaway, SerialLine, open_line
 from pipeline.bench.host.session import Session
 from pipeline.bench.host.signals import Stopped, signals_held, stopping_on_signals
 from pipeline.bench.live.observer import Buttons, Observer, Observers, RunOutcome, Wish
-from pipeline.bench.planning.orders import Order, order_on
-from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_file import add_recordings, load_plan, plan_path, save_plan
-from pipeline.bench.planning.propose import extend_plan, propose_plan
-from pipeline.bench.thresholds import TRIES
 from pipeline.errors import ConfigError, DataError, HardwareError, PipelineError
+from pipeline.experiments.plan import Plan, Recording
+from pipeline.experiments.plan_file import add_recordings, load_plan, plan_path, save_plan
+from pipeline.experiments.propose import extend_plan, propose_plan
 from pipeline.lock import alone_in
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
-from pipeline.synthesis.files import Value
+from pipeline.submission.toml_file import Value
 
 _USUAL_BAUD = 115_200
+_TRIES = 3  # of one recording; a fault that strikes three times is not chance
 
 
 def acquire(
@@ -184,11 +183,11 @@ class _Acquisition:
     def _wish(self, run: "_Run") -> Wish:
         """Return what becomes of a run that ended early: a limit decides, a button, an answer."""
         name, partial = run.outcome.recording.id, run.outcome.partial
-        limit = partial.startswith(STOPPED)
-        if run.file and (limit or self._buttons.pressed != "keep"):
+        unsafe = run.outcome.is_unsafe
+        if run.file and (unsafe or self._buttons.pressed != "keep"):
             self._observer.remark(f"{run.file} is partial ({partial}); it is not in {NAME}")
-        if limit:  # the same again would do the same harm
-            self._failed[name] = TRIES
+        if unsafe:  # the same again would do the same harm
+            self._failed[name] = _TRIES
             less = (
                 "divide its amplitude in plan.toml by four"
                 if run.outcome.recording.amplitude
@@ -202,7 +201,7 @@ class _Acquisition:
         wish = self._buttons.pressed or self._answer(run)
         self._heed_stop()
         if wish == "skip" or (wish == "keep" and not run.file):
-            self._failed[name] = TRIES
+            self._failed[name] = _TRIES
             return "skip"
         return wish
 
@@ -210,12 +209,14 @@ class _Acquisition:
         """Ask whether to record it again; a fault that struck too often is not asked about."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
-        if self._failed[name] >= TRIES:
+        if self._failed[name] >= _TRIES:
             return "skip"
         offered: list[Wish] = ["repeat", "keep", "skip"] if run.file else ["repeat", "skip"]
         self._buttons.offer(*offered)
         try:
-            self._observer.confirm(f"Record {name} again")
+            self._observer.confirm(
+                f"{name} ended early: {run.outcome.partial}. Record {name} again"
+            )
         except ConfigError:  # nobody there to decide: the rest of the plan goes on
             return "skip"
         return self._buttons.pressed or "repeat"
@@ -258,7 +259,7 @@ class _Acquisition:
         done = _done(submission)
         for recording in plan.recordings:
             wanted = not self._only or recording.id in self._only
-            given_up = self._failed.get(recording.id, 0) >= TRIES
+            given_up = self._failed.get(recording.id, 0) >= _TRIES
             if wanted and recording.id not in done and not given_up:
                 return recording
         return None
@@ -289,8 +290,8 @@ class _Acquisition:
         try:
             order, table = order_on(recording, plan, submission, line.bench)
         except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
-            self._failed[recording.id] = TRIES
-            return self._refused(recording, path, str(error))
+            self._failed[recording.id] = _TRIES
+            return self._refused(RunOutcome(recording=recording, lines=0, partial=str(error)), path)
         try:
             restless = session.prepare(order)
             with signals_held() as let_in:  # what is complete is noted before the program ends
@@ -308,7 +309,14 @@ class _Acquisition:
                     self._note(run)
                 self._observer.finished(run.outcome)
         except HardwareError as error:
-            return self._refused(recording, path, str(error), astray=isinstance(error, Runaway))
+            outcome = RunOutcome(
+                recording=recording,
+                lines=0,
+                partial=str(error),
+                is_astray=isinstance(error, Runaway),
+                wish=session.wish,
+            )
+            return self._refused(outcome, path)
         return run
 
     def _run(
@@ -326,11 +334,8 @@ class _Acquisition:
                 self._observer.remark(f"{file} is partial (stopped by hand); it is not in {NAME}")
             raise
 
-    def _refused(
-        self, recording: Recording, path: Path, why: str, *, astray: bool = False
-    ) -> "_Run":
+    def _refused(self, outcome: RunOutcome, path: Path) -> "_Run":
         """Tell of a recording that did not begin."""
-        outcome = RunOutcome(recording=recording, lines=0, partial=why, is_astray=astray)
         self._observer.finished(outcome)
         return _Run(outcome=outcome, path=path)
 

@@ -4,17 +4,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from pipeline.bench.host.record import data_file
-from pipeline.bench.planning.plan import Limits, Plan, Recording
 from pipeline.bench.protocol.messages import FULL_SCALE, Description
-from pipeline.bench.thresholds import ROUNDED, SAME_SCALE
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.ingest.read import DUTY_COUNT
 from pipeline.output import new_folder, write_file
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.edit import append_experiment, edit_submission
 from pipeline.submission.load import NAME, spring_names
 from pipeline.submission.toml_file import Value
-from pipeline.synthesis.files import toml_section
+from pipeline.submission.toml_section import toml_section
 
 _TO_ADD = """\
 # Who you are, one table for each of you:
@@ -121,11 +120,12 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
         "input": (system.input, bench.input_unit, bench.input_per_count),
         "position": (system.position, bench.position_unit, bench.position_per_count),
     }
+    # Scales that differ by less are the same number typed with fewer digits.
     return [
         f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
         f"that of {NAME} is used"
         for name, (own, unit, stated) in pairs.items()
-        if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > SAME_SCALE
+        if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > 1e-3
     ]
 
 
@@ -141,7 +141,7 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
     ]
 
 
-def limit_words(limits: Limits, submission: Submission, bench: Description) -> str:
+def limit_words(limits: PlanLimits, submission: Submission, bench: Description) -> str:
     """Return the limits of a plan beside what the bench counts and can give.
 
     Raises
@@ -151,7 +151,7 @@ def limit_words(limits: Limits, submission: Submission, bench: Description) -> s
     system = submission.system
     unit, position = system.input.unit, system.position.unit
     full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
-    if limits.input > ROUNDED * full:
+    if limits.input > 1.01 * full:  # it may be typed with fewer digits
         raise ConfigError(
             f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
             f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "

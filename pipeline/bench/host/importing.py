@@ -9,23 +9,20 @@ from pathlib import Path
 
 from pipeline.bench.host.experiments import add_experiment
 from pipeline.bench.live.observer import Observer
-from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_file import load_plan, plan_path
-from pipeline.bench.planning.plan_words import hold_words
-from pipeline.bench.thresholds import SAME_FREQUENCY
 from pipeline.errors import ConfigError, SubmissionError
+from pipeline.experiments.plan import Plan, Recording
+from pipeline.experiments.plan_file import load_plan, plan_path
+from pipeline.experiments.plan_words import hold_words
 from pipeline.ingest.fill import experiment_entry, free_carts, free_id
-from pipeline.ingest.formats.table import ENDINGS
+from pipeline.ingest.formats.recognise import ENDINGS
 from pipeline.ingest.inspect import Inspection, inspect_file
 from pipeline.output import own_folder
-from pipeline.results_of_runs import Kind
+from pipeline.results import Kind
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
 from pipeline.submission.toml_file import Value
 
 LOOK_EVERY = 0.5  # s
-_COMPLETE = 2  # looks in a row at which size and time of a file were the same
-_CUT_SHORT = 20  # … at which a file that ends in mid-line is taken to stay so
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,7 +110,7 @@ class Importer:
             state = info.st_size, info.st_mtime_ns
             self._looks[path] = self._looks.get(path, 0) + 1 if self._seen.get(path) == state else 0
             self._seen[path] = state
-            if info.st_size and (at_once or self._looks[path] >= _COMPLETE):
+            if info.st_size and (at_once or self._looks[path] >= 2):  # nobody writes it any more
                 ready.append(path)
         return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
 
@@ -168,7 +165,7 @@ class Importer:
             self._observer.remark(f"not taken: {error}")
             return None
         if any("cut short" in problem for problem in inspection.problems):
-            if not final and self._looks[path] < _CUT_SHORT:
+            if not final and self._looks[path] < 20:  # its last line may still come
                 self._over.discard(path)
             else:
                 self._observer.remark(f"{path.name}: not taken, {inspection.problems[0]}")
@@ -215,7 +212,7 @@ class Importer:
             return None
         if recording.kind == "sine":
             found = inspection.frequency
-            near = found and abs(found / recording.frequency - 1) < SAME_FREQUENCY
+            near = found and abs(found / recording.frequency - 1) < 0.05
             return recording if inspection.kind == "sine" and near else None
         # A swept or switched input may look like either.
         alike = {"sweep": ("sweep", "step"), "step": ("step", "sweep")}

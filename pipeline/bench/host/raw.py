@@ -13,15 +13,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
-from pipeline.bench.planning.plan import Limits, Recording
 from pipeline.bench.protocol.messages import Description
 from pipeline.errors import DataError
+from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.output import own_folder
 
 FOLDER = "raw"
 _VERSION = "cartlab-raw/1"
 _TIME = struct.Struct("<Qd")  # end of the lump in the stream, s since the run began
-_LONGEST_HEADER = 100_000  # bytes
 _LINE = ("target", "duty", "milliseconds")  # what follows the encoders
 
 
@@ -38,7 +37,7 @@ class RawHeader:
     """
 
     recording: Recording
-    limits: Limits
+    limits: PlanLimits
     commands: tuple[str, ...]
     bench: Description
     begun: str
@@ -124,7 +123,7 @@ def read_raw(path: Path) -> RawRun:
     """
     raw = path.read_bytes()
     head, newline, content = raw.partition(b"\n")
-    if not newline or len(head) > _LONGEST_HEADER:
+    if not newline or len(head) > 100_000:  # bytes
         raise DataError(f"{path.name}: is no raw file of a bench, its first line is no header")
     header = _header(head, name=path.name)
     times = path.with_suffix(".times")
@@ -142,7 +141,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
         bench = {**found["bench"], "commands": frozenset(found["bench"]["commands"])}
         return RawHeader(
             recording=Recording.model_validate(found["recording"]),
-            limits=Limits.model_validate(found["limits"]),
+            limits=PlanLimits.model_validate(found["limits"]),
             commands=tuple(found["commands"]),
             bench=Description(**bench),
             begun=found["begun"],
@@ -158,3 +157,13 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
     while (path := parent / f"{recording.id}-{number}.raw").exists():
         number += 1
     return path
+
+
+def known_commands(folder: Path) -> frozenset[str]:
+    """Return the extensions of the bench of the latest recording; the chirp where there is none."""
+    for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
+        try:
+            return read_raw(path).header.bench.commands
+        except DataError:
+            continue
+    return frozenset("c")

@@ -5,13 +5,12 @@ from pathlib import Path
 
 from pipeline.bench.host.raw import FOLDER, RawRun, read_raw
 from pipeline.bench.host.stream import Stream
-from pipeline.bench.planning.plan import Recording
 from pipeline.bench.protocol.messages import Reading
 from pipeline.errors import DataError
+from pipeline.experiments.plan import Recording
 from pipeline.output import own_folder, write_file
 
 DATA = "data"
-_FEWEST_LINES = 8  # what a record needs at least
 
 
 def data_file(recording: Recording, *, partial: bool = False) -> str:
@@ -40,7 +39,7 @@ def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = Fal
     """
     run = read_raw(raw_path)
     readings = readings_of(run)
-    if len(readings) < _FEWEST_LINES:
+    if len(readings) < 8:  # what a record needs at least
         raise DataError(f"{raw_path.name}: holds {len(readings)} lines, too few for a record")
     name = data_file(run.header.recording, partial=partial)
     own_folder(folder, DATA).mkdir(exist_ok=True)

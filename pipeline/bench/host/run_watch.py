@@ -1,16 +1,12 @@
 """What is looked at while lines come: the limits and the wave, in a run and in the rest before."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from pipeline.bench.host.orders import Order
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.live.observer import Observer
-from pipeline.bench.planning.orders import Order
 from pipeline.bench.protocol.messages import Reading
-from pipeline.bench.thresholds import ASTRAY
-
-STOPPED = "stopped: "  # begins why a run was ended that was not safe to go on with
-_FORWARD = 0.05  # s between batches handed to the observers
 
 
 class LineWatch:
@@ -25,6 +21,7 @@ class LineWatch:
     ----------
     is_astray : the motor's duty was not what the order asks for.
     is_too_far : a cart was further from its zero than its limit.
+    is_unsafe : it was stopped because to go on was not safe.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None) -> None:
@@ -33,7 +30,7 @@ class LineWatch:
         self._period = period
         self._strays, self._drives_off = _InARow(), _InARow()
         self._before: Reading | None = None
-        self.is_astray = self.is_too_far = False
+        self.is_astray = self.is_too_far = self.is_unsafe = False
 
     def check(self, batch: Sequence[Reading]) -> str:
         """Return why the run must stop, or ""."""
@@ -42,6 +39,11 @@ class LineWatch:
                 return trouble
         return ""
 
+    def stop(self, why: str) -> str:
+        """Return why the run must stop, which is not safe to go on with."""
+        self.is_unsafe = True
+        return f"stopped: {why}"
+
     def _trouble(self, reading: Reading) -> str:
         order = self._order
         off = order.drives_off(reading, before=self._before or reading)
@@ -49,7 +51,7 @@ class LineWatch:
         if passed := order.passed(reading, carts=self._carts):
             self.is_too_far = bool(order.too_far(reading, carts=self._carts))
             self.is_astray = off
-            return f"{STOPPED}{passed}"
+            return self.stop(passed)
         if self._period is not None:
             strays = order.strays(reading, period=self._period)
             if self._strays.lasts(strays, ms=reading.ms):
@@ -59,8 +61,8 @@ class LineWatch:
                 )
         if self._drives_off.lasts(off, ms=reading.ms):
             self.is_astray = True
-            return (
-                f"{STOPPED}the bench drives its motor with {reading.duty} duty counts where it "
+            return self.stop(
+                f"the bench drives its motor with {reading.duty} duty counts where it "
                 f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
             )
         return ""
@@ -79,7 +81,7 @@ class _InARow:
         elif self._since is None:
             self._since = ms
         else:
-            return ms - self._since >= ASTRAY
+            return ms - self._since >= 4  # five lines at 1 kHz, else two at least
         return False
 
 
@@ -87,21 +89,30 @@ class RunWatch(LineWatch):
     """Checks the lines of a run, and hands them on in batches."""
 
     def __init__(
-        self, order: Order, *, carts: int, period: float | None, stream: Stream, observer: Observer
+        self,
+        order: Order,
+        *,
+        carts: int,
+        period: float | None,
+        stream: Stream,
+        observer: Observer,
+        let_in: Callable[[], None],
     ) -> None:
         super().__init__(order, carts=carts, period=period)
         self._stream = stream
         self._observer = observer
+        self._let_in = let_in
         self._batch: list[Reading] = []
         self._forwarded = time.monotonic()
 
     def check(self, batch: Sequence[Reading]) -> str:
         """Return why the run must stop, or ""."""
+        self._let_in()
         self._batch += batch
         if trouble := super().check(batch):
             return trouble  # before anybody is told: the stop goes out first
         now = time.monotonic()
-        if now - self._forwarded > _FORWARD:
+        if now - self._forwarded > 0.05:
             self._forwarded = now
             self.forward(())
         return ""

@@ -29,14 +29,11 @@ from pipeline.errors import DataError, HardwareError
 
 _TRIES, _BETWEEN = 5, 0.4  # s; a bench just plugged in is not there at once
 LUMP = 8192  # bytes read at most at a time: what is read within one heartbeat, many times over
-_WRITE_TIMEOUT = 0.5  # s
 _QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
 _LOOK = 0.005  # s between looks at the port
 FIRST_LINE = 2.0  # s a bench may take to begin
-_TRIAL = 0.1  # s of a run that does nothing, to see whether a stock bench is there at all
 _NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
 _QUIET = 0.05  # s without a byte: what was under way has arrived
-_LONGEST_LINE = 512  # bytes; more without an end is noise
 
 
 class Runaway(HardwareError):
@@ -303,7 +300,8 @@ class SerialLine:
 
     def _try_stock(self) -> None:
         """Have a stock bench stream for a moment, which tells how many encoders it has."""
-        self.send(Start(wave=Wave.DELTA, frequency=1 / _TRIAL, amplitude=0))
+        # A run of 0.1 s that does nothing shows whether a stock bench is there at all.
+        self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
         self._in_run, self._is_cleared = False, True  # in it the motor must be off
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
@@ -337,7 +335,7 @@ class _Ear:
         if not data:
             return 0
         *lines, self._tail = (self._tail + data).split(b"\n")
-        self._tail = self._tail[-_LONGEST_LINE:]
+        self._tail = self._tail[-512:]  # bytes; more without an end is noise
         for reading in filter(None, map(parse_reading, lines)):
             before, self._on = self._on, reading.duty != 0
             if before and self._on:
@@ -372,7 +370,7 @@ def _opened(port: str, *, baud: int) -> "serial.SerialBase":
             opened = serial.serial_for_url(port, do_not_open=True)
             opened.baudrate = baud
             opened.timeout = 0  # a read returns what is there
-            opened.write_timeout = _WRITE_TIMEOUT
+            opened.write_timeout = 0.5  # s
             opened.exclusive = True if "://" not in port else None
             opened.open()
         except (serial.SerialException, ValueError, OSError) as error:

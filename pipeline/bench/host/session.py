@@ -7,54 +7,36 @@ is in no thread of its own: if it hangs, the heartbeat ends and the bench cuts i
 
 import gc
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
+from pipeline.bench.host.orders import Order
 from pipeline.bench.host.raw import RawHeader, RawWriter
-from pipeline.bench.host.run_watch import STOPPED, LineWatch, RestWatch, RunWatch
+from pipeline.bench.host.run_watch import LineWatch, RestWatch, RunWatch
 from pipeline.bench.host.serial_line import FIRST_LINE, LUMP, Runaway, SerialLine
 from pipeline.bench.host.signals import Stopped
 from pipeline.bench.host.stream import Stream
 from pipeline.bench.live.observer import Buttons, Observer, RunOutcome, Wish
-from pipeline.bench.planning.orders import Order
-from pipeline.bench.planning.plan import Limits, Recording
-from pipeline.bench.planning.plan_words import hold_words
 from pipeline.bench.protocol.messages import (
     HEARTBEAT_EVERY,
     WATCHDOG,
     Command,
     Hands,
-    Reading,
     Signal,
     encode,
 )
-from pipeline.bench.thresholds import (
-    ENOUGH,
-    NEARLY,
-    OTHER_PERIOD,
-    REST_WINDOW,
-    SILENCE,
-    STILL,
-    UNREADABLE,
-)
+from pipeline.bench.protocol.stamps import OTHER_PERIOD
 from pipeline.errors import HardwareError
+from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.experiments.plan_words import hold_words
 
-_NOTHING_MOVED = (
-    "no cart that is free moved: is it held, is its encoder plugged in, is the motor on?"
-)
-# Why a run ended that somebody ended with a button.
-BY_HAND: Mapping[Wish, str] = {
-    "skip": "skipped by hand",
-    "keep": "ended by hand",
-    "repeat": "ended by hand, to be repeated",
-}
-
+SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
+_NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
+_STILL = 4  # counts a cart at rest may flicker; a run in which no free cart moves more is none
 _LOOK = 0.003  # s between looks at the port
 _AFTER_END = 0.02  # s the last lines may still be under way
-_REST_TRIES = 4
-_PULL_OUT = 1.7  # s a virtual hand takes to pull a cart out
 
 
 @contextmanager
@@ -77,6 +59,10 @@ class Session:
     carts : of the submission; a bench that describes itself may have more, whose travel is
         watched as well.
     buttons : looked at before anything moves and at every look at the port.
+
+    Attributes
+    ----------
+    wish : the button that ended the run, or the rest before it; None: none did.
     """
 
     def __init__(
@@ -84,7 +70,7 @@ class Session:
         line: SerialLine,
         *,
         carts: int,
-        limits: Limits,
+        limits: PlanLimits,
         observer: Observer,
         buttons: Buttons | None = None,
     ) -> None:
@@ -100,6 +86,7 @@ class Session:
         self._free: tuple[int, ...] | None = None  # as a person was last told
         self._beat = float("-inf")
         self._latest_beat = 0.0  # s, the longest without a heartbeat in this run
+        self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
         """Have the carts held or freed and at rest; return what is to be said of it, or "".
@@ -110,6 +97,7 @@ class Session:
         Runaway : the motor is on, or a cart is past its travel, where the bench is to do nothing.
         """
         recording = order.recording
+        self.wish = None
         self._buttons.offer("skip")
         held = tuple(cart for cart in range(1, self._carts + 1) if cart not in recording.carts)
         if self._line.knows("h"):
@@ -122,7 +110,7 @@ class Session:
         if self._line.knows("h"):
             if recording.release:
                 self._line.send(Hands(held=held, released=recording.release))
-                time.sleep(_PULL_OUT)
+                time.sleep(1.7)  # s a virtual hand takes to pull a cart out
         elif recording.release:
             self._observer.confirm(
                 f"Pull cart {recording.release} out and hold it still, nearer than limits.travel "
@@ -139,28 +127,22 @@ class Session:
         what came is in the file; an interrupt goes on to the caller. One that is held is asked for
         with `let_in` while lines come: once the last one is there, the run is whole.
         """
-        header = RawHeader(
-            recording=order.recording,
-            limits=self._limits,
-            commands=tuple(encode(command).decode() for command in order.commands),
-            bench=self._line.bench,
-            begun=datetime.now().astimezone().isoformat(timespec="seconds"),
-        )
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
         watch = RunWatch(
-            order, carts=self._moving, period=self._stated, stream=stream, observer=self._observer
+            order,
+            carts=self._moving,
+            period=self._stated,
+            stream=stream,
+            observer=self._observer,
+            let_in=let_in,
         )
 
         def begin() -> None:
             self._buttons.offer("skip", "keep", "repeat")
             self._observer.started(recording)
 
-        def check(lines: Sequence[Reading]) -> str:
-            let_in()
-            return watch.check(lines)
-
-        with RawWriter(path, header) as raw:
+        with RawWriter(path, self._header(order)) as raw:
             try:
                 partial = self._carry_out(
                     order,
@@ -168,25 +150,39 @@ class Session:
                     seconds=recording.duration,
                     begin=begin,
                     arrived=raw.write,
-                    check=check,
+                    watch=watch,
                 )
             except HardwareError as error:
                 partial = str(error)
                 watch.is_astray |= isinstance(error, Runaway)
         self._swings_out = watch.is_too_far
         watch.forward(stream.finish())
-        if not partial and recording.controller is None and stream.widest <= STILL:
-            partial = _NOTHING_MOVED
+        if not partial and recording.controller is None and stream.widest <= _STILL:
+            partial = (
+                "no cart that is free moved: is it held, is its encoder plugged in, "
+                "is the motor on?"
+            )
         fit = stream.fit()
-        if stream.lines > ENOUGH and not partial:
+        if stream.lines > 1000 and not partial:  # enough to tell a clock's period
             self._say_other_period(fit.period)
             self._period = fit.period
         return RunOutcome(
-            recording=order.recording,
+            recording=recording,
             lines=stream.lines,
             anomalies=stream.anomalies(fit),
             partial=partial,
             is_astray=watch.is_astray,
+            is_unsafe=watch.is_unsafe,
+            wish=self.wish,
+        )
+
+    def _header(self, order: Order) -> RawHeader:
+        return RawHeader(
+            recording=order.recording,
+            limits=self._limits,
+            commands=tuple(encode(command).decode() for command in order.commands),
+            bench=self._line.bench,
+            begun=datetime.now().astimezone().isoformat(timespec="seconds"),
         )
 
     @property
@@ -223,25 +219,25 @@ class Session:
         if recording.settle <= 0:
             return ""
         nothing, moving = order.rest(), dict[int, int]()
-        for _ in range(_REST_TRIES):
+        for _ in range(4):
             self._observer.settling(recording, recording.settle)
             watch = RestWatch(
                 nothing,
                 # Carts that a run took too far swing back by themselves.
                 carts=0 if self._swings_out else self._zeroed,
                 period=self._stated,
-                since=1e3 * recording.settle - REST_WINDOW,
+                since=1e3 * recording.settle - 500,  # the half second told of below
             )
             self._look_on(nothing, watch)
             self._swings_out = False
             moving = {
                 cart: swing
                 for cart, swing in enumerate(watch.swings[: self._carts], start=1)
-                if swing > STILL
+                if swing > _STILL
             }
             if not moving:
                 if watch.last and (why := order.too_far(watch.last, carts=self._zeroed)):
-                    raise Runaway(f"{STOPPED}at rest, {why}")
+                    raise Runaway(f"stopped: at rest, {why}")
                 self._zero_at_rest(recording)
                 return ""
         swings = ", ".join(f"cart {cart} by {swing} counts" for cart, swing in moving.items())
@@ -255,7 +251,7 @@ class Session:
         HardwareError : it did not go on to its end; Runaway : because something was done.
         """
         settle = nothing.recording.settle
-        trouble = self._carry_out(nothing, self._stream(()), seconds=settle, check=watch.check)
+        trouble = self._carry_out(nothing, self._stream(()), seconds=settle, watch=watch)
         if trouble:
             kind = Runaway if watch.is_astray or watch.is_too_far else HardwareError
             raise kind(f"while the carts came to rest, {trouble}")
@@ -285,10 +281,18 @@ class Session:
         ------
         Stopped : the whole session is to end.
         """
-        wish = self._buttons.pressed
-        if wish == "stop":
-            raise Stopped("by hand")
-        return BY_HAND[wish] if wish else ""
+        self.wish = self._buttons.pressed
+        match self.wish:
+            case "stop":
+                raise Stopped("by hand")
+            case "skip":
+                return "skipped by hand"
+            case "keep":
+                return "ended by hand"
+            case "repeat":
+                return "ended by hand, to be repeated"
+            case None:
+                return ""
 
     def _carry_out(
         self,
@@ -296,7 +300,7 @@ class Session:
         stream: Stream,
         *,
         seconds: float,
-        check: Callable[[Sequence[Reading]], str],
+        watch: LineWatch,
         begin: Callable[[], None] = lambda: None,
         arrived: Callable[[bytes], None] = lambda data: None,
     ) -> str:
@@ -308,7 +312,7 @@ class Session:
         try:
             self._start(order.commands)
             begin()
-            partial = self._listen(stream, seconds=seconds, arrived=arrived, check=check)
+            partial = self._listen(stream, seconds=seconds, arrived=arrived, watch=watch)
         finally:
             self._stop(always=bool(partial))
         return partial
@@ -362,8 +366,8 @@ class Session:
         stream: Stream,
         *,
         seconds: float,
-        check: Callable[[Sequence[Reading]], str],
-        arrived: Callable[[bytes], None] = lambda data: None,
+        watch: LineWatch,
+        arrived: Callable[[bytes], None],
     ) -> str:
         """Read lines until the run is over; return why it ended early, or ""."""
         end = 1e3 * seconds
@@ -377,24 +381,24 @@ class Session:
                 arrived(data)
                 last = now
                 lines = stream.feed(data, since=since, now=now)
-                if trouble := check(lines):
+                if trouble := watch.check(lines):
                     return trouble
                 if stream.broken:
                     return stream.broken
                 if lines:
                     first, unread = lines[0].ms if first is None else first, None
-                    if lines[-1].ms - first > end + NEARLY:
-                        return f"{STOPPED}the bench went on past the end of the run"
+                    if lines[-1].ms - first > end + _NEARLY:
+                        return watch.stop("the bench went on past the end of the run")
                 else:
                     unread = now if unread is None else unread
-                    if now - unread > UNREADABLE:
-                        return f"{STOPPED}what the bench sends cannot be read: nothing is watched"
+                    if now - unread > 0.25:  # s: the motor may be on, and nobody sees
+                        return watch.stop("what the bench sends cannot be read: nothing is watched")
             if why := self._by_hand():  # after the limits: what they say is never unsaid
                 return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
                 return ""
-            if stream.latest >= end - NEARLY and quiet > 2 * _AFTER_END + SILENCE / 2:
+            if stream.latest >= end - _NEARLY and quiet > 2 * _AFTER_END + SILENCE / 2:
                 return ""
             if quiet > (SILENCE if stream.latest >= 0 else FIRST_LINE):
                 return (

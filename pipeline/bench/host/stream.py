@@ -13,21 +13,11 @@ import numpy as np
 from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
-from pipeline.bench.thresholds import (
-    CROWD,
-    CROWDED,
-    DRIVEN,
-    LATE,
-    LEAP,
-    MOVED,
-    NEIGHBOUR_MOVED,
-    SPIKE,
-    WINDOW,
-)
 
-_LONGEST_LINE = 512  # bytes; more without an end is noise
-_ODD = 0.005  # of the expected period: how far off a clock may well be
-_FORGET = 1.0  # s after which the two clocks are set by one another anew
+# An encoder that stands still in a window (ms) though it moved in the one before and the motor
+# drives on as much (duty counts; less moves no cart) is stuck; so is one that never moved, of the
+# driven cart, or beside a neighbour that did.
+_WINDOW, _DRIVEN = 1000, 8
 
 
 class Stream:
@@ -110,7 +100,7 @@ class Stream:
         clock that runs on): a host that was busy elsewhere does not make lines late.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")
-        if len(self._tail) > _LONGEST_LINE:
+        if len(self._tail) > 512:  # bytes without an end: noise
             lines.append(self._tail)
             self._tail = b""
         valid: list[Reading] = []
@@ -166,16 +156,17 @@ class Stream:
         if before is not None and _stands_out(before, held, after, closed=self._closed):
             self._reject()
             return []
-        if held.ms - last > LEAP:
+        if held.ms - last > 1000:
             return self._break(
                 f"the bench's stamps leap from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
                 "its clock, or a second in which no line came"
             )
         self._keep(held)
-        if self.lines > CROWD:
-            went_on = held.ms - self._stamps[-1 - CROWD]
-            if went_on < CROWDED * CROWD * self._expected:
-                self._break(f"the bench's clock stands still: {CROWD} lines in {went_on} ms of it")
+        if self.lines > 500:
+            went_on = held.ms - self._stamps[-501]
+            # Half of their time would be another period, less is a clock that stands still.
+            if went_on < 0.25 * 500 * self._expected:
+                self._break(f"the bench's clock stands still: 500 lines in {went_on} ms of it")
         return [held]
 
     def _break(self, why: str) -> list[Reading]:
@@ -190,10 +181,11 @@ class Stream:
 
     def _time(self, reading: Reading, *, since: float, now: float) -> None:
         due = 1e-3 * reading.ms
-        if now - self._lead_from > _FORGET:
+        if now - self._lead_from > 1.0:  # s; then the two clocks are set by one another anew
             self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
         self._new_lead = min(self._new_lead, now - due)
-        self._late += since - due > min(self._lead, self._new_lead) + LATE
+        # 0.02 s behind the earliest lines: they waited somewhere for one another.
+        self._late += since - due > min(self._lead, self._new_lead) + 0.02
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
@@ -202,7 +194,8 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
         return True
     if held.ms < before.ms:
         return True
-    room = SPIKE * max(1, after.ms - before.ms)
+    # A hit on an end stop makes a true reading stand out by so many counts a line.
+    room = 32 * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
     if not closed:
@@ -228,13 +221,13 @@ class _MissingSoFar:
         """Take note of a stamp."""
         self._stamps.append(ms)
         span, count = ms - self._stamps[0], len(self._stamps) - 1
-        if span < WINDOW or not count:
+        if span < _WINDOW or not count:
             return
         if (even := even_period(np.array(self._stamps))) is not None:
             self._period, self._seen_even = even, True
         else:
             measured = span / count
-            near = abs(measured / self._expected - 1) < _ODD
+            near = abs(measured / self._expected - 1) < 0.005  # so far off a clock may well be
             first = self._period == self._expected
             if near and not self._seen_even and (first or measured < self._period):
                 self._period = measured
@@ -259,13 +252,13 @@ class _EncoderWatch:
     def stuck(self) -> int:
         """How many encoders froze while driven on, or never moved though their carts had to."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
-        pushed = self._driven.width >= DRIVEN
+        pushed = self._driven.width >= _DRIVEN
         never = {
             encoder
             for encoder, width in moved.items()
             if width == 0
             and pushed
-            and (encoder == 0 or max(moved.values()) >= NEIGHBOUR_MOVED)
+            and (encoder == 0 or max(moved.values()) >= 200)
             and self._earlier is not None  # a run of less than a window tells nothing
         }
         return len(self._frozen | never)
@@ -286,7 +279,7 @@ class _EncoderWatch:
         duties = [reading.duty for reading in readings]
         self._duty.widen(duties)
         self._driven.widen(duties)
-        if readings[-1].ms - self._start >= WINDOW:
+        if readings[-1].ms - self._start >= _WINDOW:
             self._close(readings[-1].ms)
 
     def _close(self, ms: int) -> None:
@@ -294,11 +287,11 @@ class _EncoderWatch:
         duty = self._duty.width
         if self._earlier is not None:
             earlier, earlier_duty = self._earlier
-            if duty >= max(DRIVEN, earlier_duty / 2):
+            if duty >= max(_DRIVEN, earlier_duty / 2):
                 self._frozen |= {
                     encoder
                     for encoder, width in widths.items()
-                    if width == 0 and earlier[encoder] >= MOVED
+                    if width == 0 and earlier[encoder] >= 20
                 }
         self._earlier, self._start = (widths, duty), ms
         self._ranges = {encoder: _Range() for encoder in self._encoders}

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol, get_args
 
-from pipeline.bench.planning.plan import Plan, Recording
 from pipeline.bench.protocol.messages import Reading
+from pipeline.experiments.plan import Plan, Recording
 
 Wish = Literal["stop", "skip", "keep", "repeat"]
 WISHES: tuple[Wish, ...] = get_args(Wish)
@@ -53,6 +53,8 @@ class RunOutcome:
     partial : why it ended early; "": it did not.
     remarks : what a person should know, a sentence each.
     is_astray : the bench did what nothing told it to: nothing more is asked of it.
+    is_unsafe : to go on was not safe: the same is not tried again.
+    wish : the button that ended it; None: none did.
     """
 
     recording: Recording
@@ -61,6 +63,8 @@ class RunOutcome:
     partial: str = ""
     remarks: tuple[str, ...] = field(default=())
     is_astray: bool = False
+    is_unsafe: bool = False
+    wish: Wish | None = None
 
 
 class Observer(Protocol):

@@ -13,15 +13,12 @@ from rich.table import Table
 from rich.text import Text
 
 from pipeline.bench.live.observer import Anomalies, RunOutcome
-from pipeline.bench.planning.plan import Plan, Recording
-from pipeline.bench.planning.plan_words import session_time, time_words
 from pipeline.bench.protocol.messages import Reading
 from pipeline.errors import ConfigError
+from pipeline.experiments.plan import Plan, Recording
+from pipeline.experiments.plan_words import session_time, time_words
 
 _BARS = "▁▂▃▄▅▆▇█"
-_WIDTH = 60  # characters of a sparkline
-_RATE_OVER = 2.0  # s
-_REFRESH = 8.0  # Hz
 
 
 class Terminal:
@@ -39,7 +36,7 @@ class Terminal:
         self._live = Live(
             get_renderable=self._view.render,
             console=self._console,
-            refresh_per_second=_REFRESH,
+            refresh_per_second=8.0,
             transient=True,
         )
 
@@ -159,11 +156,11 @@ class _View:
         last, now = batch[-1], time.monotonic()
         self._ms, self._anomalies = last.ms, anomalies
         if len(self._traces) != len(last.counts):
-            self._traces = [deque(maxlen=_WIDTH) for _ in last.counts]
+            self._traces = [deque(maxlen=60) for _ in last.counts]  # characters of a sparkline
         for trace, count in zip(self._traces, last.counts, strict=True):
             trace.append(count)
         self._arrived.append((now, len(batch)))
-        while now - self._arrived[0][0] > _RATE_OVER:
+        while now - self._arrived[0][0] > 2.0:  # s
             self._arrived.popleft()
 
     def render(self) -> Group:

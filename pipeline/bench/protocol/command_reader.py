@@ -22,9 +22,7 @@ from pipeline.bench.protocol.messages import (
 _LONGEST_FIELD = 32  # characters
 _LARGEST_NUMBER = 1e9
 _LARGEST_AMPLITUDE = 1_000_000
-_HIGHEST_HARMONIC = 10_000
 _MOST_PHASE = 10.0  # rad, more than a turn
-_MOST_CYCLES = 1_000_000
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 
@@ -117,7 +115,7 @@ def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tup
     frequency = _number_within(*FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)
     amplitude = _whole_within(-_LARGEST_AMPLITUDE, _LARGEST_AMPLITUDE)
-    cycles = _whole_within(1, _MOST_CYCLES)
+    cycles = _whole_within(1, 1_000_000)
     stock = {
         "d": (_one_of(waves), _one_of("oc"), _one_of("ot"), frequency, amplitude, cycles),
         "g": (gain,) * 3,
@@ -127,7 +125,7 @@ def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tup
         "f": (gain,) * (2 * encoders + 1),
         "c": (frequency,),
         "m": (
-            _whole_within(0, _HIGHEST_HARMONIC),
+            _whole_within(0, 10_000),
             _number_within(-1.0, 1.0),
             _number_within(-_MOST_PHASE, _MOST_PHASE),
         ),

@@ -11,23 +11,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.bench.thresholds import (
-    ALIKE,
-    BY_CHANCE,
-    CLOSEST_TEETH,
-    FEWEST_EVEN,
-    MOST_ABSENT,
-    OTHER_PERIOD,
-    PIECE,
-    SLOW,
-    STRIP,
-    TOOTH_SLACK,
-)
-
 Stamps = NDArray[np.int64]
 
+OTHER_PERIOD = 0.02  # of a period: no clock is so far off the one that is stated
+_SLOW = 1.5  # ms; from this period on each difference tells by itself
+_MOST_ABSENT = 0.2  # of the stamps; more is a slower clock
+_CLOSEST_TEETH = 20  # a clock of 1.05 ms; one further off is no bench's that aims at 1 kHz
+_TOOTH_SLACK = 1  # ms a tooth may be off: stamps are rounded
 _FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps tried as the comb's first two teeth
-_RECENT = 16  # teeth the spacing is told from, for a clock that drifts
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,25 +51,26 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
         return measured
     steps, span = np.diff(stamps), int(stamps[-1] - stamps[0])
     missing = max(0, round(span / period) + 1 - n)
-    if stated and missing > MOST_ABSENT * span / period:
+    if stated and missing > _MOST_ABSENT * span / period:
         return StampFit(period=period, missing=missing)
     usual = float(np.median(steps))
-    if usual >= SLOW:
-        measured = float(steps[steps < usual + SLOW].mean())  # rounding makes two usual steps
+    if usual >= _SLOW:
+        measured = float(steps[steps < usual + _SLOW].mean())  # rounding makes two usual steps
         lost = int((np.round(steps / measured) - 1).clip(min=0).sum())
         return StampFit(period=span / (n - 1 + lost), missing=lost)
-    if span + 1 - np.unique(stamps).size > MOST_ABSENT * span:  # or the clock has leapt
-        if stated or period >= 1 / (1 - MOST_ABSENT):
+    if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has leapt
+        if stated or period >= 1 / (1 - _MOST_ABSENT):
             return StampFit(period=period, missing=missing)
         return StampFit(period=span / (n - 1), missing=0)  # not the bench that is expected
-    if not 1.0 <= period < 1.0 + 1.0 / CLOSEST_TEETH:
+    if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
         return StampFit(period=period, missing=missing)
     seen = np.zeros(span + 1, dtype=np.bool_)
     seen[stamps - stamps[0]] = True
     absent = np.flatnonzero(~seen).tolist()
     teeth = _comb(absent)
-    chance = (1 + 2 * TOOTH_SLACK) * len(absent) / span  # that a tooth is there though it is none
-    if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < BY_CHANCE:
+    chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # of a tooth that is none
+    # Losses look like this comb by chance less often than once in a hundred runs.
+    if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < 0.01:
         spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
         return StampFit(period=spacing / (spacing - 1), missing=len(absent) - len(teeth))
     skips = round(span * (1 - 1 / period))
@@ -89,7 +81,8 @@ def even_period(stamps: Stamps) -> float | None:
     """Return the period of stamps that one even clock explains without a loss, else None."""
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
     slope = float(i @ stamps / (i @ i))
-    return slope if slope > 0 and np.ptp(stamps - slope * i) < STRIP else None
+    # Stamps of one even clock lie within 1 ms of a line; a loss makes it 1.5 or more.
+    return slope if slope > 0 and np.ptp(stamps - slope * i) < 1.25 else None
 
 
 def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
@@ -97,16 +90,17 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
     Lines that a bench loses leave no long piece even, unless they are few.
     """
-    pieces = [stamps[i : i + PIECE + 1] for i in range(0, stamps.size - PIECE, PIECE)]
+    long = 200  # lines of a piece, which mostly lacks some if one in a hundred is lost
+    pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
     even = [period for piece in pieces if (period := even_period(piece)) is not None]
-    if len(even) < max(FEWEST_EVEN * len(pieces), 1):
+    if len(even) < max(0.25 * len(pieces), 1):
         return None
     measured = float(np.median(even))
-    if abs(measured / stated - 1) <= OTHER_PERIOD or max(even) - min(even) > ALIKE * measured:
+    if abs(measured / stated - 1) <= OTHER_PERIOD or max(even) - min(even) > 0.01 * measured:
         return None
     span = int(stamps[-1] - stamps[0])
     missing = sum(
-        max(0, round(int(piece[-1] - piece[0]) / measured) - PIECE)
+        max(0, round(int(piece[-1] - piece[0]) / measured) - long)
         for piece in pieces
         if even_period(piece) is None
     )
@@ -130,14 +124,14 @@ def _comb(absent: Sequence[int]) -> list[int]:
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
     """Return the teeth from the first two on; [] where one is missing before the end."""
-    if second - first < CLOSEST_TEETH:
+    if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]
     while True:
-        back = teeth[-_RECENT:]
+        back = teeth[-16:]  # a clock may drift
         # Two teeth tell their spacing to a millisecond, many to a fraction of it.
         expected = back[-1] + (back[-1] - back[0]) / (len(back) - 1)
-        slack = TOOTH_SLACK + 1.0 / (len(back) - 1)
+        slack = _TOOTH_SLACK + 1.0 / (len(back) - 1)
         low, high = int(np.ceil(expected - slack)), int(np.floor(expected + slack))
         if high > last:
             return teeth

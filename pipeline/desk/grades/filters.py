@@ -5,11 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from urllib.parse import urlencode
 
-from pipeline.desk.books import Class, Team
+from pipeline.desk.books import Class
+from pipeline.grading.grade import CODES
+from pipeline.grading.gradebook.open_book import Listing
 from pipeline.grading.words import WORDS
-from pipeline.schemas.grade import CODES
 
-_STATES: Mapping[str, tuple[str, Callable[[Team], bool]]] = {
+_STATES: Mapping[str, tuple[str, Callable[[Listing], bool]]] = {
     "failed": ("could not be graded", lambda team: team.line.status == "failed"),
     "late": ("late", lambda team: team.line.days_late > 0),
     "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
@@ -49,7 +50,7 @@ class Filter:
         """The address's end that asks for it."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
-    def chosen(self, shown: Class) -> list[Team]:
+    def chosen(self, shown: Class) -> list[Listing]:
         """Return the teams that it is about, in its order."""
         return [team for team in self.ordered(shown) if self._takes(team, shown)]
 
@@ -57,16 +58,16 @@ class Filter:
         """Return who is before and after a team among the chosen, or ""; it may be none of them."""
         before, after, passed = "", "", False
         for team in self.ordered(shown):
-            if team.line.name == name:
+            if team.line.submission == name:
                 passed = True
             elif self._takes(team, shown):
                 if passed:
-                    after = team.line.name
+                    after = team.line.submission
                     break
-                before = team.line.name
+                before = team.line.submission
         return before, after
 
-    def ordered(self, shown: Class) -> Sequence[Team]:
+    def ordered(self, shown: Class) -> Sequence[Listing]:
         """Return the whole class in its order."""
         teams = list(shown.teams.values())
         if self.order == "points":
@@ -75,7 +76,7 @@ class Filter:
             teams.sort(key=lambda team: -team.line.days_late)
         return teams
 
-    def _takes(self, team: Team, shown: Class) -> bool:
+    def _takes(self, team: Listing, shown: Class) -> bool:
         line = team.line
         if self.flag and self.flag not in line.codes:
             return False
@@ -83,10 +84,12 @@ class Filter:
             return False
         if self.state in _STATES and not _STATES[self.state][1](team):
             return False
-        if self.lost and line.name not in shown.lost.get(self.lost, ()):
+        if self.lost and line.submission not in shown.lost.get(self.lost, ()):
             return False
         wanted = self.q.casefold()
-        return not wanted or any(wanted in text.casefold() for text in (line.name, *line.authors))
+        return not wanted or any(
+            wanted in text.casefold() for text in (line.submission, *line.authors)
+        )
 
     def fields(self, shown: Class) -> list[dict]:
         """Return the choices of a form, each with how many there are."""

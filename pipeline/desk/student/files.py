@@ -8,14 +8,16 @@ from itertools import count
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO
 
-from pipeline.desk.jobs import Failed, Hand
+from pipeline.desk.ask import Said
+from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.scratch import scratch_folder
 from pipeline.desk.student.handin import BESIDE
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.unpack import HAND_IN, is_debris
-from pipeline.ingest.formats.table import ENDINGS
+from pipeline.ingest.formats.recognise import ENDINGS
 from pipeline.lock import turn_in
 from pipeline.output import own_folder, write_file
+from pipeline.processes import Failed
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import (
     MAX_DATA_BYTES,
@@ -28,15 +30,14 @@ from pipeline.submission.toml_file import decoded, parse_toml
 
 # Texts that a packed submission brings, and their most bytes; what is there and sound stays.
 _TEXTS = {NAME: MAX_TOML_BYTES, "notes.md": MAX_NOTES_BYTES}
-_UNFIT = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$')  # in no name, on any system
-_RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
-_LONGEST = 120  # bytes of a name, whatever letters it has: systems take 255, some fewer
 _ASIDE = "set-aside"  # where recordings go that are not to be part of it
 
 
-def take_uploads(sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, hand: Hand) -> list[str]:
+def take_uploads(
+    sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, workers: WorkerPool
+) -> list[Said]:
     """Store uploaded files, and what is in archives; return what a person would not expect."""
-    said: list[str] = []
+    said: list[Said | None] = []
     with scratch_folder() as scratch:
         files: list[tuple[str, BinaryIO | Path]] = []
         for number, (name, content) in enumerate(sent):
@@ -44,30 +45,34 @@ def take_uploads(sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, hand: Ha
                 files.append((name, content))
                 continue
             try:
-                files += _unpacked(content, scratch / str(number), hand=hand)
+                files += _unpack(content, scratch / str(number), workers=workers)
             except (SubmissionError, Failed) as error:
-                said.append(f"{quote(name)}: not taken: {error}")
+                said.append(_refuse(name, error))
         with turn_in(folder):
             room = _Room(folder)
             for name, given in files:
                 try:
-                    with _opened(given) as file:
+                    with _open(given) as file:
                         said.append(_take(name, file.read(MAX_DATA_BYTES + 1), folder, room=room))
                 except SubmissionError as error:
-                    said.append(f"{quote(name)}: not taken: {error}")
+                    said.append(_refuse(name, error))
     return [line for line in said if line]
 
 
-def _opened(given: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
+def _refuse(name: str, error: Exception) -> Said:
+    return Said(f"{quote(name)}: not taken: {error}", "refused")
+
+
+def _open(given: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
     return given.open("rb") if isinstance(given, Path) else nullcontext(given)
 
 
-def _unpacked(content: BinaryIO, scratch: Path, *, hand: Hand) -> list[tuple[str, Path]]:
+def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tuple[str, Path]]:
     scratch.mkdir()
     archive, into = scratch / "upload.zip", scratch / "files"
     with archive.open("xb") as file:
         shutil.copyfileobj(content, file)
-    members = hand.do("unpack", archive=str(archive), into=str(into))
+    members = workers.do("unpack_upload", archive=str(archive), into=str(into))
     return [(name, into / name) for name in members if not is_debris(PurePosixPath(name))]
 
 
@@ -94,7 +99,7 @@ class _Room:
         self._files, self._bytes = self._files + 1, self._bytes + len(raw)
 
 
-def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
+def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
     """Store a file, under another name where its own is of something else; say if so."""
     last = PurePosixPath(given.replace("\\", "/")).name
     if last in _TEXTS:
@@ -103,25 +108,30 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> str:
             raise SubmissionError("there is one already, which stays as it is")
         room.check(raw)
         write_file(folder / last, raw)
-        return ""
+        return None
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"a recording ends in {', '.join(ENDINGS)}")
     seen = "".join(c if c.isprintable() else "-" for c in last)  # blanks of all sorts, marks
-    name = _UNFIT.sub("-", seen.encode(errors="ignore")[-_LONGEST:].decode(errors="ignore"))
-    if _RESERVED.fullmatch(name):
+    # Bytes, whatever letters it has: systems take 255, some fewer.
+    name = seen.encode(errors="ignore")[-120:].decode(errors="ignore")
+    # What stands in no name on some system, and names that Windows keeps for itself.
+    name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
+    if re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name):
         name = f"data-{name}"
-    names = _names(own_folder(folder, "data") / name)
-    target = next(path for path in names if not _there(path) or _holds(path, raw))
-    if _there(target):
-        return f"{quote(last)}: is there already"
+    names = _list_names(own_folder(folder, "data") / name)
+    target = next(path for path in names if not _is_there(path) or _holds(path, raw))
+    if _is_there(target):
+        return Said(f"{quote(last)}: is there already", "changed")
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)
     why = "" if seen == last else "; no name may have characters that do not show"
-    return f"{quote(last)}: taken as {target.name}{why}" if target.name != last else ""
+    if target.name == last:
+        return None
+    return Said(f"{quote(last)}: taken as {target.name}{why}", "changed")
 
 
-def _there(path: Path) -> bool:
+def _is_there(path: Path) -> bool:
     return path.exists() or path.is_symlink()
 
 
@@ -129,7 +139,7 @@ def _holds(path: Path, raw: bytes) -> bool:
     return not path.is_symlink() and path.is_file() and path.read_bytes() == raw
 
 
-def _names(path: Path) -> Iterator[Path]:
+def _list_names(path: Path) -> Iterator[Path]:
     """Yield a path, then those beside it that it may have instead."""
     yield path
     for number in count(2):
@@ -145,8 +155,8 @@ def put_aside(file: str, folder: Path) -> str:
     """
     aside = own_folder(folder, _ASIDE)
     aside.mkdir(exist_ok=True)
-    names = _names(aside / PurePosixPath(file).name)
-    target = next(path for path in names if not _there(path))
+    names = _list_names(aside / PurePosixPath(file).name)
+    target = next(path for path in names if not _is_there(path))
     try:
         (folder / file).rename(target)
     except FileNotFoundError:

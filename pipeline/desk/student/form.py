@@ -1,31 +1,67 @@
 """The form of `submission.toml`: its keys as fields, and what was typed back into the file.
 
 What was typed goes into the file as it was typed, digits and all, and the submission's own check
-says what is wrong with it: nothing is checked twice.
+says what is wrong with it: nothing is checked twice. What explains a field, and how it is typed, is
+what the submission's model says of its key.
 """
 
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
 import tomlkit
+from tomlkit.items import AoT, Comment, Null
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.fill import unit_doubt
+from pipeline.ingest.fill import UNSURE
 from pipeline.names import parameter_names, read_name
-from pipeline.report.words import symbol_text
-from pipeline.resources import TEMPLATES
-from pipeline.submission.edit import toml_item
+from pipeline.set_up import Units
+from pipeline.submission import Submission
+from pipeline.submission.edit import comment_text, toml_item
 from pipeline.submission.load import InvalidSubmission, spring_names
 from pipeline.submission.models import MOST_CARTS
+from pipeline.words.text import symbol_text
 
-_NUMBER = re.compile(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?")
-_INLINE = ("input", "position", "controller", "columns")  # tables that stand in one line
-_BLANK = ("title", "section")  # keys that stay where nothing is said, and their comments
-_KEPT = ("system", "experiments")  # tables that stay where nothing is left in them
+# The groups of the form: key, title, keys of the file. Between the last two stand the parameters,
+# whose names depend on the number of carts.
+_GROUPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
+    ("who", "Who and what", ("title", "section", "authors")),
+    (
+        "bench",
+        "The bench",
+        ("system.carts", "system.springs", "system.position.unit", "system.position.per_count",
+         "system.input.unit", "system.input.sign", "system.input.per_count", "system.columns"),
+    ),
+    (
+        "design",
+        "The controller you are asked for",
+        ("design.cart", "design.reference", "design.overshoot_percent", "design.settling_time",
+         "design.input_limit", "design.sample_time", "design.method"),
+    ),
+    (
+        "model",
+        "Your state model and controller",
+        ("reported.state_space.A", "reported.state_space.B", "reported.feedback.gains",
+         "reported.feedback.prefilter", "reported.feedback.overshoot_percent",
+         "reported.feedback.settling_time"),
+    ),
+)  # fmt: skip
+_OF_EXPERIMENT = ("kind", "carts", "frequency", "window", "note", "columns", "sample_rate")
+_OF_LOOP = (
+    "controlled_cart", "reference", "controller.type", "controller.gains", "controller.prefilter",
+    "controller.kp", "controller.ki", "controller.kd", "controller.scale", "controller.cart",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """A way to answer what is asked about a field: the words of a button, and what it types."""
+
+    label: str
+    value: str
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +70,12 @@ class Field:
 
     Attributes
     ----------
-    asked : what speaks against the value, though it can be used.
+    kind : text, number, numbers, rows (of numbers, a line each), flags, authors, columns, or words
+        (a text of several lines).
+    choices : to choose from; "": left out.
+    asked : what speaks against the value, though it can be used; `answers` to it.
     names : of the flags.
+    symbol : of the parameter whose value it is.
     """
 
     path: str
@@ -47,6 +87,8 @@ class Field:
     value: str = ""
     wrong: str = ""
     asked: str = ""
+    answers: tuple[Answer, ...] = ()
+    symbol: str = ""
 
     @property
     def on(self) -> list[bool]:
@@ -56,20 +98,18 @@ class Field:
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Fields that belong together."""
+    """Fields that belong together; `summary` says them in a line, `missing` what they lack."""
 
+    key: str
     title: str
     fields: tuple[Field, ...]
-    optional: bool = False
+    summary: str = ""
+    missing: str = ""
 
     @property
     def open(self) -> bool:
-        """Whether to show it at once: something stands in it, or it is needed."""
-        return not self.optional or any(field.value or field.wrong for field in self.fields)
-
-    def filled(self, fields: Mapping[str, Field]) -> "Group":
-        """Return the group with fields of other values."""
-        return replace(self, fields=tuple(fields[field.path] for field in self.fields))
+        """Whether to show it at once: something in it needs a person."""
+        return bool(self.missing) or any(field.wrong for field in self.fields)
 
 
 def read_document(text: str) -> dict[str, Any]:
@@ -80,68 +120,57 @@ def read_document(text: str) -> dict[str, Any]:
         return {}
 
 
-def groups(document: Mapping[str, Any]) -> list[Group]:
+def fill_form(document: Mapping[str, Any]) -> list[Group]:
     """Return the form of a submission, filled in from its file."""
-    carts = _carts(document)
-    found = []
-    for entry in _catalogue()["groups"]:
-        fields = [_field(one, one["path"]) for one in entry["fields"]]
-        optional = entry.get("optional", False)
-        found.append(Group(title=entry["title"], fields=tuple(fields), optional=optional))
-    rigid = carts == 1 and _at(document, "system.springs") == [False, False]
-    units = {
-        key: str(_at(document, f"system.{key}.unit") or unit)
-        for key, unit in (("position", "count"), ("input", "V"))
-    }
+    *first, last = [
+        Group(key=key, title=title, fields=tuple(map(_describe_field, paths)))
+        for key, title, paths in _GROUPS
+    ]
+    carts = count_carts(document)
+    rigid = carts == 1 and _find(document, "system.springs") == [False, False]
+    units = Units(
+        position=str(_find(document, "system.position.unit") or "count"),
+        input=str(_find(document, "system.input.unit") or "V"),
+    )
     claims = tuple(
         Field(
             path=f"reported.{which}.{name}",
             label=f"{symbol_text(name)} {which}",
-            help=read_name(name).unit(**units),
+            symbol=symbol_text(name),
+            help=read_name(name).unit(units),
             kind="number",
         )
         for name in parameter_names(carts, rigid=rigid)
         for which in ("initial", "final")
     )
-    found.insert(3, Group(title="Your numbers", fields=claims, optional=True))
-    return [replace(group, fields=_filled(group.fields, document, carts)) for group in found]
+    groups = [*first, Group(key="numbers", title="Your numbers", fields=claims), last]
+    return [replace(group, fields=_fill(group.fields, document)) for group in groups]
 
 
-def asked_for_unit(fields: Iterable[Field], fractions: Sequence[str]) -> tuple[Field, ...]:
-    """Return the fields, with what speaks against the unit of positions; see `unit_doubt`."""
-    path = "system.position.unit"
-    return tuple(
-        replace(field, asked=unit_doubt(field.value or "count", fractions=fractions))
-        if field.path == path
-        else field
-        for field in fields
-    )
-
-
-def field_text(document: Mapping[str, Any], field: Field) -> str:
-    """Return the value of a field in another state of the file."""
-    return _fill(field, document, _carts(document)).value
-
-
-def experiment_fields(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
+def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
     """Return the fields of one experiment, filled in from its table."""
-    entries = [*_catalogue()["experiment"]]
-    if _at(document, f"experiments.{index}.kind") == "closed_loop":
-        entries += _catalogue()["loop"]
-    fields = [_field(one, f"experiments.{index}.{one['path']}") for one in entries]
-    return _filled(fields, document, _carts(document))
+    table = f"experiments.{index}"
+    is_loop = _find(document, f"{table}.kind") == "closed_loop"
+    first, rest = _OF_EXPERIMENT[:2], _OF_EXPERIMENT[2:]
+    keys = (*first, *_OF_LOOP, *rest) if is_loop else _OF_EXPERIMENT
+    return _fill([_describe_field(f"{table}.{key}") for key in keys], document)
 
 
-def typed(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list[Field]:
-    """Return the fields whose value was changed, with what was typed.
+def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list[Field]:
+    """Return the fields whose value was changed or answered, with what was typed.
 
     Parameters
     ----------
     form : by path, what was typed; a field that is not in it was not shown.
-    values : likewise, of flags: the numbers of those that are on.
+    values : likewise, of flags: the numbers of those that are on; and of `answer`: the path of a
+        field that was asked about, "=" and the value that was chosen, perhaps the old one.
     """
     changed = []
+    answered = dict(one.partition("=")[::2] for one in values("answer"))
     for field in fields:
+        if field.path in answered:
+            changed.append(replace(field, value=answered[field.path]))
+            continue
         if field.kind == "flags":
             on = values(field.path)
             text = " ".join("true" if str(i) in on else "false" for i in range(len(field.names)))
@@ -154,7 +183,7 @@ def typed(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list
     return changed
 
 
-def with_errors(
+def mark_errors(
     fields: Sequence[Field], changed: Sequence[Field], error: SubmissionError | None
 ) -> tuple[tuple[Field, ...], list[str]]:
     """Return the fields as typed, each with what is wrong with it, and what belongs to none."""
@@ -174,59 +203,91 @@ def with_errors(
     return tuple(shown), left
 
 
-def apply(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> None:
-    """Write what was typed into a document; an emptied field takes its key away."""
-    for field in changed:
-        if field.path == "authors":
-            _set_authors(document, field.value)
-        else:
-            empty = not field.value and field.path not in _BLANK
-            _set(document, field.path.split("."), None if empty else _item(field))
-        if field.path == "system.carts":  # springs for another number of carts: all are there
-            _set(document, ["system", "springs"], None)
-
-
-def remove_experiment(document: tomlkit.TOMLDocument, index: int) -> None:
-    """Take the table of one experiment away; its file stays."""
-    tables: Any = document["experiments"]
-    if index < len(tables):
-        del tables[index]
-
-
-# --------------------------------------------------------------------------- values
+# ------------------------------------------------------------------- a key as a field
 
 
 @cache
-def _catalogue() -> dict[str, Any]:
-    return tomllib.loads((TEMPLATES / "desk" / "fields.toml").read_text(encoding="utf-8"))
+def _schema() -> dict[str, Any]:
+    return Submission.model_json_schema()
 
 
-def _field(entry: Mapping[str, Any], path: str) -> Field:
-    return Field(**{**entry, "path": path, "choices": tuple(entry.get("choices", ()))})
+def _variants(node: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the JSON Schemas that a value may be of, without that of nothing."""
+    for key in ("anyOf", "oneOf"):
+        if key in node:
+            return [found for one in node[key] for found in _variants(one)]
+    if "$ref" in node:
+        return _variants(_schema()["$defs"][node["$ref"].rpartition("/")[2]])
+    return [] if node.get("type") == "null" else [dict(node)]
 
 
-def _carts(document: Mapping[str, Any]) -> int:
-    carts = _at(document, "system.carts")
+def _describe_field(path: str) -> Field:
+    """Return the empty field of a key, by what the submission's model says of it."""
+    tables, keys, required = [_schema()], [], True
+    for part in path.split("."):
+        tables = [variant for key in keys for variant in _variants(key)] or tables
+        if part.isdecimal():
+            keys, required = [table["items"] for table in tables], True
+        else:
+            holders = [table for table in tables if part in table["properties"]]
+            keys = [table["properties"][part] for table in holders]
+            required &= all(part in table.get("required", ()) for table in holders)
+    values = [variant for key in keys for variant in _variants(key)]
+    return Field(
+        path=path,
+        label=keys[0]["title"],
+        help=keys[0].get("description", ""),
+        kind=_find_kind(values[0]),
+        choices=_list_choices(values, first=[] if required else ["", keys[0].get("default")]),
+    )
+
+
+def _find_kind(value: Mapping[str, Any]) -> str:
+    """Return how a value is typed; see `Field`."""
+    kind = value["type"]
+    if kind == "array":
+        inner = _variants(value.get("items") or value["prefixItems"][0])[0]["type"]
+        return {"object": "authors", "array": "rows", "boolean": "flags"}.get(inner, "numbers")
+    if kind == "string":
+        return "words" if value.get("maxLength", 0) > 200 else "text"
+    return {"object": "columns"}.get(kind, "number")
+
+
+def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) -> tuple[str, ...]:
+    """Return what can be chosen, () where anything can be typed; that which is `first` first."""
+    every = [
+        choice
+        for value in values
+        for choice in (value.get("enum") or ([value["const"]] if "const" in value else []))
+    ]
+    if values[0]["type"] == "integer" and "maximum" in values[0]:
+        every = list(range(values[0]["minimum"], values[0]["maximum"] + 1))
+    known = [one for one in first if one == "" or one in every] if every else []
+    return tuple(map(str, dict.fromkeys([*known, *every])))
+
+
+# --------------------------------------------------------------- from the file to the form
+
+
+def count_carts(document: Mapping[str, Any]) -> int:
+    """Return how many carts a file says there are; 1 where it says nothing that can be."""
+    carts = _find(document, "system.carts")
     return carts if isinstance(carts, int) and 1 <= carts <= MOST_CARTS else 1
 
 
-def _filled(fields: Iterable[Field], document: Mapping[str, Any], carts: int) -> tuple[Field, ...]:
-    return tuple(_fill(field, document, carts) for field in fields)
-
-
-def _fill(field: Field, document: Mapping[str, Any], carts: int) -> Field:
-    value = _at(document, field.path)
-    if field.kind == "flags":
-        names = tuple(spring_names(carts))
-        flags = (
-            value if isinstance(value, list) and len(value) == len(names) else [True] * len(names)
+def _fill(fields: Iterable[Field], document: Mapping[str, Any]) -> tuple[Field, ...]:
+    springs = tuple(spring_names(count_carts(document)))
+    return tuple(
+        replace(
+            field,
+            names=springs if field.kind == "flags" else (),
+            value=read_value(document, field),
         )
-        text = " ".join("true" if flag else "false" for flag in flags)
-        return replace(field, names=names, value=text)
-    return replace(field, value=_text(field, value))
+        for field in fields
+    )
 
 
-def _at(document: Any, path: str) -> Any:
+def _find(document: Any, path: str) -> Any:
     here = document
     for part in path.split("."):
         try:
@@ -236,42 +297,100 @@ def _at(document: Any, path: str) -> Any:
     return here
 
 
-def _text(field: Field, value: Any) -> str:
-    """Return a value as it is typed."""
+def read_value(document: Mapping[str, Any], field: Field) -> str:
+    """Return the value of a field in some state of the file, as it is typed."""
+    value = _find(document, field.path)
+    if field.kind == "flags":
+        every = [True] * (count_carts(document) + 1)
+        stated = value if isinstance(value, list) and len(value) == len(every) else every
+        return " ".join("true" if flag else "false" for flag in stated)
     if value is None:
         return ""
     if field.kind == "authors" and isinstance(value, list):
-        people = [one for one in value if isinstance(one, dict)]
-        lines = (
-            ", ".join(filter(None, (_row(p.get("id", "")), _row(p.get("name", "")))))
-            for p in people
-        )
-        return "\n".join(lines)
+        people = [
+            [_write_value(person.get(key, "")) for key in ("id", "name")]
+            for person in value
+            if isinstance(person, dict)
+        ]
+        return "\n".join(", ".join(filter(None, person)) for person in people)
     if field.kind == "columns" and isinstance(value, dict):
-        return "\n".join(f"{role} = {_row(column)}" for role, column in value.items())
+        return "\n".join(f"{role} = {_write_value(column)}" for role, column in value.items())
     if field.kind == "rows" and isinstance(value, list):
-        return "\n".join(_row(row) for row in value)
-    return _row(value)
+        return "\n".join(map(_write_value, value))
+    return _write_value(value)
 
 
-def _row(value: Any) -> str:
+def _write_value(value: Any) -> str:
     if isinstance(value, list):
-        return ", ".join(map(_row, value))
+        return ", ".join(map(_write_value, value))
     try:
         return str(value)
     except ValueError:  # a whole number of thousands of digits, which only fits one typed in hex
         return hex(value)
 
 
-def _item(field: Field) -> Any:
+# --------------------------------------------------------------- from the form to the file
+
+
+def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> None:
+    """Write what was typed into a document; an emptied field takes its key away."""
+    for field in changed:
+        if field.path == "authors":
+            _set_authors(document, field.value)
+        else:
+            # Two keys stay where nothing is said, and their comments.
+            empty = not field.value and field.path not in ("title", "section")
+            _set(document, field.path.split("."), None if empty else _make_item(field))
+            _settle(document, field.path)
+        if field.path == "system.carts":  # springs for another number of carts: all are there
+            _set(document, ["system", "springs"], None)
+
+
+def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
+    """Take the mark of a doubt from a key of `[system]`: who wrote the key has answered it."""
+    table, key, *_ = [*path.split("."), ""]
+    item: Any = document.get("system", {}).get(key) if table == "system" else None
+    if item is not None and item.trivia.comment.startswith(f"# {UNSURE}"):
+        item.trivia.comment_ws = item.trivia.comment = ""
+
+
+def clear_marks(document: tomlkit.TOMLDocument, index: int, doubts: Iterable[str]) -> None:
+    """Take the comments that mark these doubts from the table of an experiment."""
+    texts = {f"# {_mark(doubt)}" for doubt in doubts}
+    body: Any = document.get("experiments")
+    if isinstance(body, AoT) and index < len(body):
+        lines = body[index].value.body
+        for place, (_, item) in enumerate(lines):
+            if isinstance(item, Comment) and item.trivia.comment in texts:
+                lines[place] = (None, Null())
+
+
+def is_marked(doubt: str, marks: Sequence[str]) -> bool:
+    """Return whether a doubt is among those that stand marked in a table."""
+    return _mark(doubt) in [UNSURE + mark for mark in marks]
+
+
+def _mark(doubt: str) -> str:
+    """Return the comment that marks a doubt, as it was written: cut where it is long."""
+    return comment_text(UNSURE + doubt)
+
+
+def remove_experiment(document: tomlkit.TOMLDocument, index: int) -> None:
+    """Take the table of one experiment away; its file stays."""
+    tables: Any = document["experiments"]
+    if index < len(tables):
+        del tables[index]
+
+
+def _make_item(field: Field) -> Any:
     """Return what was typed as an item of the file."""
     match field.kind:
-        case "number" | "count":
-            return _number(field.value)
+        case "number":
+            return _make_number(field.value)
         case "flags":
-            return toml_item([word == "true" for word in field.value.split()])
+            return toml_item(field.on)
         case "numbers":
-            return _numbers(field.value)
+            return _make_numbers(field.value)
         case "columns":
             pairs = (line.partition("=")[::2] for line in field.value.splitlines())
             return toml_item(
@@ -283,25 +402,24 @@ def _item(field: Field) -> Any:
         case "rows":
             rows = tomlkit.array()
             for line in field.value.splitlines():
-                rows.append(_numbers(line))
+                rows.append(_make_numbers(line))
             return rows.multiline(True)
     return tomlkit.item(field.value)
 
 
-def _number(text: str) -> Any:
+def _make_number(text: str) -> Any:
     """Return a number with the digits it was typed with; what is none stays text, to be refused."""
-    return tomlkit.parse(f"x = {text}\n")["x"] if _NUMBER.fullmatch(text) else tomlkit.item(text)
+    if re.fullmatch(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?", text):
+        return tomlkit.parse(f"x = {text}\n")["x"]
+    return tomlkit.item(text)
 
 
-def _numbers(text: str) -> Any:
+def _make_numbers(text: str) -> Any:
     array = tomlkit.array()
-    for word in _words(text):
-        array.append(_number(word))
+    for word in re.split(r"[,;\s]+", text.strip("[] ")):
+        if word:
+            array.append(_make_number(word))
     return array
-
-
-def _words(text: str) -> Iterator[str]:
-    return (word for word in re.split(r"[,;\s]+", text.strip("[] ")) if word)
 
 
 def _set(document: Any, parts: Sequence[str], item: Any) -> None:
@@ -318,41 +436,42 @@ def _set(document: Any, parts: Sequence[str], item: Any) -> None:
     if part not in document:
         if item is None:
             return
-        inline = part in _INLINE
         above = bool(rest[1:])  # [reported.final] needs no [reported]
-        document[part] = tomlkit.inline_table() if inline else tomlkit.table(above)
+        in_one_line = part in ("input", "position", "controller", "columns")
+        document[part] = tomlkit.inline_table() if in_one_line else tomlkit.table(above)
     _set(document[part], rest, item)
-    if part not in _KEPT and not document[part]:
+    if part not in ("system", "experiments") and not document[part]:
         del document[part]
 
 
 def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
     """Write the people, one a line; of a table that stays only what was changed is."""
-    people = [line.partition(",")[::2] for line in text.splitlines() if line.strip()]
-    tables: Any = document.get("authors")
+    lines = [line.partition(",")[::2] for line in text.splitlines() if line.strip()]
+    people = [(id_.strip(), name.strip()) for id_, name in lines]
     if not people:
         document.pop("authors", None)
         return
+    tables: Any = document.get("authors")
     if tables is None:
-        new = tomlkit.aot()
-        for id_, name in people:
-            new.append(_author(id_, name))
-        document.append("authors", new)
+        tables = tomlkit.aot()
+        for person in people:
+            tables.append(_make_author(*person))
+        document.append("authors", tables)
         return
-    for i, (id_, name) in enumerate(people):
+    for i, person in enumerate(people):
         if i >= len(tables):
-            tables.append(_author(id_, name))
+            tables.append(_make_author(*person))
             continue
-        for key, value in (("id", id_.strip()), ("name", name.strip())):
+        for key, value in zip(("id", "name"), person, strict=True):
             if str(tables[i].get(key, "")) != value:
                 _set(tables[i], [key], tomlkit.item(value) if value else None)
     while len(tables) > len(people):
         del tables[len(tables) - 1]
 
 
-def _author(id_: str, name: str) -> Any:
+def _make_author(id_: str, name: str) -> Any:
     table = tomlkit.table()
-    table.add("id", id_.strip())
-    if name.strip():
-        table.add("name", name.strip())
+    table.add("id", id_)
+    if name:
+        table.add("name", name)
     return table

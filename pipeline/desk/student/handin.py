@@ -4,17 +4,19 @@ import io
 import zipfile
 from pathlib import Path
 
-from pipeline.desk.last_report import state
+from pipeline.desk.last_report import NOTES, find_state
+from pipeline.errors import SubmissionError
+from pipeline.grading.self_check.log import FILE as CHECKS
 from pipeline.submission import load_submission
 from pipeline.submission.load import NAME, outside
 
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # same files, same bytes
 _REPORT = "report/report.pdf"
-BESIDE = ("notes.md", _REPORT)
+BESIDE = (NOTES, CHECKS, _REPORT)
+_MADE = ("report", "gap", "solution")  # folders of what is computed: no recording lies there
 
 
-def hand_in(folder: Path) -> bytes:
-    """Return the zip of a submission.
+def pack(folder: Path, *, report: bool = True) -> bytes:
+    """Return the zip of a submission; `report`: with its report, if that is up to date.
 
     Raises
     ------
@@ -22,32 +24,47 @@ def hand_in(folder: Path) -> bytes:
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name in held(folder):
-            info = zipfile.ZipInfo(name, _FIXED_TIME)
+        for name in list_held(folder, report=report):
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # same files, same bytes
             archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
 
 
-def held(folder: Path) -> list[str]:
+def list_held(folder: Path, *, report: bool = True) -> list[str]:
     """Return the files that the zip holds.
 
     Raises
     ------
     SubmissionError : the submission is not valid.
     """
-    files = [experiment.file for experiment in load_submission(folder).experiments]
-    return list(dict.fromkeys([NAME, *files, *beside(folder)]))
+    named = [experiment.file for experiment in load_submission(folder).experiments]
+    files = [file for file in named if not _is_made(folder, file)]
+    return list(dict.fromkeys([NAME, *files, *list_beside(folder, report=report)]))
 
 
-def beside(folder: Path) -> list[str]:
+def list_beside(folder: Path, *, report: bool = True) -> list[str]:
     """Return what goes with it: of `BESIDE`, what is there; no report of what was changed since."""
-    left_out = "" if state(folder) == "current" else _REPORT
+    left_out = "" if report and find_state(folder) == "current" else _REPORT
     return [name for name in BESIDE if name != left_out and outside(folder, name) is None]
 
 
-def missing(folder: Path) -> list[str]:
+def list_missing(folder: Path) -> list[str]:
     """Return what keeps a submission from being handed in, each in a line."""
-    submission = load_submission(folder)
+    try:
+        submission = load_submission(folder)
+    except SubmissionError as error:
+        return [str(error)]
     files = dict.fromkeys(experiment.file for experiment in submission.experiments)
     found = [problem for file in files if (problem := outside(folder, file)) is not None]
+    found += [
+        f"{file} is computed from recordings; name the recording itself"
+        for file in files
+        if _is_made(folder, file)
+    ]
     return found or ([] if files else ["there is no experiment in it yet"])
+
+
+def _is_made(folder: Path, name: str) -> bool:
+    """Whether a file lies, also by a link, where what is computed lies: no zip takes that along."""
+    place = (folder / name).resolve()
+    return any(place.is_relative_to((folder / made).resolve()) for made in _MADE)

@@ -14,10 +14,6 @@ from pipeline.results import Estimate, FrequencyResponse
 
 Scale = Literal["log", "magnitude", "polar"]
 
-_LOG_ERROR = 0.05  # added to the error of ln|G|: on the way there no point should rule
-_TABLE_STD = 0.01  # of a magnitude that comes without an error
-_PHASE_KNOWN = 0.5  # rad; a worse phase tells nothing
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
@@ -52,13 +48,15 @@ class Points:
             raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
         std = np.concatenate([r.magnitude_std for r in responses])
         stated = np.isfinite(std) & (std > 0)
-        std = np.where(stated, std, _TABLE_STD * np.maximum(magnitude, np.median(magnitude) / 1e3))
+        # Of a magnitude that comes without an error.
+        std = np.where(stated, std, 0.01 * np.maximum(magnitude, np.median(magnitude) / 1e3))
         phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
         phase_std = [
             np.full(r.omega.size, np.inf) if r.phase_std is None else r.phase_std for r in responses
         ]
         spread = np.concatenate(phase_std)
         distinct, at = np.unique(omega, return_inverse=True)
+        # In rad: a worse phase tells nothing.
         return cls(
             omega=distinct,
             at=at,
@@ -66,7 +64,7 @@ class Points:
             magnitude=magnitude,
             std=std,
             unit=np.exp(-1j * np.concatenate(phase)).astype(np.complex128),
-            phase_std=np.where((spread > 0) & (spread < _PHASE_KNOWN), spread, np.inf),
+            phase_std=np.where((spread > 0) & (spread < 0.5), spread, np.inf),
             from_table=all(r.source == "table" for r in responses) or not stated.any(),
         )
 
@@ -88,7 +86,8 @@ class Points:
     @property
     def level_weight(self) -> Array:
         """One over the error of the level, (N,)."""
-        return 1.0 / np.hypot(self.std / np.exp(self.level), _LOG_ERROR)
+        # Added to the error of ln|G|: on the way there no point should rule.
+        return 1.0 / np.hypot(self.std / np.exp(self.level), 0.05)
 
     def widened(self, share: float) -> "Points":
         """Return the points with a relative error added to those they have."""

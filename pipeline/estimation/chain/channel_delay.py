@@ -6,12 +6,9 @@ late it comes:
     k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}
 
 So each cart's channel has one delay against that of the cart before it with which its own law
-holds best. No derivative is taken: both sides are weighed with a smooth bump that slides along
-the records, and the derivatives fall on the bump (modulating functions). The weights are free in
-sign and size, so a cart in another unit, or turned, has the same delay.
-
-Reference: H. A. Preisig & D. W. T. Rippin, Theory and application of the modulating function
-method, Computers & Chemical Engineering 17, 1993.
+holds best. No derivative is taken: both sides are weighed with a bump that slides along the
+records (`modulating`). The weights are free in sign and size, so a cart in another unit, or
+turned, has the same delay.
 """
 
 from collections.abc import Sequence
@@ -21,17 +18,11 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from pipeline.arrays import Array
-from pipeline.estimation import limits
+from pipeline.estimation.modulating import bump, motion_period
 from pipeline.results import Record
 
-_BUMP = np.polynomial.Polynomial.fromroots([0.0] * 4 + [1.0] * 4)  # t⁴ (1 - t)⁴
-_WIDTH = 0.25  # of the motion's period: wider ones weigh the fast motions, which tell most, away
-_NARROWEST = 16  # samples under a bump: fewer, and the encoder's steps are all it sees
-_OVERLAP = 6  # steps in which a bump slides on by its width
-_MOST_PLACES = 400  # of the bump in a record
 _FEWEST_PLACES = 30
 _MOST_LATE = 15  # steps of the grid that are tried, either way
-_PER_PERIOD = 240  # steps of the grid in a period of the motion, where it is sampled more often
 _PARTS = 8  # that the error is found from, at least: records, or parts of them
 
 
@@ -101,10 +92,11 @@ class _Normal:
 
 def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> ChannelDelay | None:
     usable = [record for record in records if _tells(record, cart)]
-    periods = [_period(record.position(cart), record.sample_time) for record in usable]
+    periods = [motion_period(one.position(cart)) * one.sample_time for one in usable]
     if not usable:
         return None
-    finest = float(np.median(periods)) / _PER_PERIOD
+    # Steps of the grid in a period of the motion, where it is sampled more often.
+    finest = float(np.median(periods)) / 240
     step = max(float(np.median([record.sample_time for record in usable])), finest)
     parts = -(-_PARTS // len(usable))
     equations: list[_Normal] = []
@@ -141,15 +133,8 @@ def _tells(record: Record, cart: int) -> bool:
         return False
     if cart + 1 in record.free and cart + 1 not in record.carts:
         return False
-    return all(
-        np.ptp(record.position(c)) > limits.DELAY_COUNTS * record.encoder_step(c)
-        for c in (cart - 1, cart)
-    )
-
-
-def _period(x: Array, sample_time: float) -> float:
-    """Return the period of a sine with the speed of this motion, s."""
-    return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)) * sample_time)
+    # Encoder steps of motion from which on a channel's delay shows.
+    return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))
 
 
 def _equations(
@@ -157,24 +142,25 @@ def _equations(
 ) -> list[_Normal]:
     """Return the equations of each part of a record; none where it is too short."""
     t = np.arange(record.t[0], record.t[-1], step)
-    width = max(round(_WIDTH * period / step), _NARROWEST)
+    # Of the motion's period: wider ones weigh the fast motions, which tell most, away.
+    # Samples under a bump: fewer, and the encoder's steps are all it sees.
+    width = max(round(0.25 * period / step), 16)
     first, last = _MOST_LATE, t.size - width - _MOST_LATE
-    places = np.arange(first, last, max(width // _OVERLAP, (last - first) // _MOST_PLACES, 1))
+    places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
     if places.size < max(_FEWEST_PLACES, parts):
         return []
-    at = (np.arange(width) + 0.5) / width
-    bumps = [_BUMP.deriv(order)(at) / width**order for order in (2, 1, 0)]
+    weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width)
 
     def under(cart: int, *, late: float = 0.0) -> Array:
         return sliding_window_view(np.interp(t + late, record.t, record.position(cart)), width)
 
     own = under(cart)[places]
-    right = [own @ bumps[0], -(own @ bumps[1]), own @ bumps[2], np.zeros(places.size)]
+    right = [own @ bend, -(own @ slope), own @ weight, np.zeros(places.size)]
     if cart + 1 in record.free:
-        right[3] = under(cart + 1, late=after)[places] @ bumps[2]
+        right[3] = under(cart + 1, late=after)[places] @ weight
     before = under(cart - 1)
     shifts = range(-_MOST_LATE, _MOST_LATE + 1)
-    left = np.array([before[places - shift] @ bumps[2] for shift in shifts])
+    left = np.array([before[places - shift] @ weight for shift in shifts])
     # Zeros of encoders drop out; each record weighs the same.
     left = left - left.mean(axis=1, keepdims=True)
     size = float(np.linalg.norm(left[_MOST_LATE]))

@@ -13,13 +13,14 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.estimation import limits
 from pipeline.estimation.chain.modal_response import Modes, find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
-from pipeline.estimation.chain.time_window import Window, compare, open_window
+from pipeline.estimation.chain.time_search import FOLLOWED
+from pipeline.estimation.chain.time_window import FitWindow, compare, open_window
 from pipeline.estimation.units_and_clocks import FASTEST, LENGTH_SCALES, TIME_FACTORS
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Record
+from pipeline.set_up import Bench
 
 _ModesOf = Callable[[tuple[int, ...]], Modes]
 
@@ -49,7 +50,7 @@ class Followed:
     @property
     def belongs(self) -> bool:
         """Whether the record follows."""
-        return self.share <= limits.FOLLOWED
+        return self.share <= FOLLOWED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,12 +99,13 @@ def near(record: Record, chain: Chain) -> list[Followed]:
     one of them that is all of the motion.
     """
     modes = _modes(chain)
-    detuned = [replace(record, t=factor * record.t) for factor in limits.DETUNED]
+    # A spring that stiffens, or an input that is late, shifts resonances by some percent.
+    detuned = [replace(record, t=factor * record.t) for factor in np.linspace(0.85, 1.15, 13)]
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
 
 def find_misread(
-    record: Record, chain: Chain, fit: Followed, *, better: float = limits.BETTER
+    record: Record, chain: Chain, fit: Followed, *, better: float = 10.0
 ) -> Misread | None:
     """Return how a record must be read to follow the chain, so many times better than as it is.
 
@@ -111,15 +113,17 @@ def find_misread(
     ----------
     fit : how it follows as it is.
     """
-    found, least = None, min(fit.share / better, limits.FOLLOWED)
-    if better > 1 and fit.share < limits.DOUBTFUL:
+    found, least = None, min(fit.share / better, FOLLOWED)
+    # What stays of a good record is friction, and no other reading takes that away.
+    if better > 1 and fit.share < 0.005:
         return None
     # As the bench counts its input: a record's own sign was found by what it holds.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        if held and held.share <= (min(least, limits.TURNED) if misread.legal else least):
+        # What a record that counts the other way leaves at most; a long delay leaves more.
+        if held and held.share <= (min(least, 0.02) if misread.legal else least):
             found, least = misread, held.share
     return found
 
@@ -140,7 +144,8 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         window = open_window(record)
     except DataError:
         return
-    if np.any(np.ptp(window.y, axis=1) < limits.SEEN_STEPS * np.sqrt(12) * window.stated_sigma):
+    # Encoder steps of motion: rounding changes a smaller one by any factor.
+    if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
         misread, factors = said
@@ -152,7 +157,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         )
 
 
-def _weights(window: Window, modes: Modes) -> Array:
+def _weights(window: FitWindow, modes: Modes) -> Array:
     """Return the factors (p,) with which the columns follow best."""
     driven = compare(replace(window, y=0 * window.y), modes).residual.ravel()
     alone = [
@@ -169,9 +174,11 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     A unit is that of the whole file: one cart near its null moves by any factor too little.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    scales = [scale for scale in LENGTH_SCALES if scale >= limits.UNMISTAKABLE]
+    # An amplifier at its limit makes less of the input by a factor of 2 or 3.
+    scales = [scale for scale in LENGTH_SCALES if scale >= 10.0]
     for scale in (*scales, *(1 / scale for scale in scales)):
-        if np.all(np.abs(size * scale - 1) < limits.SAME_SCALE) and len(set(sign)) == 1:
+        # Relative, of a unit's factor: the known ones lie 2.5 times apart.
+        if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
             words = (
                 "its positions or its input look to be in another unit: they move "
                 f"{scale:.3g} times as far as its input moves the carts"
@@ -190,7 +197,7 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
 
 def _modes(chain: Chain) -> _ModesOf:
     """Return what finds the chain's modes by its free carts, without derivatives."""
-    P = Parametrisation(n=chain.n, springs=tuple(bool(k) for k in chain.k))
+    P = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
 
     @cache
     def find(free: tuple[int, ...]) -> Modes:
@@ -216,20 +223,16 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
     lost = np.maximum(excess, 0.0) / power
     reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
+    # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)²
+    # where they move at all, which is doubled here; encoder and noise hide shares below the least.
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         missed=dict(zip(window.carts, residual, strict=True)),
         reach=dict(zip(window.carts, reach.tolist(), strict=True)),
         friction={
-            cart: float(
-                limits.FRICTION_PER_ROOT
-                * np.sqrt(max(share, limits.LEAST_SHARE))
-                * np.ptp(force)
-                / 2
-            )
+            cart: float(10.0 * np.sqrt(max(share, 1e-4)) * np.ptp(force) / 2)
             for cart, share in zip(window.carts, lost, strict=True)
-            if share <= limits.FOLLOWED
-            and (force := force_on(record, chain, cart=cart)) is not None
+            if share <= FOLLOWED and (force := force_on(record, chain, cart=cart)) is not None
         },
     )
 

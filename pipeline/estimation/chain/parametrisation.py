@@ -6,7 +6,7 @@ all entries are of order one. The spring wall-1 alone enters as it is, because i
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,12 +17,11 @@ from pipeline.errors import DataError
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import Estimate
+from pipeline.set_up import Bench
 
 # Damping ratios to begin with, where none is measured:
 START_ZETA = 0.05  # of each cart alone: what a cart on bearings has
 ASSUMED_ZETA = 0.1  # of a mode or a null: the usual guess of the paper
-_DIFFERENCE = 1e-6  # relative step; a forward difference errs by as much, rounding by 1e-9
-_NO_DAMPING = 1e-10  # far below any bench's, above the rounding of a pole on the imaginary axis
 _FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
 # A start must be a chain: what a measured table implies below this share of the largest spring
 # (or mass) is raised to it.
@@ -35,8 +34,7 @@ class Parametrisation:
 
     Attributes
     ----------
-    n : number of carts.
-    springs : (n + 1,) which springs there are; one cart has one stiffness, the sum of its two.
+    bench : which springs there are.
     zero : names of parameters held at zero ("c_2", "k_1"): a fit found them at their bound.
 
     Raises
@@ -45,26 +43,27 @@ class Parametrisation:
         beyond it.
     """
 
-    n: int
-    springs: tuple[bool, ...]
+    bench: Bench
     zero: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if len(self.springs) != self.n + 1:
-            raise ValueError(f"springs: expected {self.n + 1}, found {len(self.springs)}")
         for j in range(2, self.n + 1):
-            if not self.springs[j - 1]:
+            if not self.bench.springs[j - 1]:
                 raise DataError(
                     f"the fit needs a spring between carts {j - 1} and {j}, found none: "
                     f"the motor does not move cart {j}; are the springs stated right?"
                 )
 
+    @property
+    def n(self) -> int:
+        """The number of carts."""
+        return self.bench.n
+
     @cached_property
     def names(self) -> tuple[str, ...]:
         """The free parameters, "m_1" … "k_n": the order of theta and of its covariance."""
-        springs = (any(self.springs), False) if self.n == 1 else self.springs
         names = [f"{symbol}_{i}" for symbol in "mc" for i in range(1, self.n + 1)]
-        names += [f"k_{j}" for j, present in enumerate(springs, start=1) if present]
+        names += [f"k_{j}" for j, present in enumerate(self.bench.stiff, start=1) if present]
         return tuple(name for name in names if name not in self.zero)
 
     @cached_property
@@ -142,7 +141,7 @@ class Parametrisation:
 
     def holding_at_zero(self, *names: str) -> "Parametrisation":
         """Return the same with further parameters held at zero."""
-        return Parametrisation(n=self.n, springs=self.springs, zero=(*self.zero, *names))
+        return replace(self, zero=(*self.zero, *names))
 
 
 def _place(name: str) -> tuple[str, int]:
@@ -173,9 +172,10 @@ def named_estimates(
     values = chain.parameters()
     J = parameter_jacobian(chain, names)
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
+    # Far below any bench's, above the rounding of a pole on the imaginary axis.
     return {
         name: Estimate(value=0.0, std=None, source=source, at_bound=True)
-        if read_name(name).is_damping and value <= _NO_DAMPING
+        if read_name(name).is_damping and value <= 1e-10
         else Estimate(value=value, std=float(np.sqrt(v)) if v >= 0 else None, source=source)
         for (name, value), v in zip(values.items(), variance, strict=True)
     }
@@ -188,7 +188,8 @@ def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     for name in names:
         symbol, i = _place(name)
         values: Array = getattr(chain, symbol)
-        step = _DIFFERENCE * (values[i] or np.max(values) or critical_damping(chain))
+        # Relative step; a forward difference errs by as much, rounding by 1e-9.
+        step = 1e-6 * (values[i] or np.max(values) or critical_damping(chain))
         moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
         moved[symbol][i] += step
         there = np.array(list(Chain(**moved).parameters().values()))
@@ -202,15 +203,14 @@ def critical_damping(chain: Chain) -> float:
     return float(np.sqrt(m * k)) or m  # on no spring: in one second
 
 
-def physical_start(found: Chain, *, springs: Sequence[bool], zeta: float = START_ZETA) -> Chain:
+def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> Chain:
     """Return a proper chain near one that a measured table implies.
 
     `found` may hold what no real chain has (a negative spring, a mass far too small): such values
     are clipped. Dampings are set from `zeta`, as a table's are too uncertain to keep; but a cart
     on no spring keeps its own.
     """
-    present = [any(springs), False] if found.n == 1 else list(springs)
-    k = np.where(present, _raised(found.k), 0.0)
+    k = np.where(bench.stiff, _raised(found.k), 0.0)
     m = _raised(found.m)
     held = k[:-1] + k[1:]
     return Chain(m=m, c=np.where(held > 0, 2 * zeta * np.sqrt(m * held), found.c), k=k)
@@ -221,7 +221,7 @@ def _raised(values: Array) -> Array:
     return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
 
 
-def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) -> Chain:
+def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
     """Return a chain of equal carts and springs with the gain and mean frequency of `values`.
 
     A start for a fit when too few estimates are at hand to recover a chain from. `values` needs
@@ -238,12 +238,12 @@ def even_chain(values: Mapping[str, float], *, n: int, springs: Sequence[bool]) 
             "fit: a start needs the gain of cart 1 and a resonance, "
             f"found {', '.join(values) or 'nothing'}"
         )
-    present = [any(springs), False] if n == 1 else list(springs)
-    unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(present, dtype=float))
+    n = bench.n
+    unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(bench.stiff, dtype=float))
     modes = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate
     stretch = np.exp(
         np.mean(np.log(np.sort(omegas))) - np.mean(np.log(modes[modes > 0][: len(omegas)]))
     )
     k = unit.static_gains()[0] / gain
     even = Chain(m=unit.m * k / stretch**2, c=unit.c, k=unit.k * k)
-    return physical_start(even, springs=springs)
+    return physical_start(even, bench=bench)

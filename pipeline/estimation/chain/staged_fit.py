@@ -17,8 +17,6 @@ from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.recovery import recover_chain
 
-_EVALUATIONS = 100  # a stage that gets there takes about ten
-_RUNAWAY = 7.0  # of a logarithm, a factor 1000: a stage that got there has lost its way
 _FARTHEST = 50.0  # of a logarithm: a step that goes astray must not overflow
 _ZETA_RANGE = (0.01, 1.0)  # of a start: outside it the fit would not find its way back
 
@@ -105,14 +103,14 @@ def _fit(
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if points.omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
+    # A stage that gets there takes about ten.
     found = minimise(
         evaluate,
         start,
-        residual=lambda both: both[0],
-        jacobian=lambda both: both[1],
-        max_evaluations=_EVALUATIONS,
+        max_evaluations=100,
     ).x
-    if np.max(np.abs(found - start)) > _RUNAWAY:
+    # Of a logarithm, a factor 1000: a stage that got there has lost its way.
+    if np.max(np.abs(found - start)) > 7.0:
         return gain, factors
     return float(np.exp(found[0])), found[1:].reshape(shape)
 

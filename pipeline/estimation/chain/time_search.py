@@ -11,19 +11,20 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import find_modes
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.estimation.chain.time_start import WIDTHS, even_chains, regress_chain
-from pipeline.estimation.chain.time_window import Misfit, Window, compare
-from pipeline.estimation.limits import FOLLOWED
+from pipeline.estimation.chain.time_window import FitWindow, Misfit, compare
 from pipeline.estimation.minimise import minimise
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
+# The share of a record's power (about its mean) that a chain may leave: carts with dry friction
+# leave some 2 %, a wrong chain most.
+FOLLOWED = 0.1
 # A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
 # start is nothing, and no step may overflow.
 _LOG_REACH = 15.0
 # Relative change of the cost at which a search ends: with n samples, 1/n is one standard error.
 _SEARCH_TOLERANCE = 1e-6
 _MOST_EVALUATIONS = 60
-_SEARCH_SAMPLES = 700  # of a record; the search needs no more to come close
 # Of a chain with a record, in all starts together, about 1 ms each. With all carts measured a
 # search takes some 200 at most; with a cart unmeasured some 3000 until the noise is reached, and
 # 5000 through all starts where dry friction or play keep it from there. Records that no chain
@@ -45,7 +46,7 @@ class Attempt:
 
     parametrisation: Parametrisation
     theta: Array
-    windows: Sequence[Window]
+    windows: Sequence[FitWindow]
     misfits: Sequence[Misfit]
     converged: bool = False
     n_evaluations: int = 1
@@ -85,7 +86,7 @@ class Attempt:
         return self.lost < FOLLOWED or self.cost < EXPLAINED * self.dof
 
 
-def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Array) -> Attempt:
+def look(windows: Sequence[FitWindow], parametrisation: Parametrisation, theta: Array) -> Attempt:
     """Compare the chain of theta with all windows."""
     chain, dp_dtheta = parametrisation.unpack(theta), parametrisation.dp_dtheta(theta)
     modes = {
@@ -97,7 +98,7 @@ def look(windows: Sequence[Window], parametrisation: Parametrisation, theta: Arr
 
 
 def descend(
-    windows: Sequence[Window],
+    windows: Sequence[FitWindow],
     parametrisation: Parametrisation,
     theta: Array,
     *,
@@ -107,11 +108,14 @@ def descend(
     reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
     lower = np.maximum(parametrisation.bounds[0], theta - reach)
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
+
+    def residual_and_jacobian(x: Array) -> tuple[Array, Array]:
+        triangle = condense(look(windows, parametrisation, x).misfits)
+        return triangle[:, -1], triangle[:, :-1]
+
     solution = minimise(
-        lambda x: condense(look(windows, parametrisation, x).misfits),
+        residual_and_jacobian,
         np.clip(theta, lower, upper),
-        residual=lambda triangle: triangle[:, -1],
-        jacobian=lambda triangle: triangle[:, :-1],
         bounds=(lower, upper),
         scale="jac",
         tolerance=tolerance,
@@ -139,7 +143,7 @@ def condense(misfits: Sequence[Misfit]) -> Array:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Found:
+class SearchOutcome:
     """What a search came to.
 
     Attributes
@@ -154,24 +158,25 @@ class Found:
 
 
 def search(
-    windows: Sequence[Window],
+    windows: Sequence[FitWindow],
     parametrisation: Parametrisation,
     *,
     given: Chain | None,
     most_comparisons: int = _MOST_COMPARISONS,
-) -> Found:
+) -> SearchOutcome:
     """Return the best chain from as many starts as it takes, or as it may take.
 
     Raises
     ------
     DataError : the records suggest no start at all.
     """
-    springs = parametrisation.springs
-    regressed = [regress_chain(windows, springs=springs, width=width) for width in WIDTHS]
-    full, windows = windows, [window.thinned(_SEARCH_SAMPLES) for window in windows]
+    bench = parametrisation.bench
+    regressed = [regress_chain(windows, bench=bench, width=width) for width in WIDTHS]
+    # Of a record; the search needs no more to come close.
+    full, windows = windows, [window.thinned(700) for window in windows]
     near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
     near.sort(key=lambda theta: look(windows, parametrisation, theta).cost)
-    even = [parametrisation.pack(chain) for chain in even_chains(windows, springs=springs)]
+    even = [parametrisation.pack(chain) for chain in even_chains(windows, bench=bench)]
     best: Attempt | None = None
     tried = comparisons = 0
     cut_short = False
@@ -190,4 +195,6 @@ def search(
             "time fit: needs records that a chain with these springs can follow, found none: "
             "are the springs stated right?"
         )
-    return Found(best=look(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short)
+    return SearchOutcome(
+        best=look(full, parametrisation, best.theta), n_starts=tried, cut_short=cut_short
+    )

@@ -15,9 +15,10 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.estimation.chain.parametrisation import even_chain, physical_start
-from pipeline.estimation.chain.time_window import Window
+from pipeline.estimation.chain.time_window import FitWindow
 from pipeline.estimation.modulating import bump, bump_integral
 from pipeline.plant.linear.chain import Chain
+from pipeline.set_up import Bench
 
 WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
 _HOP = 0.25  # of the width, from one bump to the next: they overlap, so closer adds little
@@ -30,15 +31,13 @@ _SWING_OVER_GAIN = 1.6  # of a lightly damped cart after a step
 _SMALLEST_ZETA = 0.005  # noise may well make a regressed damping negative
 
 
-def regress_chain(
-    windows: Sequence[Window], *, springs: Sequence[bool], width: float
-) -> Chain | None:
+def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -> Chain | None:
     """Regress a chain from the windows, with bumps of `width` (s).
 
     None where some cart's equation cannot be had (it needs the cart and its free neighbours
     measured) or makes no sense (a negative mass or coupling).
     """
-    n = len(springs) - 1
+    n = bench.n
     m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
     moments = [_moments(window, n=n, width=width) for window in windows]
     for cart in range(1, n + 1):
@@ -49,7 +48,7 @@ def regress_chain(
         ]
         if not seen:
             return None
-        rows, targets = zip(*(_equation(cart, springs, *moment) for moment in seen), strict=True)
+        rows, targets = zip(*(_equation(cart, bench, *moment) for moment in seen), strict=True)
         zeros = np.zeros((sum(map(len, rows)), len(rows)))  # a constant force in each record
         ends = np.cumsum([0, *map(len, rows)])
         for column, (first, last) in enumerate(pairwise(ends)):
@@ -64,35 +63,33 @@ def regress_chain(
             k[0] = found[3]
         if not m[cart - 1] > 0 or (cart < n and not k[cart] > 0):
             return None
-    start = physical_start(Chain(m=m, c=c, k=k), springs=springs)
+    start = physical_start(Chain(m=m, c=c, k=k), bench=bench)
     omega = np.maximum(start.omega_carts, 1 / width)
     return Chain(m=start.m, c=np.maximum(c, 2 * _SMALLEST_ZETA * omega * start.m), k=start.k)
 
 
-def _tells_of(window: Window, cart: int, n: int) -> bool:
+def _tells_of(window: FitWindow, cart: int, n: int) -> bool:
     """Tell whether a cart's equation can be set up: it moves, and who pulls at it is known."""
     near = {j for j in (cart - 1, cart, cart + 1) if 1 <= j <= n and j in window.free}
     driven = cart > 1 or window.drive_u is not None
     return driven and cart in window.free and near <= set(window.carts)
 
 
-def _equation(cart: int, springs: Sequence[bool], x: Array, force: Array) -> tuple[Array, Array]:
+def _equation(cart: int, bench: Bench, x: Array, force: Array) -> tuple[Array, Array]:
     """Return the columns of m, c, the spring after (and for cart 1 that before), and the target.
 
     `x` (3, n + 2, n_b) holds the moments with φ, φ', φ'' of walls and carts, `force` (n_b,) that
     of the input.
     """
     stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
-    single = x.shape[1] == 3  # one cart: two springs act as one, counted as the first
-    after = stretch[1] * (springs[cart] and not single)
-    columns = [x[2, cart], -x[1, cart], after]
+    columns = [x[2, cart], -x[1, cart], stretch[1] * bench.stiff[cart]]
     if cart > 1:
         return np.stack(columns, axis=1), -stretch[0]
-    columns.append(stretch[0] * (any(springs) if single else springs[0]))
+    columns.append(stretch[0] * bench.stiff[0])
     return np.stack(columns, axis=1), force
 
 
-def _moments(window: Window, *, n: int, width: float) -> tuple[Array, Array] | None:
+def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
     """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
 
     φ = (τ (1 - τ))⁴, τ from 0 to 1 over the bump. None where the record is shorter than two
@@ -127,7 +124,7 @@ def _around(t: Array, starts: Array, width: float) -> np.ndarray:
     return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
 
 
-def even_chains(windows: Sequence[Window], *, springs: Sequence[bool]) -> list[Chain]:
+def even_chains(windows: Sequence[FitWindow], *, bench: Bench) -> list[Chain]:
     """Return chains of equal carts, from slow to fast, with about the gain the records show.
 
     For records a regression cannot use, as where a cart was not measured. The range of
@@ -139,12 +136,12 @@ def even_chains(windows: Sequence[Window], *, springs: Sequence[bool]) -> list[C
     swing = np.median([np.ptp(w.y[0]) / u for w, u in zip(driven, ranges, strict=True)])
     slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
     fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
-    if not swing > 0 or fastest <= slowest or not (springs[0] or springs[-1]):
+    if not swing > 0 or fastest <= slowest or not bench.tied:
         return []  # with no spring to a wall nothing sets a gain
-    n, ratio = len(springs) - 1, fastest / slowest
+    ratio = fastest / slowest
     count = int(np.log(ratio) / np.log(_FREQUENCY_STEP)) + 1
     chains = []
     for omega in slowest * ratio ** (np.arange(count + 1) / count):
         values = {"K_1": swing / _SWING_OVER_GAIN, "omega_a": omega}
-        chains.append(even_chain(values, n=n, springs=springs))
+        chains.append(even_chain(values, bench=bench))
     return chains

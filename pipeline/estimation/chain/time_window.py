@@ -9,20 +9,16 @@ from pipeline.errors import DataError
 from pipeline.estimation.chain.modal_response import Modes, drive_modes
 from pipeline.estimation.noise import local_noise, noise_beyond_rounding, rounding_left
 from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
-from pipeline.results import Record
-from pipeline.results_of_runs import Kind
+from pipeline.results import Kind, Record
 
 # A free decay is used from where its largest swing has fallen by half: whatever released the
 # cart has let go of it by then.
 _RELEASED_BELOW = 0.5
-_DECAY_START_SHARE = 0.95  # of the largest swing: the end of the hold
-_RANK = 1e-9  # relative singular value below which two nuisance parameters are one
-_NOISE_FREE = 1e-6  # of the motion: the error to assume where neither noise nor steps are seen
 _FEWEST_SAMPLES = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Window:
+class FitWindow:
     """What the fit uses of a record.
 
     Attributes
@@ -68,7 +64,7 @@ class Window:
         """
         return np.sqrt(np.mean(residual[:, self.n_resting :] ** 2, axis=1))
 
-    def informed(self, residual: Array, *, at_rest: bool) -> "Window":
+    def informed(self, residual: Array, *, at_rest: bool) -> "FitWindow":
         """Return the same with its errors as a fit has left them, nowhere below the stated ones.
 
         Parameters
@@ -85,7 +81,7 @@ class Window:
         shared = (np.array(left) * self.step / sigma) ** 2 / 12 if at_rest else 0.0
         return replace(self, sigma=sigma, at_rest=at_rest, shared=shared)
 
-    def thinned(self, most: int) -> "Window":
+    def thinned(self, most: int) -> "FitWindow":
         """Return the same with at most twice as many samples as `most`; the input keeps all."""
         step = max(self.t.size // most, 1)
         return replace(self, t=self.t[::step], y=self.y[:, ::step], stride=self.stride * step)
@@ -123,7 +119,8 @@ def usable_segment(record: Record) -> slice:
     swing = np.max(np.abs(record.y - rest[:, None]), axis=0)
     if not np.max(swing) > 3 * np.max(record.resolution, initial=0.0):
         raise DataError(f"{record.id}: time fit needs a cart that moves, found none")
-    held_until = int(np.flatnonzero(swing >= _DECAY_START_SHARE * swing.max())[-1])
+    # Of the largest swing: the end of the hold.
+    held_until = int(np.flatnonzero(swing >= 0.95 * swing.max())[-1])
     released = np.flatnonzero(swing[held_until:] < _RELEASED_BELOW * swing.max())
     start = held_until + int(released[0]) if released.size else record.t.size
     if record.t.size - start < _FEWEST_SAMPLES:
@@ -134,7 +131,7 @@ def usable_segment(record: Record) -> slice:
     return slice(start, record.t.size)
 
 
-def open_window(record: Record) -> Window:
+def open_window(record: Record) -> FitWindow:
     """Prepare a record for the fit.
 
     Raises
@@ -163,9 +160,10 @@ def open_window(record: Record) -> Window:
             drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
     steps = np.array([record.encoder_step(cart) for cart in carts])
     noise = np.array([local_noise(t, position) for position in y])
-    least = _NOISE_FREE * float(np.max(np.ptp(y, axis=1)))
+    # Of the motion: the error to assume where neither noise nor steps are seen.
+    least = 1e-6 * float(np.max(np.ptp(y, axis=1)))
     sigma = np.maximum(np.maximum(noise, steps / np.sqrt(12)), least)
-    return Window(
+    return FitWindow(
         id=record.id,
         kind=record.kind,
         t=t - t[0],
@@ -182,7 +180,7 @@ def open_window(record: Record) -> Window:
     )
 
 
-def compare(window: Window, modes: Modes) -> Misfit:
+def compare(window: FitWindow, modes: Modes) -> Misfit:
     """Compare a chain, given by its modes, with a window.
 
     Start and encoder zeros enter linearly and are eliminated: residual and jacobian are projected
@@ -202,7 +200,8 @@ def compare(window: Window, modes: Modes) -> Misfit:
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(local / scale)
     U, s, Vt = np.linalg.svd(R)
-    kept = s > _RANK * s[0]
+    # Relative singular value below which two nuisance parameters are one.
+    kept = s > 1e-9 * s[0]
     basis = Q @ U[:, kept]
 
     signals, d_weights = [], []  # modal signals, and their weights in the jacobian
@@ -238,7 +237,7 @@ def compare(window: Window, modes: Modes) -> Misfit:
     )
 
 
-def weighed(values: Array, window: Window) -> Array:
+def weighed(values: Array, window: FitWindow) -> Array:
     """Return values (…, p, n) over sigma, the mean of the first rest for no more than it tells.
 
     The whitening of n readings with an error in common: of their covariance 1 + shared, the

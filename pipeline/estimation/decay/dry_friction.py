@@ -8,6 +8,7 @@ Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-15
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +17,11 @@ from pipeline.arrays import Array
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
-from pipeline.estimation.limits import FRICTION_F
-from pipeline.results_of_runs import FrictionTest
+from pipeline.results import FrictionTest
 
+_THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
 _UNKNOWNS = 7
-_MAX_EVALUATIONS = 200  # a decay takes some 30, derivatives included
 _MOST_LOSS = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
-_ONE_START = 1.5  # residual over noise without friction: up to here there is little, if any
 _LESS_DAMPING = (1.0, 0.3)  # starts: friction takes a share of the damping fitted without it
 
 
@@ -57,50 +56,47 @@ def fit_friction(
     pole = complex(viscous.poles[0])
     if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
         return None
-    direction = -1.0 if falling else 1.0
-
-    def swings(p: Array) -> _Swings:
-        return _Swings.at(t, p, direction=direction)
-
+    cut = partial(_Swings.at, direction=-1.0 if falling else 1.0)
+    # Up to 1.5 times the noise without friction there is little, if any.
     fits = [
         fit_separable(
             y,
-            swings,
+            partial(cut, t),
             start=np.array([turning, -pole.real * share, pole.imag]),
-            max_evaluations=_MAX_EVALUATIONS,
+            max_evaluations=200,  # some 30 are usual
             scale=np.array([1 / pole.imag, abs(pole), abs(pole)]),
         )
-        for share in (_LESS_DAMPING if viscous.rms > _ONE_START * floor else _LESS_DAMPING[:1])
+        for share in (_LESS_DAMPING if viscous.rms > 1.5 * floor else _LESS_DAMPING[:1])
     ]
     best = min(fits, key=lambda fit: float(fit.residual @ fit.residual))
     if not best.converged or best.p[2] <= 0:
         return None
     linear, residual = best.linear, best.residual
-    dof = t.size - _UNKNOWNS
-    angle = best.p[2] * (t[-1] - t[0]) / (t.size - 1)
-    variance = max(float(residual @ residual) / dof, floor**2) * colour(residual, angle=angle)
-    gained = viscous.rms**2 * t.size - float(residual @ residual)
-    fitted = swings(best.p)
-    full = np.column_stack([fitted.derivatives(linear), fitted.columns])
-    size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
-    inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
-    covariance = variance * (inverse @ inverse.T)
-    decay, omega_d = float(best.p[1]), float(best.p[2])
-    omega_n = float(np.hypot(decay, omega_d))
+    left, angle = float(residual @ residual), best.p[2] * (t[-1] - t[0]) / (t.size - 1)
+    variance = max(left / (t.size - _UNKNOWNS), floor**2) * colour(residual, angle=angle)
+    gained = viscous.rms**2 * t.size - left
+    covariance = variance * _inverse_normal(cut(t, best.p), linear)
+    (_, decay, omega_d), omega_n = best.p.tolist(), float(np.hypot(*best.p[1:]))
     per_pole = np.array([omega_d**2, -decay * omega_d]) / omega_n**3  # of zeta = decay / omega_n
-    drop, statistic = float(linear[3]), max(gained / variance, 0.0)
+    statistic = max(gained / variance, 0.0)
     test = FrictionTest(
         f_statistic=statistic,
-        threshold=FRICTION_F,
-        present=statistic > FRICTION_F and drop > floor,
-        drop=drop,
+        threshold=_THRESHOLD,
+        present=statistic > _THRESHOLD and bool(linear[3] > floor),
+        drop=float(linear[3]),
         drop_std=float(np.sqrt(covariance[6, 6])),
         zeta=decay / omega_n,
         zeta_std=float(np.sqrt(per_pole @ covariance[1:3, 1:3] @ per_pole)),
     )
-    return FrictionFit(
-        test=test, model=lambda at: _Swings.at(at, best.p, direction=direction).columns @ linear
-    )
+    return FrictionFit(test=test, model=lambda at: cut(at, best.p).columns @ linear)
+
+
+def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
+    """Return (7, 7) the inverse of J'J, J by the nonlinear unknowns, then by the linear ones."""
+    full = np.column_stack([fitted.derivatives(linear), fitted.columns])
+    size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
+    inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
+    return inverse @ inverse.T
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

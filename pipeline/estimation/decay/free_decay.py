@@ -9,18 +9,16 @@ from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.estimation.decay.dry_friction import FrictionFit, fit_friction
 from pipeline.estimation.decay.ringing import Ringing, fit_ringing
-from pipeline.estimation.limits import ADEQUATE
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
+# Residual over noise up to which a model says all there is to say: with 50 samples chance moves it
+# by a tenth.
+_ADEQUATE = 1.5
 # Swings are counted in grains: encoder steps, or as much noise as would round as coarsely.
 _PROMINENCE = 6.0
 _SMALLEST_SWING = 8.0
-_SWING_GROWTH = 1.02  # a swing may exceed the one before by this much, no more
-_INTERVAL_CHANGE = 0.3  # of the intervals so far; a hand keeps no better time
-_ZERO_INPUT = 0.02  # of the largest input
 _BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points left to the hand, where enough others remain
-_FEW_TURNINGS = 5  # with fewer, the rest after them is needed too
 _MIN_SAMPLES = 12
 # Carried back, a fit may be off by so many of its own residuals; and by a share of the amplitude
 # while it stands on the smaller swings only, or where it leaves more than noise anyway.
@@ -97,7 +95,8 @@ def _stretches(record: Record) -> list[list[Stretch]]:
         if b - a >= _MIN_SAMPLES
     ]
     largest = float(np.max(np.abs(u)))
-    off = [part for part in parts if abs(part.level or 0.0) <= _ZERO_INPUT * largest]
+    # Of the largest input.
+    off = [part for part in parts if abs(part.level or 0.0) <= 0.02 * largest]
     on = [part for part in parts if part not in off]
     return [off, on, [whole]] if record.kind == "decay" else [off, on]
 
@@ -114,10 +113,12 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
     start = 0
     while start < swings.size:
         end = start + 1
+        # A swing may exceed the one before by this much, no more.
+        # Of the intervals so far; a hand keeps no better time.
         while (
             end < swings.size
-            and _SMALLEST_SWING * size <= swings[end] <= _SWING_GROWTH * swings[end - 1]
-            and abs(times[end] / np.median(times[start:end]) - 1) <= _INTERVAL_CHANGE
+            and _SMALLEST_SWING * size <= swings[end] <= 1.02 * swings[end - 1]
+            and abs(times[end] / np.median(times[start:end]) - 1) <= 0.3
         ):
             end += 1
         best = max(best, turning[start : end + 1], key=lambda run: _score(y, run))
@@ -147,27 +148,34 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     """
     interval = float(np.median(np.diff(t[run])))
     stop = run[-1] + 1
-    if len(run) < _FEW_TURNINGS:
+    # With fewer, the rest after them is needed too.
+    if len(run) < 5:
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
     def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
-        return _fit(
-            t,
-            y,
-            stretch=stretch,
-            first=first,
-            stop=stop,
-            run=run,
-            pole=near,
-            floor=floor,
-            last=last,
+        """Fit with dry friction where the viscous fit leaves more than noise, and at last."""
+        own = slice(first, stop)
+        fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
+        friction = None
+        if last or fit.rms > _ADEQUATE * floor:
+            friction = fit_friction(
+                t[own],
+                y[own],
+                viscous=fit,
+                turning=float(t[run[0]]),
+                falling=bool(y[run[1]] < y[run[0]]),
+                floor=floor,
+            )
+        turning = [i for i in run if i > first]
+        return FreeDecay(
+            stretch=stretch, first=first, stop=stop, turning=turning, fit=fit, friction=friction
         )
 
     enough = max(stop - _MIN_SAMPLES, stretch.first)
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
-    if decay.rms(t, y) > ADEQUATE * floor:
+    if decay.rms(t, y) > _ADEQUATE * floor:
         # How a real cart breaks away is no part of the model: from its first passage on.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
@@ -194,44 +202,6 @@ def _carried_back(
     tolerance = _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * size
     bad = np.flatnonzero(np.abs(y[head] - decay.model(t[head])) > tolerance)
     return head.start + (int(bad[-1]) + 1 if bad.size else 0)
-
-
-def _fit(
-    t: Array,
-    y: Array,
-    *,
-    stretch: Stretch,
-    first: int,
-    stop: int,
-    run: list[int],
-    pole: complex,
-    floor: float,
-    last: bool,
-) -> FreeDecay:
-    """Fit samples [first, stop), with dry friction where the viscous fit leaves more than noise.
-
-    The `last` fit always has it: its test is reported.
-    """
-    t, y = t[:stop], y[:stop]
-    fit = fit_ringing(t[first:], y[first:], poles=np.array([pole]), drift=True)
-    friction = None
-    if last or fit.rms > ADEQUATE * floor:
-        friction = fit_friction(
-            t[first:],
-            y[first:],
-            viscous=fit,
-            turning=float(t[run[0]]),
-            falling=bool(y[run[1]] < y[run[0]]),
-            floor=floor,
-        )
-    return FreeDecay(
-        stretch=stretch,
-        first=first,
-        stop=stop,
-        turning=[i for i in run if i > first],
-        fit=fit,
-        friction=friction,
-    )
 
 
 def _ratio(y: Array, run: list[int]) -> float:

@@ -8,11 +8,8 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
 
-_PENCIL_SAMPLES = 300  # the matrix pencil only starts the fit; more samples would only cost time
-_OSCILLATES = 1e-3  # imaginary part over size: below, a pole is real but for rounding
 _MAX_EVALUATIONS = 100
 _MOST_GROWTH = 50.0  # of an exponent: beyond, numbers run over
-_ALWAYS_DECAYS = 1e-6  # of the frequency: the least damping of a start
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,10 +59,11 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     tau = scale * (t - t[0])
     level = np.array([np.ones_like(t), t - t[0]] if drift else [np.ones_like(t)])
     k = len(level)
+    # Of the frequency: the least damping of a start.
     fit = fit_separable(
         y,
         lambda p: _Waves.at(tau, p, level=level),
-        start=np.append(np.maximum(-poles.real / scale, _ALWAYS_DECAYS), poles.imag / scale),
+        start=np.append(np.maximum(-poles.real / scale, 1e-6), poles.imag / scale),
         max_evaluations=_MAX_EVALUATIONS,
     )
     linear, residual, waves = fit.linear, fit.residual, _Waves.at(tau, fit.p, level=level)
@@ -125,10 +123,12 @@ def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     level is one more pole, near zero. Fewer poles come back where the data do not oscillate in
     so many modes.
     """
-    n = min(t.size, _PENCIL_SAMPLES)
+    # The matrix pencil only starts the fit; more samples would only cost time.
+    n = min(t.size, 300)
     grid = np.linspace(t[0], t[-1], n)
     hankel = np.lib.stride_tricks.sliding_window_view(np.interp(grid, t, y), n // 3)
     rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes + 1].T
     z = np.linalg.eigvals(np.linalg.lstsq(rows[:-1], rows[1:], rcond=None)[0])
     s = np.log(z.astype(np.complex128)) / (grid[1] - grid[0])
-    return s[s.imag > _OSCILLATES * np.abs(s)]
+    # Imaginary part over size: below, a pole is real but for rounding.
+    return s[s.imag > 1e-3 * np.abs(s)]

@@ -17,7 +17,7 @@ _PRECISION = 1e-8  # relative: of the sum of squares, of p, and of its slope
 _FOUND = (1, 2, 3, 4)  # what MINPACK says where it came to one of them
 
 
-class Model(Protocol):
+class SeparableModel(Protocol):
     """A model at some values of its nonlinear unknowns."""
 
     @property
@@ -45,7 +45,7 @@ class SeparableFit:
 
 def fit_separable(
     y: Array,
-    model: Callable[[Array], Model],
+    model: Callable[[Array], SeparableModel],
     *,
     start: Array,
     max_evaluations: int,
@@ -79,13 +79,13 @@ def fit_separable(
 class _Point:
     """The model at some p (n_p,), its linear unknowns solved for; `basis` spans the columns."""
 
-    model: Model
+    model: SeparableModel
     basis: Array
     linear: Array
     residual: Array
 
 
-def _solved(y: Array, model: Model) -> _Point:
+def _solved(y: Array, model: SeparableModel) -> _Point:
     """Return the model with the linear unknowns that leave the least of y."""
     X = model.columns
     basis, sizes, turn = np.linalg.svd(X, full_matrices=False)

@@ -1,5 +1,6 @@
 """Records made ready for fitting: free motion only, rest and start found, noise estimated."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -13,22 +14,16 @@ from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
-_REST_TIME = 0.02  # s without motion: the run starts at rest
-_TAIL = 0.12  # share of a record that must lie still to tell the rest point
 _STILL = 2.6  # encoder steps, peak to peak, that count as lying still
-_FIT_RATE = 250.0  # Hz; faster records are averaged in blocks for the fits
-_FEWEST_BLOCKS = 3  # tell a curvature
-_USUAL_FREQUENCY = 8.0  # Hz; carts on a bench swing no faster
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # fewer samples at the top are no hold …
 _HELD_TIME = 2.0  # … nor is a stay there within this many times what free motion takes
-_HAND_TIME = 0.02  # s, half width of a local cubic: what a hand holds moves no faster
 _RESTING = 1.5  # encoder steps within which a cart at rest reads …
 _ONE_READING = 0.07  # … and the time (s, at the usual pace) of which counts as independent
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Run:
+class GapRun:
     """One record as the fits see it.
 
     Attributes
@@ -88,13 +83,37 @@ class Run:
         """(rows,) root-mean-square of the reading about its rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
+    @property
+    def input(self) -> Array:
+        """(samples,) the input at each of them."""
+        if self.knots.size == self.t.size:
+            return self.command
+        return np.interp(self.t, self.knots, self.command)
+
+    def by_cart(self, rows: Array, zero: Array) -> Array:
+        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples); else 0."""
+        x = np.zeros((zero.size, self.t.size))
+        x[list(self.rows)] = rows - zero[list(self.rows)][:, None]
+        return x
+
+    def with_noise(self, sigma: Mapping[int, float]) -> "GapRun":
+        """Return the run with the noise of some rows, by cart index."""
+        own = [sigma.get(row, old) for row, old in zip(self.rows, self.sigma, strict=True)]
+        return replace(self, sigma=np.array(own))
+
+    def with_zeros(self, *, width: float) -> "GapRun":
+        """Return the run with the encoders' zeros those of the file, within `width` noises."""
+        std = np.full(self.zero.size, 1.0)
+        std[list(self.rows)] = width * self.sigma
+        return replace(self, zero=np.zeros(self.zero.size), zero_std=std)
+
     @cached_property
-    def thin(self) -> "Run":
+    def thin(self) -> "GapRun":
         """The run as the fits see it: fast samples block by block, the pieces as they are."""
         return _thin(self) if self.block > 1 else self
 
 
-def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
+def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
     A decay starts after the hand has let go; a slow or held beginning is cut. One that begins in
@@ -106,49 +125,31 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     guided = _guided(record, n=n)
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
-    tail = y[:, -max(3, int(_TAIL * t.size)) :]
+    # The last eighth must lie still to tell the rest point.
+    tail = y[:, -max(3, int(0.12 * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
-    quiet_end = bool(np.all(u[-tail.shape[1] :] == 0.0))
     frequency = _dominant_frequency(t, y)
-    pace = min(1.0, _USUAL_FREQUENCY / frequency)
+    # Carts on a bench swing no faster than at 8 Hz.
+    pace = min(1.0, 8.0 / frequency)
     if record.kind == "decay":
-        rest = np.where(settled, tail.mean(axis=1), np.median(y, axis=1))
-        radians = 2 * np.pi * frequency * record.sample_time
-        offset = y - rest[:, None]
-        if in_motion:
-            first = _first_turn(offset, still)
-        else:
-            first = _release(offset, still, radians=radians)
-        first = min(first, t.size // 2)
+        offset = y - np.where(settled, tail.mean(axis=1), np.median(y, axis=1))[:, None]
+        radians = None if in_motion else 2 * np.pi * frequency * record.sample_time
+        first = min(_free_from(offset, still, radians=radians), t.size // 2)
         t, u, y, guided = t[first:], u[first:], y[:, first:], guided[:, first:]
-    # The input may already act between the samples: the first two are before its effect.
-    quiet = max(2, int(np.argmax(u != u[0])) + 1)
-    look = max(2, min(quiet, round(_REST_TIME / record.sample_time)))
-    lies_still = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
-    at_rest = lies_still and record.kind != "decay" and not in_motion
-    # What moves before the input does was not in equilibrium, only held.
-    balanced = at_rest and bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
-    zero, zero_std = np.zeros(n), np.ones(n)
-    start, slope = np.zeros(n), np.zeros(n)
+    moves = in_motion or record.kind == "decay"
+    at_rest, balanced = (False,) * 2 if moves else _begins_at_rest(y, u, still, record.sample_time)
+    zero, zero_std, start, slope = np.zeros(n), np.ones(n), np.zeros(n), np.zeros(n)
+    ended, own = settled & np.all(u[-tail.shape[1] :] == 0.0), list(rows)
+    zero[own] = np.where(ended, tail.mean(axis=1), y[:, 0] if balanced else y.mean(axis=1))
     span = np.ptp(y, axis=1)
-    for j, row in enumerate(rows):
-        if settled[j] and quiet_end:
-            zero[row], zero_std[row] = tail[j].mean(), 0.02 * span[j]
-        elif balanced and u[0] == 0.0:
-            zero[row], zero_std[row] = y[j, 0], 0.02 * span[j]
-        else:
-            zero[row], zero_std[row] = y[j].mean(), 0.2 * span[j]
-        zero_std[row] = max(zero_std[row], resolution[j], 1e-12)
-        start[row], slope[row] = _smooth_state(t, y[j], 0, window=_SMOOTHING * pace)
-        if at_rest:
-            start[row], slope[row] = y[j, 0], 0.0
-    if record.hold == "band_limited":
-        knots, smooth = interpolate_band_limited(t, u)
-        command = np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
-    else:
-        knots, command = t, u
+    off = np.where(ended | balanced, 0.02, 0.2) * span
+    zero_std[own] = np.maximum(np.maximum(off, resolution), 1e-12)
+    moving = [_smooth_state(t, row, 0, window=_SMOOTHING * pace) for row in y]
+    start[own], slope[own] = (y[:, 0], 0.0) if at_rest else np.transpose(moving)
+    knots, command = _held_input(t, u) if record.hold == "band_limited" else (t, u)
     rate = 1.0 / float(np.median(np.diff(t)))
-    return Run(
+    length = max(2, round(_ONE_READING * pace * rate))
+    return GapRun(
         id=record.id,
         record=record,
         t=t,
@@ -165,13 +166,8 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
         zero=zero,
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
-        weight=np.array(
-            [
-                _weight(row, step=step, length=max(2, round(_ONE_READING * pace * rate)))
-                for row, step in zip(y, resolution, strict=True)
-            ]
-        ),
-        block=max(1, int(rate * pace / _FIT_RATE)),
+        weight=np.array([_weight(*row, length) for row in zip(y, resolution, strict=True)]),
+        block=max(1, int(rate * pace / 250.0)),  # Hz; what is faster is averaged for the fits
         pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
@@ -179,10 +175,29 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> Run:
     )
 
 
+def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tuple[bool, bool]:
+    """Tell whether a run starts at rest, and whether in equilibrium without an input."""
+    # The input may already act between the samples: the first two are before its effect.
+    quiet = max(2, int(np.argmax(u != u[0])) + 1)
+    # 20 ms without motion: the run starts at rest.
+    look = max(2, min(quiet, round(0.02 / sample_time)))
+    at_rest = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
+    # What moves before the input does was not in equilibrium, only held.
+    in_place = bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
+    return at_rest, at_rest and in_place and bool(u[0] == 0.0)
+
+
+def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
+    """Return knots and an input held between them, its mean that of the smooth one."""
+    knots, smooth = interpolate_band_limited(t, u)
+    return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
+
+
 def _guided(record: Record, *, n: int) -> Array:
     """Return (n, samples) the smoothed motion of held carts, where it is more than a reading's."""
     guided = np.zeros((n, record.t.size))
-    half = max(2, round(_HAND_TIME / record.sample_time))
+    # A local cubic over 20 ms to either side: what a hand holds moves no faster.
+    half = max(2, round(0.02 / record.sample_time))
     for cart in record.carts:
         y = record.position(cart)
         if cart not in record.free and np.ptp(y) > _STILL * record.encoder_step(cart):
@@ -190,7 +205,7 @@ def _guided(record: Record, *, n: int) -> Array:
     return guided
 
 
-def _thin(run: Run) -> Run:
+def _thin(run: GapRun) -> GapRun:
     """Return one reading for each block of samples, at the middle of its times.
 
     The mean of a smooth motion exceeds its value in the middle by half the curvature times the
@@ -204,7 +219,7 @@ def _thin(run: Run) -> Run:
         times = run.t[first:last].reshape(-1, q)
         middle = times.mean(axis=1)
         mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
-        if middle.size >= _FEWEST_BLOCKS:
+        if middle.size >= 3:  # they tell a curvature
             slope = np.diff(mean, axis=1) / np.diff(middle)
             curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
             mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
@@ -226,7 +241,7 @@ def _thin(run: Run) -> Run:
     )
 
 
-def _weight(readings: Array, *, step: float, length: int) -> Array:
+def _weight(readings: Array, step: float, length: int) -> Array:
     """Return the weight of each reading of one encoder.
 
     A cart at rest repeats one rounding error: however long it lies there, that counts as
@@ -245,7 +260,7 @@ def _weight(readings: Array, *, step: float, length: int) -> Array:
     return weight
 
 
-def cut_shots(run: Run, *, length: float) -> Run:
+def cut_shots(run: GapRun, *, length: float) -> GapRun:
     """Cut a run into pieces that each start from a state of their own.
 
     `length` is in s at the usual pace.
@@ -276,16 +291,15 @@ def _dominant_frequency(t: Array, y: Array) -> float:
     return best
 
 
-def _first_turn(offset: Array, still: Array) -> int:
-    """Return the first sample at which the cart that moves most turns."""
-    leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
-    turning = extrema(offset[leader], prominence=float(still[leader]))
-    return turning[1] if len(turning) > 1 else 0
+def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
+    """Return the first sample of free motion of a decay that turns by `radians` a sample.
 
-
-def _release(offset: Array, still: Array, *, radians: float) -> int:
-    """Return the first sample of free motion of a decay that turns by `radians` a sample."""
+    None: it begins in motion; then the first sample at which the cart that moves most turns.
+    """
     leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
+    if radians is None:
+        turning = extrema(offset[leader], prominence=float(still[leader]))
+        return turning[1] if len(turning) > 1 else 0
     motion = np.abs(offset[leader])
     top = int(np.argmax(motion))
     peak = motion[top]

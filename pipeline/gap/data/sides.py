@@ -8,18 +8,14 @@ import numpy as np
 
 from pipeline.errors import DataError
 from pipeline.estimation.interventions import between
-from pipeline.gap.data.runs import Run, make_run
-from pipeline.names import by_note
-from pipeline.results import LeftOut, Record
-from pipeline.results_of_runs import Intervention
+from pipeline.gap.data.runs import GapRun, make_run
+from pipeline.results import Intervention, LeftOut, Record
+from pipeline.words.numbers import by_note
+from pipeline.words.phrases import phrases
 
-_LAST_SHARE = 0.4  # of a single run is held out
 _MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
-_STILL = 3.0  # encoder steps within which a cart stands still
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
-_PINNED = 1e-3  # noises that a known zero may be off
-_SAME_SIZE = 0.06  # relative; sizes closer than this are repeats
 
 
 def drop_left_out(
@@ -34,7 +30,7 @@ def drop_left_out(
     out = {one.experiment for one in left_out}
     kept = [record for record in records if record.id not in out]
     reasons = by_note((one.experiment, one.reason) for one in left_out)
-    notes = [f"left out, as in the report: {reason}" for reason in reasons]
+    notes = [phrases("gap").text("note_left_out", reason=reason) for reason in reasons]
     if records and not kept:
         raise DataError(f"gap: every recording is left out; {'; '.join(notes)}")
     return kept, notes
@@ -46,7 +42,7 @@ def prepare(
     springs: tuple[bool, ...],
     interventions: Sequence[Intervention] = (),
     notes: list[str],
-) -> list[Run]:
+) -> list[GapRun]:
     """Return the runs worth fitting; what is left out is noted.
 
     What a record shows behind an intervention is a run of its own.
@@ -55,21 +51,19 @@ def prepare(
     ------
     DataError : no record with a free cart that moves.
     """
-    n = len(springs) - 1
+    n, words = len(springs) - 1, phrases("gap")
     timed = [r for r in records if r.kind != "bode"]
     usable = [r for r in timed if _is_usable(r)]
     if len(usable) < len(timed):
-        notes.append(
-            "left out, as too short, without motion, without an input, or with all carts held: "
-            + ", ".join(r.id for r in timed if r not in usable)
-        )
+        unusable = ", ".join(r.id for r in timed if r not in usable)
+        notes.append(words.text("note_unusable", runs=unusable))
     if not usable:
         raise DataError(
             "gap: needs a record of half a second or more in which a free cart moves, found none"
         )
     open_loop = [r for r in usable if r.kind != "closed_loop"]
     if open_loop and len(open_loop) < len(usable):
-        notes.append("runs under feedback are left out: open-loop runs tell more")
+        notes.append(words.text("note_feedback"))
         usable = open_loop
     usable = _with_still_carts_held(usable, notes=notes)
     dwells = [r for r in usable if r.kind == "sine"]
@@ -78,22 +72,22 @@ def prepare(
         picked = {round(i) for i in np.linspace(0, len(dwells) - 1, _MOST_DWELLS)}
         left_out = {r.id for i, r in enumerate(dwells) if i not in picked}
         usable = [r for r in usable if r.id not in left_out]
-        notes.append(f"of {len(dwells)} sine dwells {_MOST_DWELLS} are used")
+        notes.append(words.text("note_dwells", all=len(dwells), used=_MOST_DWELLS))
     runs = [run for record in usable for run in _free_runs(record, interventions, n=n)]
     if not runs:
         raise DataError("gap: no record shows half a second of motion without a hand in it")
     if not any(np.any(run.command) for run in runs):
-        notes.append("no run has an input: forces are per unit of the first mass")
+        notes.append(words.text("note_no_input"))
     kept = without_twins(runs)
     if len(kept) < len(runs):
-        notes.append(f"duplicate files left out: {len(runs) - len(kept)}")
+        notes.append(words.text("note_duplicates", count=len(runs) - len(kept)))
     if not any(springs):
-        notes.append("no springs: each run is judged as a whole, from its first readings")
+        notes.append(words.text("note_no_springs"))
         kept = [_on_no_spring(run) for run in kept]
     return kept
 
 
-def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int) -> list[Run]:
+def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int) -> list[GapRun]:
     """Return the record between interventions, each stretch that shows motion as a run."""
     runs = []
     for piece in between(record, interventions):
@@ -106,12 +100,13 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
     return runs
 
 
-def _on_no_spring(run: Run) -> Run:
+def _on_no_spring(run: GapRun) -> GapRun:
     """Return a run whose readings are positions, as no rest tells a zero, and tell the start.
 
     No spring forgets a start: a free one would take up what a model lacks.
     """
-    known = np.full(run.zero.size, _PINNED * float(run.sigma.min()))
+    # A known zero may be off by a thousandth of the noise.
+    known = np.full(run.zero.size, 1e-3 * float(run.sigma.min()))
     return replace(run, start_known=True, zero=np.zeros(run.zero.size), zero_std=known)
 
 
@@ -136,24 +131,25 @@ def _span(record: Record, cart: int) -> float:
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
     """Return the records with the carts held that none of them moves, whatever they say."""
     seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
-    moving = {cart for r, cart in seen if _span(r, cart) > _STILL * r.encoder_step(cart)}
+    # Within three encoder steps a cart stands still.
+    moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}
     still = {cart for _, cart in seen} - moving
     if not still:
         return records
     carts = " and ".join(f"cart {cart}" for cart in sorted(still))
-    notes.append(f"{carts} stands still in every recording and is taken as held, not as free")
+    notes.append(phrases("gap").text("note_held", carts=carts))
     return [replace(r, free=tuple(c for c in r.free if c not in still)) for r in records]
 
 
-def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Run]]:
+def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], list[GapRun]]:
     """Return training and held-out runs; where none is to spare the longest is cut in time."""
     teach, judge_by = split(runs)
     if judge_by:
         return [runs[i] for i in teach], [runs[i] for i in judge_by]
-    notes.append("no run to spare: the last 40 % of the longest is held out")
+    notes.append(phrases("gap").text("note_cut"))
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
-    cut = int((1.0 - _LAST_SHARE) * _last_motion(run))
+    cut = int((1.0 - 0.4) * _last_motion(run))  # the share that is held out
     pieces = []
     for piece in (slice(0, cut), slice(cut, None)):
         record = replace(
@@ -181,7 +177,7 @@ def take_sides(runs: list[Run], *, notes: list[str]) -> tuple[list[Run], list[Ru
     return [*others, pieces[0]], [pieces[1]]
 
 
-def _last_motion(run: Run) -> int:
+def _last_motion(run: GapRun) -> int:
     """Return how many samples there are up to the last motion of a run."""
     step = run.sigma * np.sqrt(12.0)
     away = np.abs(run.y - run.y[:, -1:]) > _LEAST_MOTION * step[:, None]
@@ -189,16 +185,16 @@ def _last_motion(run: Run) -> int:
     return max(last, run.t.size // 2)
 
 
-def without_twins(runs: Sequence[Run]) -> list[Run]:
+def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:
     """Return the runs without those whose samples are those of an earlier one."""
-    kept: list[Run] = []
+    kept: list[GapRun] = []
     for run in runs:
         if not any(k.y.shape == run.y.shape and np.array_equal(k.y, run.y) for k in kept):
             kept.append(run)
     return kept
 
 
-def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
+def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
     """Return the indices of training and held-out runs.
 
     Whole runs are held out. Of repeats one goes to each side; of three sizes of a kind the middle
@@ -214,7 +210,8 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
         sizes = {i: _size(runs[i]) for i in members}
         clusters: list[list[int]] = []
         for i in sorted(members, key=lambda i: sizes[i]):
-            if clusters and abs(sizes[i] - sizes[clusters[-1][0]]) <= _SAME_SIZE * abs(sizes[i]):
+            # Sizes within 6 % are repeats.
+            if clusters and abs(sizes[i] - sizes[clusters[-1][0]]) <= 0.06 * abs(sizes[i]):
                 clusters[-1].append(i)
             else:
                 clusters.append([i])
@@ -234,7 +231,7 @@ def split(runs: Sequence[Run]) -> tuple[list[int], list[int]]:
     return [i for i in range(len(runs)) if i not in held], sorted(held)
 
 
-def _size(run: Run) -> float:
+def _size(run: GapRun) -> float:
     """How hard a run was driven: its extreme input, or where a free decay starts.
 
     Of a run under feedback its reference: the input is the controller's answer.

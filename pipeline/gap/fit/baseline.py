@@ -1,6 +1,6 @@
 """The linear chain fitted to all runs at once, so that only missing structure is left."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,21 +9,15 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump
 from pipeline.estimation.noise import high_frequency_noise
-from pipeline.gap.data.runs import Run, cut_shots
-from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, fit_model
-from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
+from pipeline.gap.data.runs import GapRun, cut_shots
+from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, fit_model
+from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.fit.restart import restart_runs
 from pipeline.gap.fit.structure import Structure
 from pipeline.plant.linear.chain import Chain
 
-SHOT_LENGTH = 0.6  # s; a wrong structure does little harm over it
-_WINDOW, _HOP = 0.3, 0.05  # s, of the modulating functions, at the usual pace
-_FIRST_MASS = 1e3  # weight of the equation m_1 = 1, where nothing else sets a scale
-_SMALLEST_ZETA = 0.002
-_MOVING = 0.9  # mean weight of the readings of a piece in which a cart moves
 
-
-def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
+def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     """Estimate masses, dampings and springs by modulating functions.
 
     Without any input the first mass is one.
@@ -32,49 +26,14 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
     rows = [j for j, there in enumerate(springs) if there]
     rows = rows[:1] if n == 1 else rows
     columns = 2 * n + len(rows)
-    equations: list[Array] = []
-    right: list[float] = []
-    for run in runs:
-        step = max(1, round(_HOP * run.pace / run.record.sample_time))
-        width = max(8, round(_WINDOW * run.pace / run.record.sample_time))
-        x = np.zeros((n, run.t.size))
-        for j, row in enumerate(run.rows):
-            x[row] = run.y[j] - run.zero[row]
-        size = max(1e-12, float(np.abs(x).max()))
-        u = (
-            np.interp(run.t, run.knots, run.command)
-            if run.knots.size != run.t.size
-            else run.command
-        )
-        for first in range(0, run.t.size - width, step):
-            piece = slice(first, first + width)
-            t = run.t[piece]
-            span = t[-1] - t[0]
-            s = (t - t[0]) / span
-            w, w1, w2 = bump(s, span=span)
-            local = x[:, piece]
-            stretch = np.vstack([local, np.zeros(width)]) - np.vstack([np.zeros(width), local])
-            for i in run.rows:
-                if not run.free[i]:
-                    continue
-                equation = np.zeros(columns)
-                equation[i] = np.trapezoid(local[i] * w2, t)
-                equation[n + i] = -np.trapezoid(local[i] * w1, t)
-                for at, j in enumerate(rows, start=2 * n):
-                    if j == i:
-                        equation[at] += np.trapezoid(stretch[j] * w, t)
-                    if j == i + 1:
-                        equation[at] -= np.trapezoid(stretch[j] * w, t)
-                equations.append(equation / size)
-                # A held input acts over the sample that follows.
-                force = 0.5 * (u[piece] + np.append(u[first], u[piece][:-1])) if i == 0 else 0 * t
-                right.append(float(np.trapezoid(force * w, t)) / size)
-    A, b = np.array(equations), np.array(right)
+    found = [one for run in runs for one in _equations(run, rows)]
+    A, b = np.array([equation for equation, _ in found]), np.array([right for _, right in found])
     if not np.any(b):
         # Free decays alone: forces are per unit of the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
         first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
-        A[-1, first] = b[-1] = _FIRST_MASS * float(np.abs(A[:, first]).max())
+        # The equation m_1 = 1 weighs much: nothing else sets a scale.
+        A[-1, first] = b[-1] = 1e3 * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
     scale[scale == 0.0] = 1.0  # a cart that no run shows keeps the smallest values
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
@@ -82,31 +41,61 @@ def first_chain(runs: Sequence[Run], *, springs: Sequence[bool]) -> Chain:
     k = np.zeros(n + 1)
     k[rows] = np.maximum(p[2 * n :], 1e-3 * max(1e-12, np.abs(p[2 * n :]).max(initial=0.0)))
     diagonal = k[:-1] + k[1:]
-    floor = 2 * _SMALLEST_ZETA * np.sqrt(m * np.maximum(diagonal, 1e-12))
+    # No damping ratio below 0.002.
+    floor = 2 * 0.002 * np.sqrt(m * np.maximum(diagonal, 1e-12))
     return Chain(m=m, c=np.maximum(p[n : 2 * n], floor), k=k)
 
 
+def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]]:
+    """Yield what each window of a run says of each cart that moves: equation and right side."""
+    # Windows of 0.3 s, every 50 ms, at the usual pace.
+    step = max(1, round(0.05 * run.pace / run.record.sample_time))
+    width = max(8, round(0.3 * run.pace / run.record.sample_time))
+    x, u, n = run.by_cart(run.y, run.zero), run.input, run.zero.size
+    size = max(1e-12, float(np.abs(x).max()))
+    for first in range(0, run.t.size - width, step):
+        piece = slice(first, first + width)
+        t = run.t[piece]
+        span = t[-1] - t[0]
+        w, w1, w2 = bump((t - t[0]) / span, span=span)
+        local = x[:, piece]
+        stretch = np.vstack([local, np.zeros(width)]) - np.vstack([np.zeros(width), local])
+        for i in run.rows:
+            if not run.free[i]:
+                continue
+            equation = np.zeros(2 * n + len(rows))
+            equation[i] = np.trapezoid(local[i] * w2, t)
+            equation[n + i] = -np.trapezoid(local[i] * w1, t)
+            for at, j in enumerate(rows, start=2 * n):
+                if j in (i, i + 1):
+                    pull = np.trapezoid(stretch[j] * w, t)
+                    equation[at] += pull if j == i else -pull
+            # A held input acts over the sample that follows.
+            force = 0.5 * (u[piece] + np.append(u[first], u[piece][:-1])) if i == 0 else 0 * t
+            yield equation / size, float(np.trapezoid(force * w, t)) / size
+
+
 def fit_baseline(
-    runs: Sequence[Run], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
-) -> tuple[Fit, list[Run]]:
+    runs: Sequence[GapRun], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
+) -> tuple[GapFit, list[GapRun]]:
     """Fit the linear chain; returns it with the runs, their noise now measured.
 
     Short pieces with states of their own first, then whole runs; the better of the stages'
     chain and a first estimate of its own is kept.
     """
     structure = Structure(springs=tuple(springs))
-    shots = [cut_shots(run, length=SHOT_LENGTH) for run in runs]
+    # Over 0.6 s a wrong structure does little harm.
+    shots = [cut_shots(run, length=0.6) for run in runs]
     starts = [chain for chain in (start,) if chain is not None]
     starts.append(first_chain(runs, springs=springs))
-    fits = [
-        fit_model(structure.start(chain), shots, iterations=15, mapper=mapper) for chain in starts
-    ]
+    how = Fitting(mapper=mapper, iterations=15)
+    fits = [fit_model(structure.start(chain), shots, how) for chain in starts]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
-    return fit_model(best, noisy, iterations=25, mapper=mapper), noisy
+    return fit_model(best.anew, noisy, replace(how, iterations=25)), noisy
 
 
-def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[Run]:
+def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:
     """Return the runs with the noise of each cart: encoder step or high-frequency residual."""
     found: dict[int, list[float]] = {}
     resting: dict[int, list[float]] = {}
@@ -115,7 +104,7 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
         for j, row in enumerate(shot.rows):
             for part in (slice(a, b) for a, b in pairwise(shot.shots)):
                 # An encoder at rest repeats itself: only a moving one shows its noise.
-                moving = np.mean(shot.weight[j, part] ** 2) > _MOVING
+                moving = np.mean(shot.weight[j, part] ** 2) > 0.9
                 side = found if moving else resting
                 side.setdefault(row, []).append(high_frequency_noise((shot.y - model)[j, part]))
     out = []
@@ -127,23 +116,11 @@ def measure_noise(fit: Fit, shots: Sequence[Run], runs: Sequence[Run]) -> list[R
     return out
 
 
-def fit_nuisance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+def fit_nuisance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Fit only what belongs to the runs: for runs the model has not seen."""
-    nuisance: Sequence[Nuisance] = [fresh_nuisance(run) for run in runs]
-
-    def follow(nuisance: Sequence[Nuisance]) -> Fit:
-        return fit_model(
-            fit,
-            runs,
-            nuisance=nuisance,
-            spread=fit.spread,
-            shared=False,
-            iterations=10,
-            mapper=mapper,
-        )
-
-    found = follow(nuisance)
+    how = Fitting(mapper=mapper, shared=False, iterations=10)
+    fresh = tuple(fresh_nuisance(run) for run in runs)
+    found = fit_model(replace(fit, nuisance=fresh), runs, how)
     if fit.structure.many_rests and found.chi > fit.chi:
-        again = restart_runs(found, runs, mapper=mapper)
-        found = follow(again.nuisance)
+        found = fit_model(restart_runs(found, runs, mapper), runs, how)
     return found

@@ -9,34 +9,28 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.bounded import bounded_step
 from pipeline.gap.fit.linearise import (
     Linear,
     Nuisance,
     fresh_nuisance,
+    layout_of,
     linearise,
     move_nuisance,
     residual_points,
     run_cost,
 )
-from pipeline.gap.fit.structure import Model
+from pipeline.gap.fit.structure import GapModel
 
 Mapper = Callable[..., Iterable]
 
-_SCATTER_START = 0.05  # spread of friction from run to run, before anything is known
 _SCATTER_FLOOR, _SCATTER_TOP = 0.004, 0.2
-_SCATTER_PRIOR = (3.0, 0.04)  # weight in runs, and spread, of the prior on that spread
-_NUISANCE_SCALES = (1.0, 0.3, 0.05)  # of a run's own step, where the whole one raises its cost
-_HUGE = 1e100  # a slope, where a parameter lets the simulation run away; its square is no number
-_DEAD = 1e-9  # of the strongest column: a weaker one is rounding
-_ANCHOR = 1e6  # standard errors per unit of log mass
 _DAMP, _RELAX, _STIFFEN, _LEAST_DAMP = 1e-3, 6.0, 6.0, 1e-9
-_ATTEMPTS = 5  # at a shorter step, each six times as damped, before the fit has converged
-_RELEASES = 3  # of parameters at their bounds, which are rarely more than one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Fit(Model):
+class GapFit(GapModel):
     """A fitted model.
 
     Attributes
@@ -63,19 +57,56 @@ class Fit(Model):
         """Chi-square per residual."""
         return self.chi_square / self.n_points
 
+    @property
+    def inflation(self) -> float:
+        """By how much the misfit of a model that is still wrong widens the noise."""
+        return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
+
+    @property
+    def scattered(self) -> bool:
+        """Whether the dry friction was let differ from run to run."""
+        return any(bool(np.any(nuisance.scatter != 1.0)) for nuisance in self.nuisance)
+
+    @property
+    def anew(self) -> GapModel:
+        """The model alone: a fit of it begins where runs are expected, not where this one left."""
+        return GapModel(structure=self.structure, theta=self.theta)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Fitting:
+    """How a fit goes.
+
+    Attributes
+    ----------
+    mapper : maps work over runs.
+    iterations : the most there are.
+    tolerance : relative fall of the cost below which it has converged.
+    shared : whether the shared parameters move, or only those of the runs.
+    scatter_free : whether the dry friction may differ from run to run; `learn_spread`: by how much
+        it does is then learnt.
+    """
+
+    mapper: Mapper = map
+    iterations: int = 12
+    tolerance: float = 1e-3
+    shared: bool = True
+    scatter_free: bool = True
+    learn_spread: bool = False
+
 
 def evaluate(
-    model: Model,
-    runs: Sequence[Run],
+    model: GapModel,
+    runs: Sequence[GapRun],
     nuisance: Sequence[Nuisance],
     *,
     spread: Array,
     inflate: float = 1.0,
     mapper: Mapper = map,
-) -> Fit:
+) -> GapFit:
     """Return the fit at given parameters, shared and nuisance, without moving either."""
 
-    def cost(pair: tuple[Run, Nuisance]) -> tuple[float, float]:
+    def cost(pair: tuple[GapRun, Nuisance]) -> tuple[float, float]:
         return run_cost(model, *pair, spread=spread)
 
     costs = np.array(list(mapper(cost, zip(runs, nuisance, strict=True))))
@@ -83,16 +114,16 @@ def evaluate(
 
 
 def _fit_at(
-    model: Model,
-    runs: Sequence[Run],
+    model: GapModel,
+    runs: Sequence[GapRun],
     nuisance: Sequence[Nuisance],
     costs: Array,
     *,
     spread: Array,
     inflate: float,
-) -> Fit:
+) -> GapFit:
     points = np.array([residual_points(run) for run in runs])
-    return Fit(
+    return GapFit(
         structure=model.structure,
         theta=model.theta,
         nuisance=tuple(nuisance),
@@ -106,50 +137,37 @@ def _fit_at(
     )
 
 
-def fit_model(
-    start: Model,
-    runs: Sequence[Run],
-    *,
-    nuisance: Sequence[Nuisance] | None = None,
-    spread: Array | None = None,
-    iterations: int = 12,
-    shared: bool = True,
-    scatter_free: bool = True,
-    learn_spread: bool = False,
-    tolerance: float = 1e-3,
-    mapper: Mapper = map,
-) -> Fit:
+def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     """Fit the shared parameters and every run's nuisance parameters.
 
-    Parameters
-    ----------
-    start : where to begin; without `shared` it stays, and only nuisance parameters move.
-    spread : (n,) expected spread of the dry friction from run to run; learnt if `learn_spread`.
-    tolerance : relative fall of the cost below which the fit has converged.
+    `start` is where to begin; a fit goes on from where it left the same runs.
     """
     structure = start.structure
     low, high = structure.bounds()
+    bounds = low, high, structure.reach()
+    goes_on = start if isinstance(start, GapFit) else None
+    # Until something is known friction differs by 5 % from run to run.
     best = evaluate(
-        Model(structure=structure, theta=np.clip(start.theta, low, high)),
+        GapModel(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
-        [fresh_nuisance(run) for run in runs] if nuisance is None else nuisance,
-        spread=np.full(structure.n, _SCATTER_START) if spread is None else spread,
-        mapper=mapper,
+        goes_on.nuisance if goes_on else [fresh_nuisance(run) for run in runs],
+        spread=goes_on.spread if goes_on else np.full(structure.n, 0.05),
+        mapper=how.mapper,
     )
     damp = _DAMP
-    for iteration in range(iterations):
-        inflate = inflation(best)
+    for iteration in range(how.iterations):
+        inflate = best.inflation
         best = replace(best, cost=best.chi_square + inflate**2 * float(best.run_prior.sum()))
-        linear = _linearise_all(
-            best, runs, inflate=inflate, scatter_free=scatter_free, shared=shared, mapper=mapper
-        )
+        linear = _linearise_all(best, runs, how)
         reduced = [part.reduced for part in linear]
         stacked = np.concatenate([*reduced, anchor(runs, reduced[0].shape[1] - 1)])
-        if not np.all(np.abs(stacked) < _HUGE):
+        # Where a parameter lets the simulation run away the square of its slope is no number.
+        if not np.all(np.abs(stacked) < 1e100):
             break
-        for _attempt in range(_ATTEMPTS):
-            delta = _step(stacked, best.theta, low, high, reach=structure.reach(), damp=damp)
-            trial = _follow(best, runs, linear, delta, inflate=inflate, mapper=mapper)
+        # Shorter steps, each six times as damped, until none is left to try: it has converged.
+        for _attempt in range(5):
+            delta = _step(stacked, best.theta, bounds, damp=damp)
+            trial = _follow(best, runs, linear, delta, how)
             if trial.cost < best.cost:
                 break
             damp = max(damp * _STIFFEN, _DAMP)
@@ -158,93 +176,60 @@ def fit_model(
         fall = (best.cost - trial.cost) / best.cost
         best = trial
         damp = max(damp / _RELAX, _LEAST_DAMP)
-        if learn_spread and iteration >= 1:
+        if how.learn_spread and iteration >= 1:
             best = _learn_spread(best, runs, linear)
-        if fall < tolerance:
+        if fall < how.tolerance:
             break
     return best
 
 
-def inflation(fit: Fit) -> float:
-    """Return by how much the misfit of a model that is still wrong widens the noise."""
-    return max(1.0, float(np.sqrt(fit.chi))) if np.isfinite(fit.chi) else 1.0
-
-
-def _linearise_all(
-    fit: Fit,
-    runs: Sequence[Run],
-    *,
-    inflate: float,
-    scatter_free: bool = True,
-    shared: bool = True,
-    mapper: Mapper,
-) -> list[Linear]:
+def _linearise_all(fit: GapFit, runs: Sequence[GapRun], how: Fitting) -> list[Linear]:
     """Return every run's share of a step from a fit."""
 
-    def share(job: tuple[Run, Nuisance]) -> Linear:
+    def share(job: tuple[GapRun, Nuisance]) -> Linear:
         run, nuisance = job
-        return linearise(
-            fit,
-            run,
-            nuisance,
-            inflate=inflate,
-            spread=fit.spread,
-            scatter_free=scatter_free,
-            shared=shared,
-        )
+        free, shared = how.scatter_free, how.shared
+        layout = layout_of(fit.structure, run.thin, scatter_free=free, shared=shared)
+        return linearise(fit, run, nuisance, layout, inflate=fit.inflation, spread=fit.spread)
 
-    return list(mapper(share, zip(runs, fit.nuisance, strict=True)))
+    return list(how.mapper(share, zip(runs, fit.nuisance, strict=True)))
 
 
 def _step(
-    stacked: Array, theta: Array, low: Array, high: Array, *, reach: Array, damp: float
+    stacked: Array, theta: Array, bounds: tuple[Array, Array, Array], *, damp: float
 ) -> Array:
     """Return the damped step of the shared parameters, inside their bounds and their reach.
 
     `stacked` (rows, moving + 1) has the Jacobian and the residual; with nothing moving it is 0.
     """
     J, r = stacked[:, :-1], stacked[:, -1]
-    delta = np.zeros(theta.size)
-    active = np.arange(J.shape[1])
-    for _ in range(_RELEASES):
-        if active.size == 0:
-            break
+
+    def solve(active: np.ndarray) -> Array:
         scale = np.linalg.norm(J[:, active], axis=0)
-        scale = np.maximum(scale, _DEAD * max(1e-30, scale.max()))
+        # A column weaker than this share of the strongest is rounding.
+        scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
         A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
-        step = np.linalg.lstsq(A, np.concatenate([r, np.zeros(active.size)]), rcond=None)[0]
-        # At a bound, with the step pointing outward, a parameter stays.
-        at = theta[active]
-        out = (at + step <= low[active]) & (at <= low[active])
-        out |= (at + step >= high[active]) & (at >= high[active])
-        if not out.any():
-            delta[active] = step
-            break
-        active = active[~out]
-    # One long step must not carry the others with it: each is clipped by itself.
-    delta = np.clip(delta, -reach, reach)
-    return np.clip(theta + delta, low, high) - theta
+        right = np.concatenate([r, np.zeros(active.size)])
+        return np.asarray(np.linalg.lstsq(A, right, rcond=None)[0], dtype=np.float64)
+
+    # Parameters at their bounds are rarely more than one.
+    return bounded_step(theta, bounds, np.arange(J.shape[1]), solve=solve, rounds=3)
 
 
 def _follow(
-    fit: Fit,
-    runs: Sequence[Run],
-    linear: Sequence[Linear],
-    delta: Array,
-    *,
-    inflate: float,
-    mapper: Mapper,
-) -> Fit:
+    fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear], delta: Array, how: Fitting
+) -> GapFit:
     """Return the fit after a step, the nuisance parameters moved with it.
 
     Less far in a run where that is no gain.
     """
-    model = Model(structure=fit.structure, theta=fit.theta + delta)
+    model, inflate = GapModel(structure=fit.structure, theta=fit.theta + delta), fit.inflation
 
-    def move(job: tuple[Linear, Run, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
+    def move(job: tuple[Linear, GapRun, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
         tried = []
-        for scale in _NUISANCE_SCALES:
+        # A share of the run's own step, where the whole one raises its cost.
+        for scale in (1.0, 0.3, 0.05):
             moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
             cost = run_cost(model, run, moved, spread=fit.spread)
             tried.append((cost[0] + inflate**2 * cost[1], moved, cost))
@@ -254,7 +239,7 @@ def _follow(
         return moved, cost
 
     before = fit.run_chi * fit.run_points + inflate**2 * fit.run_prior
-    moved = list(mapper(move, zip(linear, runs, fit.nuisance, before, strict=True)))
+    moved = list(how.mapper(move, zip(linear, runs, fit.nuisance, before, strict=True)))
     return _fit_at(
         model,
         runs,
@@ -265,18 +250,19 @@ def _follow(
     )
 
 
-def anchor(runs: Sequence[Run], size: int) -> Array:
+def anchor(runs: Sequence[GapRun], size: int) -> Array:
     """Return a row that holds the first free mass where no input gives forces a scale."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
     if not size:
         return np.zeros((0, 1))
     row = np.zeros((1, size + 1))
-    row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = _ANCHOR
+    # In standard errors per unit of log mass.
+    row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = 1e6
     return row
 
 
-def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fit:
+def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear]) -> GapFit:
     """Learn how much the friction of each cart varies."""
     spread = fit.spread.copy()
     factors = np.array([nuisance.scatter for nuisance in fit.nuisance])
@@ -291,7 +277,7 @@ def _learn_spread(fit: Fit, runs: Sequence[Run], linear: Sequence[Linear]) -> Fi
         ]
         if not there:
             continue
-        weight, prior = _SCATTER_PRIOR
+        weight, prior = 3.0, 0.04  # of the prior on that spread: in runs, and its size
         total = weight * prior**2
         for r, j in there:
             column = linear[r].run_wide[j, j]

@@ -9,18 +9,17 @@ Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable le
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.structure import Model, Structure
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.structure import GapModel, Structure
 from pipeline.plant.nonlinear.simulator import sensitivity
-from pipeline.plant.nonlinear.simulator.kernel import simulate_with_derivatives
+from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
 
 _START_STEP = 1e-3  # for differences, of the swing or of the friction
-_TALL = 400  # rows of a matrix that are factorised at once
 _HOME = 0.1  # how firmly the priors hold starts that the data do not show …
 _HELD = 1e6  # … and a velocity that is known to be zero
 _FACTOR_STEP = 0.3  # of a friction factor, at a time: beyond, the friction is another one …
@@ -39,8 +38,13 @@ class Nuisance:
     zero: Array
     scatter: Array
 
+    @property
+    def start(self) -> StartState:
+        """What of it the simulator starts from."""
+        return StartState(self.x0, self.v0, self.scatter)
 
-def fresh_nuisance(run: Run) -> Nuisance:
+
+def fresh_nuisance(run: GapRun) -> Nuisance:
     """Return a run's nuisance parameters where they are expected."""
     n = run.zero.size
     free = np.array(run.free)
@@ -53,43 +57,38 @@ def fresh_nuisance(run: Run) -> Nuisance:
     )
 
 
-def simulate_run(model: Model, run: Run, nuisance: Nuisance) -> Array:
+def simulate_run(model: GapModel, run: GapRun, nuisance: Nuisance) -> Array:
     """Return the readings (rows, samples) of one run, zeros included."""
-    y, _ = _simulate_variants(model.structure, model.theta[None], run, nuisance)
+    y, _ = _simulate_variants(model.structure, model.theta[None], run, [nuisance.start])
     return y[0] + nuisance.zero[list(run.rows)][:, None]
 
 
 def _simulate_variants(
     structure: Structure,
     thetas: Array,
-    run: Run,
-    nuisance: Nuisance,
+    run: GapRun,
+    starts: Sequence[StartState],
     *,
     lanes: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array]:
-    """Return (b, rows, samples) readings of one run for many vectors, zeros left out.
+    """Return (b, rows, samples) readings of one run for many vectors and starts, zeros left out.
 
     And the derivatives (lanes, rows, samples) of the first, by what `lanes` tell: a kind of
     `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
     """
-    cart, spring, drive = structure.tables(thetas)
-    b = len(thetas)
-    y, by = simulate_with_derivatives(
-        cart,
-        spring,
-        drive,
-        np.broadcast_to(nuisance.x0, (b, *nuisance.x0.shape[-2:])),
-        np.broadcast_to(nuisance.v0, (b, *nuisance.v0.shape[-2:])),
-        np.broadcast_to(nuisance.scatter, (b, nuisance.scatter.shape[-1])),
-        np.array(run.free),
-        run.t,
-        run.knots,
-        run.command,
-        np.array(run.shots),
-        1.0,  # the simulator chooses its steps
-        np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
-        guided=run.guided,
-    )
+    y, by = simulate(
+        [(structure.model(theta).tables(), start)
+         for theta, start in zip(thetas, starts, strict=True)],
+        describe_run(
+            run.t,
+            run.command,
+            free=run.free,
+            knots=run.knots,
+            shots=run.shots,
+            guided=run.guided,
+        ),
+        of=np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
+    )  # fmt: skip
     if len(run.rows) == structure.n:
         return y, by
     return y[:, list(run.rows)], by[:, list(run.rows)]
@@ -110,16 +109,22 @@ class Linear:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """Which nuisance parameters a run has: cart indices of each, n more for a hidden mass."""
+    """What moves in a step: the nuisance parameters of a run, and the shared ones or not.
+
+    Cart indices of each, n more for a hidden mass.
+    """
 
     x0: tuple[int, ...]
     v0: tuple[int, ...]
     zero: tuple[int, ...]
     scatter: tuple[int, ...]
     first_v0: bool
+    shared: bool
 
 
-def layout_of(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
+def layout_of(
+    structure: Structure, run: GapRun, *, scatter_free: bool, shared: bool = True
+) -> Layout:
     """Return which nuisance parameters a run has under a structure."""
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
@@ -131,10 +136,11 @@ def layout_of(structure: Structure, run: Run, *, scatter_free: bool) -> Layout:
         zero=run.rows if any(structure.springs) else (),
         scatter=tuple(i for i in free if dry[i]),
         first_v0=not run.at_rest,
+        shared=shared,
     )
 
 
-def _by_shot(residual: Array, run: Run) -> Array:
+def _by_shot(residual: Array, run: GapRun) -> Array:
     """Weigh (…, rows, samples) and cut it into shots, padded with zeros to one length.
 
     Returns (…, shots, rows * longest).
@@ -148,7 +154,7 @@ def _by_shot(residual: Array, run: Run) -> Array:
     return out.reshape(*out.shape[:-2], out.shape[-2] * longest)
 
 
-def residual_points(run: Run) -> float:
+def residual_points(run: GapRun) -> float:
     """Return how many residuals a run adds to a fit, each by its weight."""
     return float((run.thin.weight**2).sum())
 
@@ -161,7 +167,8 @@ def triangle(matrix: Array) -> Array:
     Reference: J. Demmel, L. Grigori, M. Hoemmen, J. Langou, SIAM J. Sci. Comput. 34 (2012), A206.
     """
     *stack, rows, columns = matrix.shape
-    parts = rows // _TALL
+    # So many rows are factorised at once.
+    parts = rows // 400
     if parts > 1:
         even = rows // parts * parts
         tall = matrix[..., :even, :].reshape(*stack, parts, even // parts, columns)
@@ -175,23 +182,21 @@ def _r(matrix: Array) -> Array:
 
 
 def linearise(
-    model: Model,
-    run: Run,
+    model: GapModel,
+    run: GapRun,
     nuisance: Nuisance,
+    layout: Layout,
     *,
     inflate: float,
     spread: Array,
-    scatter_free: bool,
-    shared: bool = True,
 ) -> Linear:
     """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
     `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned; without `shared` only the nuisance parameters move.
+    concerned.
     """
     run = run.thin
-    layout = layout_of(model.structure, run, scatter_free=scatter_free)
-    columns = columns_of(model, run, nuisance, layout, shared=shared)
+    columns = columns_of(model, run, nuisance, layout)
     prior = start_prior(layout, run, usual_sizes(model, run), inflate=inflate)
     starts = prior.shape[1]
     shots = _eliminate_starts(_by_shot(columns / run.sigma[:, None], run), prior)
@@ -203,20 +208,13 @@ def linearise(
     )
 
 
-def columns_of(
-    model: Model,
-    run: Run,
-    nuisance: Nuisance,
-    layout: Layout,
-    *,
-    shared: bool,
-) -> Array:
+def columns_of(model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout) -> Array:
     """Return (., rows, samples) Jacobian by the starts, friction factors, zeros and shared …
 
     … parameters, and the residual last.
     """
     derive = _differences if model.structure.has_contact else _derivatives
-    y, by_nuisance, by_shared = derive(model, run, nuisance, layout, shared=shared)
+    y, by_nuisance, by_shared = derive(model, run, nuisance, layout)
     residual = run.y - y - nuisance.zero[list(run.rows)][:, None]
     by_zero = np.zeros((len(layout.zero), *residual.shape))
     by_zero[range(len(layout.zero)), [run.rows.index(i) for i in layout.zero]] = 1.0
@@ -231,7 +229,7 @@ def _eliminate_starts(points: Array, prior: Array) -> Array:
 
 
 def run_prior(
-    layout: Layout, run: Run, nuisance: Nuisance, columns: int, *, spread: Array, inflate: float
+    layout: Layout, run: GapRun, nuisance: Nuisance, columns: int, *, spread: Array, inflate: float
 ) -> Array:
     """Return (run-wide parameters, columns) of the priors on friction factors and zeros."""
     expected = np.zeros((len(layout.scatter) + len(layout.zero), columns))
@@ -245,7 +243,7 @@ def run_prior(
 
 
 def _derivatives(
-    model: Model, run: Run, nuisance: Nuisance, layout: Layout, *, shared: bool
+    model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
     """Return the readings (rows, samples) and their derivatives (., rows, samples).
 
@@ -258,7 +256,7 @@ def _derivatives(
     ]
     lanes += [(sensitivity.BY_FRICTION, i) for i in layout.scatter]
     local, steps = len(lanes), np.zeros(0)
-    if shared:
+    if layout.shared:
         lanes += [
             (kind, i)
             for kind in (sensitivity.BY_MASS, sensitivity.BY_DAMPING)
@@ -268,7 +266,7 @@ def _derivatives(
         steps = structure.steps()[structure.base_size :]
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)
-    y, by = _simulate_variants(structure, thetas, run, nuisance, lanes=lanes)
+    y, by = _simulate_variants(structure, thetas, run, [nuisance.start] * len(thetas), lanes=lanes)
     # By the logarithm of a number: by itself, times the number.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
@@ -276,7 +274,7 @@ def _derivatives(
 
 
 def _differences(
-    model: Model, run: Run, nuisance: Nuisance, layout: Layout, *, shared: bool
+    model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
     """Return what `_derivatives` does, by differences alone.
 
@@ -284,7 +282,7 @@ def _differences(
     """
     structure, theta = model.structure, model.theta
     position, velocity = usual_sizes(model, run)
-    steps = structure.steps() if shared else np.zeros(0)
+    steps = structure.steps() if layout.shared else np.zeros(0)
     x_steps = _START_STEP * position[list(layout.x0)]
     v_steps = _START_STEP * velocity[list(layout.v0)]
     g_steps = np.full(len(layout.scatter), _START_STEP)
@@ -302,16 +300,14 @@ def _differences(
             values[lane, i] += size
             lane += 1
     thetas = np.repeat(theta[None], b, axis=0)
-    if shared:
+    if layout.shared:
         thetas[lane:] += np.diag(steps)
-    y, _ = _simulate_variants(
-        structure, thetas, run, replace(nuisance, x0=x0, v0=v0, scatter=scatter)
-    )
+    y, _ = _simulate_variants(structure, thetas, run, list(map(StartState, x0, v0, scatter)))
     by = (y[1:] - y[0]) / divisors[:, None, None]
     return y[0], by[: lane - 1], by[lane - 1 :]
 
 
-def usual_sizes(model: Model, run: Run) -> tuple[Array, Array]:
+def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
     """Return the usual positions and velocities (2 n,) of the carts and what hides on them."""
     size = np.maximum(run.swing, 1e-9)
     chain = model.structure.chain(model.theta)
@@ -321,7 +317,9 @@ def usual_sizes(model: Model, run: Run) -> tuple[Array, Array]:
     return np.tile(position, 2), np.tile(position * np.maximum(rate, 1.0), 2)
 
 
-def start_prior(layout: Layout, run: Run, sizes: tuple[Array, Array], *, inflate: float) -> Array:
+def start_prior(
+    layout: Layout, run: GapRun, sizes: tuple[Array, Array], *, inflate: float
+) -> Array:
     """Return (shots, starts, starts) weak priors that keep starts the data do not show at home.
 
     In units of the swing; where a run starts at rest, its first velocity stays zero.
@@ -363,7 +361,9 @@ def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float
     return Nuisance(x0=x0, v0=v0, zero=zero, scatter=np.clip(scatter, *_FACTORS))
 
 
-def run_cost(model: Model, run: Run, nuisance: Nuisance, *, spread: Array) -> tuple[float, float]:
+def run_cost(
+    model: GapModel, run: GapRun, nuisance: Nuisance, *, spread: Array
+) -> tuple[float, float]:
     """Return chi-square of a run, and its prior terms."""
     structure = model.structure
     if not structure.visible(model.theta):

@@ -1,12 +1,13 @@
 """Start the worst runs' nuisance parameters anew, from elsewhere in the friction band."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, evaluate, fit_model
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, evaluate, fit_model
 from pipeline.gap.fit.linearise import Nuisance, residual_points
 from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
 from pipeline.plant.nonlinear.tables import Drive, Tables
@@ -15,7 +16,7 @@ _BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to 
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
-def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
     """Start the worst runs' nuisance parameters anew, elsewhere in the band where carts may rest.
 
     A cart rests anywhere inside the band of friction or cogging, and is zeroed there, so a run's
@@ -27,7 +28,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     band = _rest_band(fit)
     rest = np.array(fit.structure.dry)
 
-    def again(job: tuple[Run, Nuisance, bool, float]) -> Nuisance:
+    def again(job: tuple[GapRun, Nuisance, bool, float]) -> Nuisance:
         run, nuisance, bad, chi = job
         if not bad:
             return nuisance
@@ -44,7 +45,7 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
                 scatter=np.where(rest & free, factor, 1.0),
             )
             trial = fit_model(
-                fit, [run], nuisance=[start], spread=fit.spread, shared=False, iterations=6
+                replace(fit, nuisance=(start,)), [run], Fitting(shared=False, iterations=6)
             )
             if trial.chi_square < lowest:
                 best, lowest = trial.nuisance[0], trial.chi_square
@@ -52,11 +53,10 @@ def restart_runs(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
 
     jobs = zip(runs, fit.nuisance, worst, fit.run_chi, strict=True)
     nuisance = tuple(mapper(again, jobs))
-    inflate = max(1.0, float(np.sqrt(fit.chi)))
-    return evaluate(fit, runs, nuisance, spread=fit.spread, inflate=inflate, mapper=mapper)
+    return evaluate(fit, runs, nuisance, spread=fit.spread, inflate=fit.inflation, mapper=mapper)
 
 
-def _rest_band(fit: Fit) -> Array:
+def _rest_band(fit: GapFit) -> Array:
     """Return (n,) how far from its springs' equilibrium each cart may lie, about one sigma."""
     chain = fit.structure.chain(fit.theta)
     force = holding_force(fit.structure.model(fit.theta).tables())

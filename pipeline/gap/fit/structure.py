@@ -7,14 +7,18 @@ from functools import cached_property
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
+from pipeline.gap.data.runs import GapRun
 from pipeline.plant.linear.chain import Chain
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect, Scales, Term, chain_scales
-from pipeline.plant.nonlinear.tables import Cart, Tables
+from pipeline.plant.nonlinear.effects.base import (
+    AugmentedChain,
+    Effect,
+    EffectTerm,
+    PlaceScales,
+    chain_scales,
+)
+from pipeline.plant.nonlinear.tables import Cart
 
 _SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
-_LARGEST = 1e4
-_FASTEST_HIDDEN = 20.0  # times its cart's frequency: a faster hidden mass moves as one with it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +131,7 @@ class Structure:
         for index, candidate in enumerate(self.effects):
             coordinates = theta[self.span(index)]
             terms.append(
-                Term(
+                EffectTerm(
                     effect=candidate.effect,
                     place=candidate.place,
                     values=tuple(candidate.values(coordinates)),
@@ -135,16 +139,7 @@ class Structure:
             )
         return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))
 
-    def tables(self, thetas: Array) -> Tables:
-        """Return the simulator's tables for many vectors (b, size), stacked."""
-        stacked = [self.model(theta).tables() for theta in thetas]
-        return (
-            np.array([tables[0] for tables in stacked]),
-            np.array([tables[1] for tables in stacked]),
-            np.array([tables[2] for tables in stacked]),
-        )
-
-    def start(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> "Model":
+    def start(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> "GapModel":
         """Return the model of a chain and the effects' parameter values."""
         tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
         parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
@@ -154,26 +149,25 @@ class Structure:
             candidate.coordinates(value)
             for candidate, value in zip(self.effects, values, strict=True)
         ]
-        return Model(structure=self, theta=np.concatenate(parts))
+        return GapModel(structure=self, theta=np.concatenate(parts))
 
     def visible(self, theta: Array) -> bool:
         """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
-        cart, _, _ = self.model(theta).tables()
+        cart = self.model(theta).tables().cart
         hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():
             return True
         of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
         rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
-        return bool(
-            np.all((of_cart[hidden] == 0.0) | (rate < _FASTEST_HIDDEN**2 * of_cart[hidden]))
-        )
+        # A hidden mass that swings 20 times as fast as its cart moves as one with it.
+        return bool(np.all((of_cart[hidden] == 0.0) | (rate < 20.0**2 * of_cart[hidden])))
 
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the vector."""
         low, high = [np.full(self.base_size, -np.inf)], [np.full(self.base_size, np.inf)]
         for c in self.effects:
             for p, scale in zip(c.effect.parameters, c.scales, strict=True):
-                top = min(p.upper, _LARGEST)
+                top = min(p.upper, 1e4)
                 if p.signed:
                     low.append(np.array([-top]))
                     high.append(np.array([top]))
@@ -219,28 +213,28 @@ class Structure:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Model:
+class GapModel:
     """A structure with its vector `theta` (size,): where a fit starts, or ends."""
 
     structure: Structure
     theta: Array
 
     @property
-    def terms(self) -> tuple[Term, ...]:
+    def terms(self) -> tuple[EffectTerm, ...]:
         """The effects with their values, in the structure's order."""
         return self.structure.model(self.theta).terms
 
-    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> "Model":
+    def with_effect(self, candidate: Candidate, values: Sequence[float]) -> "GapModel":
         """Return the model with one more effect, at the values of its parameters."""
-        return Model(
+        return GapModel(
             structure=self.structure.with_effect(candidate),
             theta=np.concatenate([self.theta, candidate.coordinates(values)]),
         )
 
-    def without(self, *indices: int) -> "Model":
+    def without(self, *indices: int) -> "GapModel":
         """Return the model without some of its effects, the rest as it is."""
         spans = [np.r_[self.structure.span(index)] for index in indices]
-        return Model(
+        return GapModel(
             structure=self.structure.without(*indices),
             theta=np.delete(self.theta, np.concatenate(spans)),
         )
@@ -249,16 +243,16 @@ class Model:
 # ----------------------------------------------------------------- the sizes on this bench
 
 
-def bench_scales(runs: Sequence[Run], chain: Chain, *, effect: Effect, place: int) -> Scales:
+def bench_scales(
+    runs: Sequence[GapRun], chain: Chain, *, effect: Effect, place: int
+) -> PlaceScales:
     """Return the typical sizes at one place, from the records and the linear model."""
     n = chain.n
     size = n if effect.place != "spring" else n + 1
     position, velocity = np.full(size + 1, 1e-12), np.full(size + 1, 1e-12)
     level, sample_time = 1e-12, np.inf
     for run in runs:
-        x = np.zeros((n, run.t.size))
-        for j, row in enumerate(run.rows):
-            x[row] = run.y[j] - run.zero[row]
+        x = run.by_cart(run.y, run.zero)
         if effect.place == "spring":
             x = np.vstack([x, np.zeros(run.t.size)]) - np.vstack([np.zeros(run.t.size), x])
         half = max(1, round(0.02 / run.record.sample_time))
@@ -272,8 +266,7 @@ def bench_scales(runs: Sequence[Run], chain: Chain, *, effect: Effect, place: in
         chain,
         place=effect.place,
         at=place,
-        position=position,
-        velocity=velocity,
+        largest=(position, velocity),
         input=level,
         sample_time=max(sample_time, 0.005),
     )

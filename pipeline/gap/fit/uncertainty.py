@@ -18,8 +18,8 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.estimation.colour import score_covariance
 from pipeline.estimation.noise import noise_beyond_rounding
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper, anchor, inflation
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import GapFit, Mapper, anchor
 from pipeline.gap.fit.linearise import (
     Nuisance,
     columns_of,
@@ -31,21 +31,20 @@ from pipeline.gap.fit.linearise import (
 )
 
 _DRAWS = 60  # of the encoders' errors: a standard error is then known to 9 %
-_SEED = 0  # with the record's place in their order: each has draws of its own
 _HIDDEN = 1e-9  # of the strongest: what no run shows is as good as unknown
 
 
-def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
+def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Return the fit with the covariance of its parameters; without, where the model runs away.
 
     Where friction was fitted with one size for all runs, its spread is no part of the error.
     """
-    free = any(np.any(nuisance.scatter != 1.0) for nuisance in fit.nuisance)
 
-    def weigh(job: tuple[int, tuple[Run, Nuisance]]) -> Array:
+    def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> Array:
         index, (run, nuisance) = job
-        rng = np.random.default_rng([_SEED, index])
-        return _weigh(fit, run, nuisance, scatter_free=free, rng=rng)
+        # Seeded by the run's place in their order: each has draws of its own.
+        rng = np.random.default_rng([0, index])
+        return _weigh(fit, run, nuisance, rng=rng)
 
     told = np.sum(list(mapper(weigh, enumerate(zip(runs, fit.nuisance, strict=True)))), axis=0)
     if not np.all(np.isfinite(told)):
@@ -66,16 +65,14 @@ def covariance(fit: Fit, runs: Sequence[Run], *, mapper: Mapper = map) -> Fit:
     return replace(fit, covariance=cov)
 
 
-def _weigh(
-    fit: Fit, run: Run, nuisance: Nuisance, *, scatter_free: bool, rng: np.random.Generator
-) -> Array:
+def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> Array:
     """Return H, and S (each (size, size)) as encoders make it and as the residual shows it.
 
     All NaN where the model, or one a little beside it, runs away.
     """
-    thin, inflate = run.thin, inflation(fit)
-    layout = layout_of(fit.structure, thin, scatter_free=scatter_free)
-    columns = columns_of(fit, thin, nuisance, layout, shared=True)
+    thin, inflate = run.thin, fit.inflation
+    layout = layout_of(fit.structure, thin, scatter_free=fit.scattered)
+    columns = columns_of(fit, thin, nuisance, layout)
     if not np.all(np.isfinite(columns)):
         return np.full((3, fit.theta.size, fit.theta.size), np.nan)
     columns = columns * thin.weight / thin.sigma[:, None]
@@ -102,7 +99,7 @@ def _weigh(
     return np.stack([H, scores.T @ scores / _DRAWS, score_covariance(columns[-1], J)])
 
 
-def _by_piece(columns: Array, run: Run) -> Array:
+def _by_piece(columns: Array, run: GapRun) -> Array:
     """Return columns (starts, rows, samples) as (starts of all pieces, points)."""
     pieces = np.zeros((len(run.shots) - 1, *columns.shape))
     for piece, (first, end) in enumerate(zip(run.shots, run.shots[1:], strict=False)):
@@ -110,7 +107,9 @@ def _by_piece(columns: Array, run: Run) -> Array:
     return pieces.reshape(-1, columns[0].size)
 
 
-def _errors(fit: Fit, run: Run, nuisance: Nuisance, *, rng: np.random.Generator) -> Iterator[Array]:
+def _errors(
+    fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator
+) -> Iterator[Array]:
     """Yield what encoders err by on the fitted motion, as the fit sees it (rows, samples)."""
     x = simulate_run(fit, run, nuisance)
     steps = np.array([run.record.encoder_step(row + 1) for row in run.rows])

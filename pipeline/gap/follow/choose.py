@@ -1,27 +1,24 @@
 """Choose the laws: all at once from nothing, then those of a shape, then drop what is nothing."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.gap import limits
-from pipeline.gap.follow import forces
 from pipeline.gap.follow.drop import criterion, drop_needless, is_better, is_rough
-from pipeline.gap.follow.fit import Follow, start_follow
-from pipeline.gap.follow.laws import Bench, Law, smooth_laws
-from pipeline.gap.follow.records import Records
+from pipeline.gap.follow.fit import Follow, Records
+from pipeline.gap.follow.laws import FollowedBench, TrialLaw, smooth_laws
 from pipeline.gap.follow.score import backlash_laws, score, shaped_trials
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.simulator.terms import Kind
+from pipeline.words.progress import Progress, silent
 
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
-_NEAR_FREE = 0.02
 _FIRST = 25  # iterations of the first fit, from a chain that may be far off
 _FEW = 6  # … and of one that shows whether a rival comes near
 _SHORT_LIST = 4  # of laws with a shape, refitted
-_HOLDS = 1.5  # times what a closer model leaves: a looser one that leaves more lacks something
-_ROUNDS = 6  # of adding one of them: a real bench has several
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
@@ -33,16 +30,14 @@ def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Cha
     largest = max(float(np.abs(track.command).max()) for track in tracks)
     free = tuple(tuple(track.free.tolist()) for track in tracks)
     pinned = int(np.argmax(np.any(free, axis=0))) if largest == 0.0 else None
-    starts = []
+    fits = []
     for chain in chains:
-        bench = Bench(
+        bench = FollowedBench(
             chain=chain, springs=tuple(springs), largest=largest, free=free, pinned=pinned
         )
         laws = smooth_laws(bench, columns=records.columns)
-        starts.append(
-            start_follow(laws, laws.start(chain), tracks, gain=CLOSE, mapper=records.mapper)
-        )
-    fits = [records.fit(start, iterations=_FIRST) for start in starts]
+        start = records.begin(laws, laws.start(chain), gain=CLOSE)
+        fits.append(records.fit(start, iterations=_FIRST))
     return records.fit(min(fits, key=lambda follow: follow.total), gain=LOOSE)
 
 
@@ -51,13 +46,14 @@ def choose_laws(
     *,
     springs: Sequence[bool],
     chains: Sequence[Chain],
-    tell: Callable[[str], None] = lambda text: None,
+    progress: Progress = silent,
 ) -> Follow:
     """Return the model that following finds: the laws that are left, fitted to free runs."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
-    tell(f"all laws fitted together: {len(lean.laws.groups())} are left")
-    for _ in range(_ROUNDS):
+    progress(f"all laws fitted together: {len(lean.laws.groups())} are left")
+    # A real bench has several.
+    for _ in range(6):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
         more = add_shaped(full, records)
@@ -65,7 +61,7 @@ def choose_laws(
             break
         leaner = let_go(more, records)
         added = CATALOGUE[more.laws.keys[-1][0]].title.lower()
-        tell(f"with {added}: {len(leaner.laws.groups())} laws are left")
+        progress(f"with {added}: {len(leaner.laws.groups())} laws are left")
         full = more
         if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner
@@ -101,9 +97,10 @@ def let_go(full: Follow, records: Records) -> Follow:
     carts, and would ask for laws that are not there.
     """
     lean = _one_friction(drop_needless(full, records), records)
-    for gain in (_NEAR_FREE, FREE):
+    for gain in (0.02, FREE):
         loose = records.fit(lean, gain=gain)
-        if not loose.chi < _HOLDS * max(lean.chi, limits.AT_FLOOR):
+        # A looser model that leaves half as much again as a closer one lacks something.
+        if not loose.chi < 1.5 * max(lean.chi, limits.AT_FLOOR):
             break
         lean = drop_needless(loose, records)
     return _look_again(lean, records) if lean.gain == FREE else lean
@@ -113,7 +110,7 @@ def _look_again(lean: Follow, records: Records) -> Follow:
     """Fit all laws once more, now that a free run shows what adds up; drop what is nothing."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     missing = [key for key in everything.keys if key not in lean.laws.keys]
-    extra = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
+    extra = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
     laws, p = replace(lean.laws, drive=everything.drive).with_laws(lean.p, extra)
     again = records.refit(lean, laws, p, iterations=_FEW)
     again = _one_friction(drop_needless(again, records), records)
@@ -126,7 +123,7 @@ def _one_friction(follow: Follow, records: Records) -> Follow:
         here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
         sides = [
             [i for i in here if follow.laws.keys[i][0] in kinds]
-            for kinds in ((forces.COULOMB, forces.STRIBECK), (forces.DAHL,))
+            for kinds in ((Kind.COULOMB_FRICTION, Kind.STICTION), (Kind.PRESLIDING_FRICTION,))
         ]
         if all(sides):
             trials = [
@@ -145,7 +142,7 @@ def rivals_of(lean: Follow, records: Records) -> list[Follow]:
         bare = records.refit(lean, laws, p, gain=LOOSE, iterations=_FEW)
         gone = lean.laws.keys[group] if group >= 0 else None
         taken = {gone, *laws.keys}
-        plain = [Law(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
+        plain = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in everything.keys]
         trials = [*score(bare, records, plain), *shaped_trials(bare, records)]
         trials = sorted(
             (one for one in trials if one.law.key not in taken), key=lambda one: -one.drop

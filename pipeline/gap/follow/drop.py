@@ -3,13 +3,11 @@
 import numpy as np
 
 from pipeline.gap import limits
-from pipeline.gap.follow import forces
-from pipeline.gap.follow.fit import Follow
-from pipeline.gap.follow.records import Records
+from pipeline.gap.follow.fit import Follow, Records
+from pipeline.plant.nonlinear.simulator.terms import Kind
 
 _RIDGE = 1e-10  # of the diagonal
-_SHOWN = 1e-20  # of the strongest parameter's power: a weaker one is not shown
-_CONTACTS = {forces.BACKLASH}
+_CONTACTS = {Kind.BACKLASH}
 
 
 def is_rough(follow: Follow) -> bool:
@@ -62,7 +60,8 @@ def _needless(follow: Follow, records: Records) -> list[int]:
     off = follow.p - follow.laws.neutral()
     low, high, _ = follow.laws.bounds()
     power = np.maximum(np.diag(slope.H), 0.0)
-    usable = (power > _SHOWN * power.max()) & (low < high)
+    # A parameter weaker than this share of the strongest one's power is not shown.
+    usable = (power > 1e-20 * power.max()) & (low < high)
     order = [g for g, at in groups.items() if not np.any(np.abs(off[at]) > 0.0)]
     for g in order:
         usable[follow.laws.whole_group(g)] = False

@@ -1,7 +1,12 @@
 """The forces of the laws that a following model has, and what they are by each parameter."""
 
 from math import exp
+from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
 from pipeline.plant.nonlinear.simulator.state import inlined, tie
 from pipeline.plant.nonlinear.simulator.terms import (
     FRICTION,
@@ -13,15 +18,90 @@ from pipeline.plant.nonlinear.simulator.terms import (
     terms,
 )
 
-# Laws by their effect; that of stiction is what it has beyond Coulomb's friction.
-COULOMB, STRIBECK, LOAD = Kind.COULOMB_FRICTION, Kind.STICTION, Kind.LOAD_FRICTION
-DAHL, DRAG, OFFSET = Kind.PRESLIDING_FRICTION, Kind.QUADRATIC_DRAG, Kind.FORCE_OFFSET
-CUBIC, SLACK, COUPLING = Kind.CUBIC_SPRING, Kind.SLACK_SPRING, Kind.COUPLING_DAMPER
-BRAKING, COGGING, BACKLASH = Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH
-STOP, GAIN, HIDDEN = Kind.END_STOP, Kind.SENSOR_GAIN, Kind.EXTRA_MODE
 DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
 OWN = 2  # numbers of a law's own state, its friction's or a body's; behind them its terms
 ROOM = OWN + TERMS
+
+
+class ActingLaws(NamedTuple):
+    """Which laws act, of which kind, where, and with which parameters.
+
+    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters, those of
+    each law from `first` (laws,) on. `play` is the law of a play between motor and cart 1, or -1.
+    """
+
+    p: Array
+    kinds: NDArray[np.int64]
+    places: NDArray[np.int64]
+    first: NDArray[np.int64]
+    play: int
+
+
+class FollowedRun(NamedTuple):
+    """One run that a model follows, n carts.
+
+    `t` (samples,), `y` (samples, n) are its readings; `seen` and `free` (n,) which carts are
+    compared and which move; `guided` (samples, n) is how held carts move. `held` (3, 2, knots) is
+    the shaped input and its derivatives by dead zone and limit, with their integrals. `zero` and
+    `factor` (n,) are the encoders' zeros and the factors on dry friction of this run. `gain` is the
+    share of the error that corrects the state, `longest` a step, s.
+    """
+
+    t: Array
+    y: Array
+    seen: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    guided: Array
+    knots: Array
+    command: Array
+    held: Array
+    zero: Array
+    factor: Array
+    gain: float
+    longest: float
+
+
+class FollowedState(NamedTuple):
+    """Positions and velocities (n,), the laws' own states and terms `aux` (laws, ROOM).
+
+    And their derivatives by every lane: `DX`, `DV` (n, lanes), `DA` (2 laws, lanes); no lanes where
+    none are wanted. The lanes are the parameters `p`, then those of the run: zeros, starts,
+    velocities, factors on dry friction (n each).
+    """
+
+    x: Array
+    v: Array
+    aux: Array
+    DX: Array
+    DV: Array
+    DA: Array
+
+
+class Room(NamedTuple):
+    """Room to work in during one step.
+
+    Positions `xm` in its middle, forces `f`, sliding friction `R` (n,); slopes of the forces by x
+    and v, `K` and `C` (n, n). `du` (4,) are the derivatives of the input by the drive's parameters,
+    `dlag` (4,) of what a lag leaves. `DF`, `DR` (n, lanes): forces and friction by every lane.
+    """
+
+    xm: Array
+    f: Array
+    R: Array
+    K: Array
+    C: Array
+    du: Array
+    dlag: Array
+    DF: Array
+    DR: Array
+
+
+class Step(NamedTuple):
+    """One step of `h` s: the input that arrives, and whether the drive is powered (1) or not."""
+
+    u: float
+    on: float
+    h: float
 
 
 @inlined
@@ -49,15 +129,15 @@ def reach(x, j, n):
 
 
 @inlined
-def add_forces(p, n, kinds, places, first, factor, u, on, h, v, xm, aux, f, K, C, R):
-    """Add the laws' forces in the middle of a step of h s, and their slopes by x and v.
-
-    Forces `f` (n,), slopes `K` and `C` (n, n), sliding friction `R` (n,).
-    """
-    for law in range(kinds.size):
-        kind, at, o, out = kinds[law], places[law], first[law], aux[law, OWN:]
+def add_forces(laws, run, state, work, step):
+    """Add the laws' forces in the middle of a step, and their slopes by x and v."""
+    p, factor, aux, v, xm, h = laws.p, run.factor, state.aux, state.v, work.xm, step.h
+    n, f, K, C = v.size, work.f, work.K, work.C
+    for law in range(laws.kinds.size):
+        kind, at, o, out = laws.kinds[law], laws.places[law], laws.first[law], aux[law, OWN:]
         if kind in ON_SPRING:
-            terms(kind, p, o, reach(xm, at, n), reach(v, at, n), p[2 * n + at], u, on, out)
+            d, rate, k = reach(xm, at, n), reach(v, at, n), p[2 * n + at]
+            terms(kind, p, o, d, rate, k, step.u, step.on, out)
             pull(f, at, n, out[0])
             tie(K, at, n, out[1])
             tie(C, at, n, out[2])
@@ -65,16 +145,16 @@ def add_forces(p, n, kinds, places, first, factor, u, on, h, v, xm, aux, f, K, C
             settle(kind, p, o, v[at], out)
             aux[law, 1] = out[1] + (aux[law, 0] - out[1]) * exp(-0.5 * h * out[2])
             f[at] -= factor[at] * out[0] * aux[law, 1]
-        elif kind == HIDDEN:
+        elif kind == Kind.EXTRA_MODE:
             rise = p[o + 1] * (aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at])
             rise += p[o + 2] * (aux[law, 1] - v[at])
             f[at] += p[o] * rise
             K[at, at] += p[o] * p[o + 1]
             C[at, at] += p[o] * p[o + 2]
         else:
-            terms(kind, p, o, xm[at], v[at], 0.0, u, on, out)
+            terms(kind, p, o, xm[at], v[at], 0.0, step.u, step.on, out)
             if kind in FRICTION:
-                R[at] += out[0]
+                work.R[at] += out[0]
             else:
                 f[at] += out[0]
                 K[at, at] -= out[1]
@@ -82,21 +162,21 @@ def add_forces(p, n, kinds, places, first, factor, u, on, h, v, xm, aux, f, K, C
 
 
 @inlined
-def add_slopes(
-    p, n, kinds, places, first, factor, du, crossing, h, v, xm, aux, K, C, R, DX, DV, DF, DR, DA
-):
-    """Fill DF and DR (n, lanes): forces and friction by every lane, through the state or not.
+def add_slopes(laws, run, state, work, h, crossing):
+    """Fill DF and DR: forces and friction by every lane, through the state or not.
 
-    `du` (4,) is the input's by the drive's parameters, which act but where a play is crossed.
+    The input's parameters act but where a play is crossed.
     """
-    L, lanes = kinds.size, DX.shape[1]
-    own, drive = p.size, 3 * n + 1
+    p, factor, aux, v, xm = laws.p, run.factor, state.aux, state.v, work.xm
+    DX, DV, DA, DF, DR = state.DX, state.DV, state.DA, work.DF, work.DR
+    n, L, lanes = v.size, laws.kinds.size, DX.shape[1]
+    own, drive, du = p.size, 3 * n + 1, work.du
     for i in range(n):
         for q in range(lanes):
             DF[i, q] = 0.0
         for j in range(n):
-            if K[i, j] != 0.0 or C[i, j] != 0.0:
-                kij, cij = K[i, j], C[i, j]
+            if work.K[i, j] != 0.0 or work.C[i, j] != 0.0:
+                kij, cij = work.K[i, j], work.C[i, j]
                 for q in range(lanes):
                     DF[i, q] -= kij * DX[j, q] + cij * DV[j, q]
     if not crossing:
@@ -105,10 +185,10 @@ def add_slopes(
     for j in range(n + 1):
         pull_lane(DF, 2 * n + j, j, n, reach(xm, j, n))
     for i in range(n):
-        DR[i, own + 3 * n + i] = R[i]
+        DR[i, own + 3 * n + i] = work.R[i]
     for law in range(L):
-        kind, at, o, out = kinds[law], places[law], first[law], aux[law, OWN:]
-        size = (first[law + 1] if law + 1 < L else own) - o
+        kind, at, o, out = laws.kinds[law], laws.places[law], laws.first[law], aux[law, OWN:]
+        size = (laws.first[law + 1] if law + 1 < L else own) - o
         if kind in ON_SPRING:
             for q in range(size):
                 pull_lane(DF, o + q, at, n, out[4 + q])
@@ -132,7 +212,7 @@ def add_slopes(
                 by_q = out[6 + 3 * q] * (1.0 - left) - fading * out[7 + 3 * q]
                 DF[at, o + q] -= factor[at] * out[5 + 3 * q] * aux[law, 1] + most * by_q
             DF[at, own + 3 * n + at] -= out[0] * aux[law, 1]
-        elif kind == HIDDEN:
+        elif kind == Kind.EXTRA_MODE:
             a = p[o]
             apart = aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at]
             rate = aux[law, 1] - v[at]
@@ -160,19 +240,20 @@ def add_slopes(
 
 
 @inlined
-def settle_friction(p, n, kinds, places, first, h, v, aux, derive, DV, DA):
+def settle_friction(laws, state, h):
     """Let the states of presliding friction move on by a step of h s, at its last velocities."""
-    for law in range(kinds.size):
-        kind, at, o, out = kinds[law], places[law], first[law], aux[law, OWN:]
+    p, aux, DV, DA, L = laws.p, state.aux, state.DV, state.DA, laws.kinds.size
+    for law in range(L):
+        kind, at, o, out = laws.kinds[law], laws.places[law], laws.first[law], aux[law, OWN:]
         if kind in HYSTERESIS:
-            settle(kind, p, o, v[at], out)
+            settle(kind, p, o, state.v[at], out)
             left = exp(-h * out[2])
             fading = h * left * (aux[law, 0] - out[1])
-            if derive:
+            if DA.shape[1] > 0:
                 by_v = out[3] * (1.0 - left) - fading * out[4]
                 for q in range(DA.shape[1]):
                     DA[2 * law, q] = left * DA[2 * law, q] + by_v * DV[at, q]
-                size = (first[law + 1] if law + 1 < kinds.size else p.size) - o
+                size = (laws.first[law + 1] if law + 1 < L else p.size) - o
                 for q in range(size):
                     DA[2 * law, o + q] += out[6 + 3 * q] * (1.0 - left) - fading * out[7 + 3 * q]
             aux[law, 0] = out[1] + left * (aux[law, 0] - out[1])

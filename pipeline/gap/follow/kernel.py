@@ -18,10 +18,8 @@ References: H. Abarbanel, D. Creveling, R. Farsian, M. Kostuk, SIAM J. Applied D
 from math import ceil, exp
 
 from pipeline.gap.follow.forces import (
-    BACKLASH,
     DRIVE,
-    GAIN,
-    HIDDEN,
+    Step,
     add_forces,
     add_slopes,
     pull,
@@ -29,56 +27,48 @@ from pipeline.gap.follow.forces import (
     settle_friction,
 )
 from pipeline.plant.nonlinear.simulator.state import jit, tie
+from pipeline.plant.nonlinear.simulator.terms import Kind
 
-VELOCITY_GAIN = 0.3  # of the square of the position's: a little over critical
 _LEAST_SHARE = 0.02  # of cart 1's mass: what is left of it without the motor's
 _BLOWN_UP = 1e6  # times the record's span
 
 
 @jit
-def follow_run(
-    p, n, kinds, places, first, free, seen, guided, t, y, knots, held, command, gain, zero, factor,
-    longest, derive, E, J, x, v, aux, DX, DV, DF, DR, DA, work,
-):  # fmt: skip
-    """Fill the errors E (samples, n) and, where `derive`, J (lanes, samples, n); False: diverged.
+def follow_run(laws, run, state, work, E, J):
+    """Fill the errors E (samples, n) and, of its lanes, J (lanes, samples, n); False: diverged.
 
-    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; behind
-    them the lanes of the run's own: zeros, starts, velocities, factors on dry friction (n each).
-    `held` (3, 2, knots) is the shaped input and its derivatives by dead zone and limit, with
-    their integrals. `guided` (samples, n) is how held carts move. `x`, `v` (n,) start and are
-    used up; `aux` (laws, ROOM) starts at zero.
+    The state is where the run starts, and is used up.
     """
+    p, kinds, places, first, play = laws.p, laws.kinds, laws.places, laws.first, laws.play
+    t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
+    x, v, aux, DX, DV, DA = state.x, state.v, state.aux, state.DX, state.DV, state.DA
+    xm, f, R, K, C, du, dlag = work.xm, work.f, work.R, work.K, work.C, work.du, work.dlag
+    DF, DR, n, gain = work.DF, work.DR, state.x.size, run.gain
     own = p.size  # where the lanes of the run begin
     lanes = DX.shape[1]
+    derive = lanes > 0
     drive, L = 3 * n + 1, kinds.size
     delay, lag = p[drive + 2], max(p[drive + 3], 1e-7)
-    xm, f, R = work[0], work[1], work[2]
-    K, C = work[3 : 3 + n], work[3 + n : 3 + 2 * n]
-    lagged, dlag = held[0, 0, 0], work[3 + 2 * n]
-    for q in range(DRIVE):
-        dlag[q] = 0.0
+    lagged = held[0, 0, 0]
     position = 0
     on = 0
     # A play: the motor is a body of its own while it crosses it; touching, it is one with cart 1.
-    play, side_of = -1, 0.0
-    for law in range(L):
-        if kinds[law] == BACKLASH:
-            play = law
+    side_of = 0.0
     gap = p[first[play]] if play >= 0 else 0.0
     motor = p[first[play] + 1] if play >= 0 else 0.0
     past, past_w, past_l, u_past = 0.0, 0.0, 0.0, held[0, 0, 0]
     for sample in range(t.size):
         step = t[min(sample + 1, t.size - 1)] - t[min(sample, t.size - 2)]
         for i in range(n):
-            if not seen[i]:
+            if not run.seen[i]:
                 continue
             scale = 1.0
             lane_gain = -1
             for law in range(L):
-                if kinds[law] == GAIN and places[law] == i:
+                if kinds[law] == Kind.SENSOR_GAIN and places[law] == i:
                     lane_gain = first[law]
                     scale += p[lane_gain]
-            e = y[sample, i] - scale * x[i] - zero[i]
+            e = run.y[sample, i] - scale * x[i] - run.zero[i]
             E[sample, i] = e
             if derive:
                 for q in range(lanes):
@@ -89,7 +79,8 @@ def follow_run(
             if gain > 0.0:
                 # Whoever is a little off may rest where dry friction holds it: no jolt then.
                 x[i] += gain * e
-                kick = VELOCITY_GAIN * gain * gain / step
+                # A little over critical.
+                kick = 0.3 * gain * gain / step
                 v[i] += kick * e
                 if derive:
                     for q in range(lanes):
@@ -111,7 +102,7 @@ def follow_run(
             if not free[i]:
                 x[i] = guided[sample, i]
                 v[i] = (guided[sample + 1, i] - guided[sample, i]) / step
-        count = ceil(step / longest - 1e-9)
+        count = ceil(step / run.longest - 1e-9)
         h = step / count
         for sub in range(count):
             now = t[sample] + sub * h
@@ -140,7 +131,6 @@ def follow_run(
             share = lag / h * (1.0 - decay)
             mean = u + (lagged - u) * share
             by_lag = (lagged - u) * ((1.0 - decay) / h - decay / lag)
-            du = work[4 + 2 * n]
             du[0] = u_w * (1.0 - share) + dlag[0] * share
             du[1] = u_l * (1.0 - share) + dlag[1] * share
             du[2] = u_t * (1.0 - share) + dlag[2] * share
@@ -153,7 +143,7 @@ def follow_run(
             u = mean
             while on < knots.size - 1 and knots[on + 1] <= now + 0.5 * h:
                 on += 1
-            powered = 1.0 if command[on] != 0.0 else 0.0
+            powered = 1.0 if run.command[on] != 0.0 else 0.0
             # ------------------------------------------------ forces in the middle of the step
             for i in range(n):
                 xm[i] = x[i] + 0.5 * h * v[i]
@@ -172,14 +162,11 @@ def follow_run(
                 k = p[2 * n + j]
                 pull(f, j, n, k * reach(xm, j, n))
                 tie(K, j, n, k)
-            add_forces(p, n, kinds, places, first, factor, u, powered, h, v, xm, aux, f, K, C, R)
+            add_forces(laws, run, state, work, Step(u, powered, h))
             if derive:
-                add_slopes(
-                    p, n, kinds, places, first, factor, du, crossing, h, v, xm, aux, K, C, R, DX,
-                    DV, DF, DR, DA,
-                )  # fmt: skip
+                add_slopes(laws, run, state, work, h, crossing)
             for law in range(L):
-                if kinds[law] == HIDDEN:
+                if kinds[law] == Kind.EXTRA_MODE:
                     at, o = places[law], first[law]
                     aux[law, 0] += 0.5 * h * aux[law, 1]
                     rise = p[o + 1] * (aux[law, 0] - xm[at]) + p[o + 2] * (aux[law, 1] - v[at])
@@ -196,7 +183,7 @@ def follow_run(
                     mass = max(mass - motor, _LEAST_SHARE * mass)
                 whole = mass + half_c
                 pushed = h * f[i] / whole
-                rub = h * factor[i] * R[i] / whole
+                rub = h * run.factor[i] * R[i] / whole
                 target = v[i] * (mass - half_c) / whole + pushed
                 side = 1.0 if (v[i] if v[i] != 0.0 else pushed) > 0.0 else -1.0
                 after = target - side * rub
@@ -286,5 +273,5 @@ def follow_run(
                             DA[at, q], DA[vat, q] = DX[0, q], DV[0, q]
                         DA[at, o] += 0.5 * side_of
                     side_of = 0.0
-            settle_friction(p, n, kinds, places, first, h, v, aux, derive, DV, DA)
+            settle_friction(laws, state, h)
     return True

@@ -11,26 +11,21 @@ from pipeline.arrays import Array
 from pipeline.gap.follow import forces
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects import CATALOGUE
-from pipeline.plant.nonlinear.effects.law import Force, Friction
-from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS
+from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw
+from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS, Kind
 from pipeline.plant.nonlinear.tables import TABLES, Drive
 
 _CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go
 _REACH = 0.3  # of a mass or spring, in one step, …
 _SMALL = 0.1  # … or of this share of the largest, from which on a first estimate is believed
 _DELAY = (-0.05, 0.1)  # s
-_LONGEST_LAG = 0.3  # s
-_LEAST_LIMIT = 0.2  # of the largest input
 _SHORT = 0.01  # s: how far a delay or lag may go in one step
-_CONTACT = 40.0  # of cart 1's springs
-_BOUNCE = (0.02, 0.9)  # of the speed, behind a contact
-_SLACK = 0.95  # of a spring that goes slack, at most
 # By kind, the order of the catalogue: in which coordinates each grows from nothing.
 GROWTHS = tuple(effect.grown for effect in CATALOGUE)
 SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
 POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
 DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
-SIDED = (forces.STOP, forces.SLACK)  # with a position whose sign is the side
+SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # with a position whose sign is the side
 # The columns of the simulator's tables that the laws fill.
 COLUMNS = tuple(
     tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
@@ -39,7 +34,7 @@ COLUMNS = tuple(
 PLAIN = tuple(
     kind
     for kind, effect in enumerate(CATALOGUE)
-    if isinstance(effect.law, Force | Friction) and len(COEFFICIENTS[kind]) == SIZES[kind]
+    if isinstance(effect.law, ForceLaw | FrictionLaw) and len(COEFFICIENTS[kind]) == SIZES[kind]
 )
 Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
 DRIVE_COLUMNS = (
@@ -57,7 +52,7 @@ def column_set(columns: Iterable[IntEnum]) -> frozenset[Column]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Law:
+class TrialLaw:
     """A law at a cart or spring (from 0), with the values of its parameters."""
 
     kind: int
@@ -76,7 +71,7 @@ class Law:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Bench:
+class FollowedBench:
     """What bounds the laws on one bench.
 
     Attributes
@@ -116,13 +111,13 @@ class Bench:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Laws:
+class LawSet:
     """Which laws act: the shape of the vector `p`.
 
     It holds masses, dampings, springs (n + 1), the four values of the drive, then each law's.
     """
 
-    bench: Bench
+    bench: FollowedBench
     keys: tuple[tuple[int, int], ...]
     drive: tuple[bool, ...]  # which of its laws are free
 
@@ -201,8 +196,8 @@ class Laws:
             low[3] = high[3] = chain.k[1]
         low[n : 2 * n] = 0.0
         d, largest = self.drive_at, max(self.bench.largest, 1e-12)
-        low[d : d + 4] = (0.0, _LEAST_LIMIT * largest, _DELAY[0], 0.0)
-        high[d : d + 4] = (0.9 * largest, largest, _DELAY[1], _LONGEST_LAG)
+        low[d : d + 4] = (0.0, 0.2 * largest, _DELAY[0], 0.0)
+        high[d : d + 4] = (0.9 * largest, largest, _DELAY[1], 0.3)
         reach[d : d + 4] = (0.1 * largest, 0.1 * largest, _SHORT, _SHORT)
         neutral = self.neutral_drive()
         for q, free in enumerate(self.drive):
@@ -211,9 +206,10 @@ class Laws:
         for (kind, place), o in zip(self.keys, self.first, strict=True):
             if kind in POSITIVE:
                 low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
-            if kind == forces.SLACK:
-                low[o] = -_SLACK * max(chain.k[place], _SMALL * chain.k.max())
-            elif kind == forces.GAIN:
+            if kind == Kind.SLACK_SPRING:
+                # A spring that goes slack keeps a twentieth.
+                low[o] = -0.95 * max(chain.k[place], _SMALL * chain.k.max())
+            elif kind == Kind.SENSOR_GAIN:
                 low[o], high[o] = -0.5, 0.5
         return low, high, reach
 
@@ -230,18 +226,18 @@ class Laws:
                 low[o + q], high[o + q] = sorted((side * 0.02 * value, side * 50.0 * value))
         return low, high, reach
 
-    def with_laws(self, p: Array, extra: Sequence[Law]) -> tuple["Laws", Array]:
+    def with_laws(self, p: Array, extra: Sequence[TrialLaw]) -> tuple["LawSet", Array]:
         """Return the laws and vector with more of them."""
-        laws = Laws(
+        laws = LawSet(
             bench=self.bench, keys=(*self.keys, *(law.key for law in extra)), drive=self.drive
         )
         return laws, np.concatenate([p, *(law.values for law in extra)])
 
-    def without(self, p: Array, groups: Sequence[int]) -> tuple["Laws", Array]:
+    def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
         """Return the laws and vector without some groups: laws by index, drive from -1 to -4."""
         kept = [i for i in range(len(self.keys)) if i not in groups]
         drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
-        laws = Laws(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
+        laws = LawSet(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
         base = p[: self.base].copy()
         for q, value in enumerate(self.neutral_drive()):
             if not drive[q]:
@@ -272,7 +268,7 @@ class Laws:
     def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
         """Return, by symbol, the parameters of the friction within a law: 0 where it is not."""
         law = CATALOGUE[kind].law
-        if not (isinstance(law, Friction) and law.beyond):
+        if not (isinstance(law, FrictionLaw) and law.beyond):
             return {}
         within = next(i for i, effect in enumerate(CATALOGUE) if effect.key == law.beyond)
         there = dict(zip(self.keys, self.first, strict=True)).get((within, place))
@@ -294,7 +290,7 @@ class Laws:
             table = TABLES[effect.place]
             row = out.setdefault((table, 0 if table is Drive else place), {})
             row.update(effect.columns(effect.grown_values(own)))
-            if kind == forces.BACKLASH:
+            if kind == Kind.BACKLASH:
                 firm, damping = self._contact(p, motor=own["m_m"], bounce=own["e"])
                 row[Drive.BACKLASH_CONTACT_STIFFNESS] = firm
                 row[Drive.BACKLASH_CONTACT_DAMPING] = damping
@@ -305,13 +301,13 @@ class Laws:
 
         What follows is rigid; a bench is not quite. W. Goldsmith, Impact (1960), chapter 4.
         """
-        firm = _CONTACT * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
-        fall = -float(np.log(np.clip(bounce, *_BOUNCE)))
+        firm = 40.0 * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
+        fall = -float(np.log(np.clip(bounce, 0.02, 0.9)))
         both = motor * max(1.0 - motor / float(p[0]), 0.0)
         return firm, 2.0 * fall / float(np.hypot(np.pi, fall)) * float(np.sqrt(firm * both))
 
 
-def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:
+def smooth_laws(bench: FollowedBench, *, columns: frozenset[Column]) -> LawSet:
     """Return every law that needs no shape, at every place: all to start from nothing.
 
     `columns` are those that effects may fill.
@@ -335,4 +331,4 @@ def smooth_laws(bench: Bench, *, columns: frozenset[Column]) -> Laws:
     keys += [(kind, 0) for kind in here("input")]
     kept = tuple(key for key in keys if column_set(COLUMNS[key[0]]) <= columns)
     drive = tuple(driven and (Drive, int(column)) in columns for column in DRIVE_COLUMNS)
-    return Laws(bench=bench, keys=kept, drive=drive)
+    return LawSet(bench=bench, keys=kept, drive=drive)

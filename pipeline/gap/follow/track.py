@@ -5,19 +5,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
+from pipeline.gap.data.runs import GapRun
 from pipeline.gap.follow import forces, kernel
-from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, Bench, Laws
+from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, FollowedBench, LawSet
 from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_RATE = 100.0  # Hz, at the usual pace: some twenty readings in a swing
 _LONGEST = 2.5e-3  # s, of a step, at the usual pace …
 _FREELY = 0.4  # … times this where the model runs on, and the errors of the steps add up
 _KNOCK = 0.25  # … or this where bodies meet in between
-_FOLLOWS = 0.05  # the gain from which on it does not
 _SURE = 1e6  # weight of what is known
-_START = 0.3  # of the swing: how far a release may be from its first readings
-_SPREAD = 0.05  # of dry friction from run to run
 _FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
 
 
@@ -68,10 +65,11 @@ class Track:
     def prior(self, own: Own, dry: np.ndarray) -> tuple[Array, Array]:
         """Return (4 n,) weights of the priors on its own parameters, and their residuals."""
         n = self.free.size
-        start = np.full(n, _SURE if self.at_rest else 1.0 / max(_START * self.swing, 1e-12))
+        # A release may be a third of the swing from its first readings.
+        start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))
         speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
         start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
-        factor = np.where(dry, 1.0 / _SPREAD, _SURE)
+        factor = np.where(dry, 1.0 / 0.05, _SURE)  # dry friction differs by 5 % from run to run
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
         # An unknown velocity needs some hold, or a run that is followed closely has none.
@@ -90,11 +88,12 @@ class Track:
         )
 
 
-def make_track(run: Run, *, rate: float = _RATE) -> Track:
+def make_track(run: GapRun) -> Track:
     """Thin a run to what a swing needs."""
     n = run.zero.size
     sampled = 1.0 / float(np.median(np.diff(run.t)))
-    thin = replace(run, block=max(1, int(sampled * run.pace / rate))).thin
+    # 100 Hz, at the usual pace: some twenty readings in a swing.
+    thin = replace(run, block=max(1, int(sampled * run.pace / 100.0))).thin
     y, weight = np.zeros((thin.t.size, n)), np.zeros((thin.t.size, n))
     seen, free = np.zeros(n, dtype=np.bool_), np.array(run.free)
     for j, row in enumerate(thin.rows):
@@ -121,36 +120,47 @@ def make_track(run: Run, *, rate: float = _RATE) -> Track:
 
 
 def errors_of(
-    laws: Laws, p: Array, track: Track, own: Own, *, gain: float, derive: bool
+    laws: LawSet, p: Array, track: Track, own: Own, *, gain: float, derive: bool
 ) -> tuple[Array, Array] | None:
     """Return errors (samples, n) and derivatives of the model's readings (lanes, samples, n).
 
     None where the model runs away. Lanes: the vector, then zeros, shifts, velocities, factors.
     """
-    n = laws.bench.n
+    n, count = laws.bench.n, len(laws.keys)
     lanes = p.size + 4 * n if derive else 0
-    at = laws.drive_at
-    held = _shaped(track, p[at + DEAD_ZONE], p[at + LIMIT])
     E, J = np.zeros((track.t.size, n)), np.zeros((lanes, track.t.size, n))
     x = np.where(track.free, track.start - own.zero + own.shift, 0.0)
     DX, DV = np.zeros((n, lanes)), np.zeros((n, lanes))
     for i in np.flatnonzero(track.free) if derive else ():
         DX[i, p.size + i], DX[i, p.size + n + i], DV[i, p.size + 2 * n + i] = -1.0, 1.0, 1.0
-    count = len(laws.keys)
     aux, DA = np.zeros((count, forces.ROOM)), np.zeros((2 * count, lanes))
     for law, (kind, place) in enumerate(laws.keys):
-        if kind in (forces.HIDDEN, forces.BACKLASH):
+        if kind in (Kind.EXTRA_MODE, Kind.BACKLASH):
             aux[law, : forces.OWN] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
-    room = np.zeros((n, lanes)), np.zeros((n, lanes)), DA, np.zeros((6 + 2 * n, max(n, 4)))
-    longest = track.longest * (1.0 if gain > _FOLLOWS else _FREELY)
-    if forces.BACKLASH in laws.kinds:
+    play = max(np.flatnonzero(laws.kinds == Kind.BACKLASH), default=-1)
+    # At such a gain nothing adds up.
+    longest = track.longest * (1.0 if gain > 0.05 else _FREELY)
+    if play >= 0:
         longest = min(longest, _KNOCK * track.longest)
-    fine = kernel.follow_run(
-        p, n, laws.kinds, laws.places, laws.first, track.free, track.seen, track.guided, track.t,
-        track.y, track.knots, held, track.command, float(gain), own.zero, own.factor, longest,
-        derive, E, J, x, own.v0.copy(), aux, DX, DV, *room,
-    )  # fmt: skip
+    run = forces.FollowedRun(
+        t=track.t,
+        y=track.y,
+        seen=track.seen,
+        free=track.free,
+        guided=track.guided,
+        knots=track.knots,
+        command=track.command,
+        held=_shaped(track, p[laws.drive_at + DEAD_ZONE], p[laws.drive_at + LIMIT]),
+        zero=own.zero,
+        factor=own.factor,
+        gain=float(gain),
+        longest=longest,
+    )
+    state = forces.FollowedState(x, own.v0.copy(), aux, DX, DV, DA)
+    room = (np.zeros(shape) for shape in (n, n, n, (n, n), (n, n), 4, 4, (n, lanes), (n, lanes)))
+    acting = forces.ActingLaws(p, laws.kinds, laws.places, laws.first, int(play))
+    fine = kernel.follow_run(acting, run, state, forces.Room(*room), E, J)
     return (E, J) if fine and np.all(np.isfinite(E)) else None
 
 
@@ -180,6 +190,6 @@ def compile_follower() -> None:
         longest=_LONGEST, swing=1.0,
     )  # fmt: skip
     chain = Chain(m=one, c=one, k=np.array([1.0, 0.0]))
-    bench = Bench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))
-    laws = Laws(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+    bench = FollowedBench(chain=chain, springs=(True, False), largest=1.0, free=((True,),))
+    laws = LawSet(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
     errors_of(laws, laws.start(chain), track, track.fresh(), gain=0.0, derive=True)

@@ -1,18 +1,21 @@
 """A hypothesis: effects at places, fitted, and judged on runs the fit has not seen."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.gap import limits
 from pipeline.gap.data.independent import independent
-from pipeline.gap.data.runs import Run
+from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.baseline import fit_nuisance
-from pipeline.gap.fit.levenberg_marquardt import Fit, Mapper
+from pipeline.gap.fit.levenberg_marquardt import Fitting, GapFit, Mapper, fit_model
 from pipeline.gap.fit.linearise import simulate_run
+from pipeline.gap.fit.structure import GapModel
 from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.words.progress import Progress, silent
 
 _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
@@ -25,8 +28,8 @@ class Hypothesis:
     `held_news` are how many of the residuals are independent.
     """
 
-    fit: Fit
-    held: Fit
+    fit: GapFit
+    held: GapFit
     error: float
     bic: float
     news: float
@@ -73,21 +76,37 @@ class Hypothesis:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Study:
-    """What every step of the search needs: runs, springs, catalogue, and who maps over runs.
+    """What every step of the search needs: runs, springs, catalogue, and how fits go.
 
     `repeatability` is the relative error between runs with the same input, 0 without any. `whole`
     are the training runs with the end of the one whose end is held out, where what adds up over a
     whole run must show in the numbers: on no spring.
     """
 
-    training: tuple[Run, ...]
-    held_out: tuple[Run, ...]
+    training: tuple[GapRun, ...]
+    held_out: tuple[GapRun, ...]
     springs: tuple[bool, ...]
     catalogue: tuple[Effect, ...]
-    repeatability: float
-    mapper: Mapper
-    tell: Callable[[str], None]
-    whole: tuple[Run, ...] = ()
+    repeatability: float = 0.0
+    fitting: Fitting = field(default_factory=Fitting)
+    progress: Progress = silent
+    whole: tuple[GapRun, ...] = ()
+
+    @property
+    def mapper(self) -> Mapper:
+        """Who maps over runs."""
+        return self.fitting.mapper
+
+    def fit(self, start: GapModel, **how: Any) -> GapFit:
+        """Fit a model to the training runs, as `Fitting` says but for the changes in `how`."""
+        return fit_model(start, self.training, replace(self.fitting, **how))
+
+    def with_noise(self, training: Sequence[GapRun]) -> "Study":
+        """Return the study with these training runs, and their noise in all others."""
+        sigma = {row: s for run in training for row, s in zip(run.rows, run.sigma, strict=True)}
+        held_out = tuple(run.with_noise(sigma) for run in self.held_out)
+        whole = tuple(run.with_noise(sigma) for run in self.whole)
+        return replace(self, training=tuple(training), held_out=held_out, whole=whole)
 
     @property
     def floor(self) -> float:
@@ -101,6 +120,11 @@ class Study:
         enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
+    def may_be_half(self, hypothesis: Hypothesis) -> bool:
+        """Tell whether more is left than a contact's own law, or what repeats do, explains."""
+        enough = max(limits.FURTHER * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
+        return hypothesis.error > enough and not hypothesis.has_contact
+
     def is_noise(self, hypothesis: Hypothesis) -> bool:
         """Tell whether nothing is left: of any run, or on held-out ones beyond what repeats do."""
         quiet = hypothesis.error < limits.NOTHING * self.floor
@@ -109,9 +133,9 @@ class Study:
         return hypothesis.at_floor or quiet or as_repeats
 
 
-def judge(fit: Fit, study: Study) -> Hypothesis:
+def judge(fit: GapFit, study: Study) -> Hypothesis:
     """Return the hypothesis a fit stands for."""
-    held = fit_nuisance(fit, study.held_out, mapper=study.mapper)
+    held = fit_nuisance(fit, study.held_out, study.mapper)
     errors, sizes = [], []
     for run, left in zip(study.held_out, _residuals(held, study.held_out), strict=True):
         errors.append(float((left**2).sum()))
@@ -128,7 +152,7 @@ def judge(fit: Fit, study: Study) -> Hypothesis:
     )
 
 
-def _residuals(fit: Fit, runs: Sequence[Run]) -> list[Array]:
+def _residuals(fit: GapFit, runs: Sequence[GapRun]) -> list[Array]:
     """Return measured minus simulated positions (rows, samples) of each run."""
     return [
         run.y - simulate_run(fit, run, nuisance)
@@ -136,7 +160,7 @@ def _residuals(fit: Fit, runs: Sequence[Run]) -> list[Array]:
     ]
 
 
-def _news(fit: Fit, runs: Sequence[Run]) -> float:
+def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
     """Return how many residuals tell as much as independent ones.
 
     What a model leaves that is not noise swings with the carts: few of its points are news.

@@ -1,183 +1,188 @@
-"""Search the catalogue: laws chosen while the model follows, then fitted to free runs, judged.
+"""One search for what acts on a bench, step by step."""
 
-Nothing is tried one by one: all laws at all places are fitted together from nothing to a model
-that follows the measurement, and those that are nothing are dropped (`gap.follow`). What is left
-is fitted to whole runs, each effect must be worth it on runs the fit has not seen, and rivals
-come from the same fit with one law exchanged.
-"""
-
-from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 
-import numpy as np
+from pipeline.gap import limits
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.baseline import measure_noise
+from pipeline.gap.fit.levenberg_marquardt import GapFit, fit_model
+from pipeline.gap.fit.linearise import Nuisance
+from pipeline.gap.fit.restart import holding_force
+from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.search.deadline import Deadline, OutOfTime
+from pipeline.gap.search.find import find_hypotheses
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
+from pipeline.gap.search.offset import find_offset
+from pipeline.gap.search.prune import steps_to, without_nothing
+from pipeline.gap.search.verdict import reach_verdict
+from pipeline.gap.search.whole import finish, fit_whole
+from pipeline.gap.types import Verdict
+from pipeline.words.phrases import phrases
 
-from pipeline.gap.fit.baseline import first_chain
-from pipeline.gap.fit.levenberg_marquardt import Fit
-from pipeline.gap.fit.structure import Candidate, Model
-from pipeline.gap.follow.choose import Records, choose_laws, rivals_of
-from pipeline.gap.follow.fit import Follow
-from pipeline.gap.follow.track import make_track
-from pipeline.gap.limits import SURE
-from pipeline.gap.search.deadline import OutOfTime
-from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
-from pipeline.gap.search.translate import as_model, filled, make_candidate
-from pipeline.gap.search.whole import finish, fit_on, fit_whole
-from pipeline.plant.nonlinear.effects import find_effect
 
-_FEW = 4  # effects tried at a time: least sure means only roughly least missed
-_LOOSER = (0.02, 0.01, 0.005, 0.002, 0.0)  # gains
+class Search:
+    """A search: each of its steps goes on from what the last one left.
 
-
-def search(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return the hypothesis chosen and all that were judged, the baseline first.
-
-    Past the time allowed, the best of those so far.
+    Attributes
+    ----------
+    study : the runs, and how fits go; another one where another noise or other sides serve better.
+    linear : the linear chain that fits the training runs.
+    chosen, found : the best hypothesis so far, and all that were judged, the linear one first.
+    path : from the linear model to the chosen one, an effect at a time.
+    verdict, close : what it amounts to; under `ambiguous` the rivals.
+    final : the chosen fit with its covariance, its numbers from whole runs to their end.
+    notes : what a reader must know.
     """
-    found = [baseline]
-    with suppress(OutOfTime):
-        records = Records(
-            tracks=tuple(make_track(run) for run in study.training),
-            mapper=study.mapper,
-            columns=frozenset().union(*(filled(effect) for effect in study.catalogue)),
-        )
-        chain = baseline.fit.structure.chain(baseline.fit.theta)
-        own = first_chain(study.training, springs=study.springs)
-        lean = choose_laws(records, springs=study.springs, chains=[chain, own], tell=study.tell)
-        if not lean.laws.groups():
-            return baseline, found
-        found.append(judge(fit_whole(_as_model(lean, study, records), study), study))
-        study.tell(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
-        for rival in rivals_of(lean, records):
-            found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
-        found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
-        # What ends at a bound is often nothing: it goes, and what remains is sound.
-        chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
-        sound = [h for h in found if h.sound and np.isfinite(h.error)]
-        if not chosen.sound:
-            chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
-        usable = chosen.sound and np.isfinite(chosen.error)
-        return chosen if usable else baseline, [h for h in found if h.sound]
-    found = [h for h in found if np.isfinite(h.error) and h.sound]
-    worth = [h for h in found if worth_it(h, baseline, study)]
-    return min(worth, key=lambda h: h.bic, default=baseline), found
 
+    chosen: Hypothesis
+    found: list[Hypothesis]
+    path: tuple[Hypothesis, ...]
+    verdict: Verdict
+    close: list[Hypothesis]
+    final: GapFit
 
-def _as_model(follow: Follow, study: Study, records: Records) -> Model:
-    """Return what a following model says, in effects of the catalogue."""
-    if not any(study.springs):
-        # On no spring errors add up: what a model lacks misleads a fit that is free at once.
-        for gain in _LOOSER:
-            follow = records.fit(follow, gain=gain) if gain < follow.gain else follow
-    return as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)
+    def __init__(self, study: Study, linear: GapFit, deadline: Deadline) -> None:
+        """Begin with the linear chain, fitted to the training runs of the study."""
+        self.study, self.linear, self.deadline = study, linear, deadline
+        self.notes: list[str] = []
 
+    # ------------------------------------------------------------------------ the steps
 
-def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
-    """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
+    def find_effects(self) -> None:
+        """Choose the effects, unless the linear model leaves no more than noise or repeats do."""
+        self.chosen, self.found = self._look(self.study)
 
-    And those that are nothing within their error. Of the least sure few, what is missed least
-    goes first; what is lost adds up, so each is compared with the best so far.
-    """
-    best = chosen
-    while chosen.key:
-        effects = chosen.fit.structure.effects
-        sure = sureness(finish(chosen.fit, study))
-        order: list[int] = np.argsort(sure, kind="stable").tolist()
-        for few in (order[:_FEW], order[_FEW:]):
-            needless = []
-            for index in few:
-                plainer = _plainer(chosen, effects[index], study)
-                if plainer is not None:
-                    found.append(plainer)
-                    needless += [plainer] if plainer.sound and plainer.bic < chosen.bic else []
-                without = found[0]
-                if len(effects) > 1:
-                    without = _without(chosen, effects[index], study)
-                    found.append(without)
-                nothing = sure[index] < SURE  # it goes, wherever that leads the others
-                if nothing or (without.sound and _as_good(without, best, study)):
-                    needless.append(without)
-            if needless:
-                chosen = min(needless, key=lambda h: h.bic)
-                best = min(best, chosen, key=lambda h: h.error)
+    def measure_noise_anew(self) -> None:
+        """Search again where less is left than was taken for noise.
+
+        The misfit of the linear model was in it.
+        """
+        for _ in range(2):
+            if self.chosen.fit.chi > limits.TOO_GOOD or self.deadline.cut:
+                return
+            training = self.study.training
+            self._try(self.study.with_noise(measure_noise(self.chosen.fit, training, training)))
+
+    def change_sides(self) -> None:
+        """Search again where nothing is missing but on the held-out runs.
+
+        An effect that acts only in those cannot be found from the training runs.
+        """
+        left = self.chosen.fit.chi, self.chosen.held.chi
+        if not left[0] < limits.NEAR_FLOOR**2 < left[1] or self.deadline.cut:
+            return
+        sides = {"training": self.study.held_out, "held_out": self.study.training}
+        if self._try(replace(self.study, **sides), only_at_floor=True):
+            self.notes.append(phrases("gap").text("note_sides"))
+
+    def add_constant_force(self) -> None:
+        """Add a constant force, where the rest points ask for one.
+
+        With the force in the model the encoders' zeros are those of the file, within half a noise:
+        then all is judged so.
+        """
+        self.path = steps_to(self.chosen, self.found, self.study)
+        with suppress(OutOfTime):
+            self._add_constant_force(self._timed(self.study))
+
+    def reach_verdict(self) -> None:
+        """Settle what is chosen, and say what it amounts to."""
+        study = self.study
+        sample_time = max(run.record.sample_time for run in study.training)
+        while True:
+            self.verdict, self.path, self.close = reach_verdict(
+                self.path, self.found, study=study, sample_time=sample_time
+            )
+            self.chosen = self.path[-1]
+            with suppress(OutOfTime):
+                self._settle(self._timed(study))
+            self.final = finish(self.chosen.fit, study)
+            without = without_nothing(self.chosen, self.final, study)
+            if without is None:
                 break
-        else:
-            break
-    return chosen
+            # Fitted to its end, an effect may turn out to be nothing.
+            self.found = [*self.found, *self.path, without]
+            self.path = steps_to(without, self.found, study)
+        if not study.whole:
+            self.chosen = replace(self.chosen, fit=self.final)
+        self.path = (*self.path[:-1], self.chosen)
+        if self.verdict == "named" and not study.explains(self.chosen):
+            self.verdict = "partial"
 
+    # ------------------------------------------------------------------- what they leave
 
-def without_nothing(chosen: Hypothesis, final: Fit, study: Study) -> Hypothesis | None:
-    """Return a hypothesis without its least sure effect, where that may be nothing; or None.
+    @property
+    def judged(self) -> list[tuple[GapRun, Nuisance]]:
+        """The runs by which the final model is judged, each with its nuisance parameters."""
+        study = self.study
+        if study.whole:
+            return list(zip(study.whole, self.final.nuisance, strict=True))
+        nuisance = (*self.final.nuisance, *self.chosen.held.nuisance)
+        return list(zip((*study.training, *study.held_out), nuisance, strict=True))
 
-    `final` is its fit with the covariance.
-    """
-    sure = sureness(final)
-    if not sure or min(sure) >= SURE:
-        return None
-    return _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
+    # ------------------------------------------------------------------------- inside
 
+    def _timed(self, study: Study) -> Study:
+        """Return a study whose fits end with the time allowed."""
+        return replace(study, fitting=replace(study.fitting, mapper=self.deadline.map))
 
-def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
-    """Does a hypothesis without one of the effects do about as well?
+    def _look(self, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
+        """Return the hypothesis chosen and all that were judged in time, the linear one first."""
+        baseline = judge(self.linear, study)
+        if baseline.at_floor or baseline.error < limits.AS_REPEATS * study.repeatability:
+            return baseline, [baseline]
+        study.progress(f"linear model: error {baseline.error:.1%} of the motion on held-out runs")
+        return find_hypotheses(baseline, self._timed(study))
 
-    Where much is left for another reason, the criterion's drop is small: an effect that lowers the
-    error of runs not seen by a tenth is kept there, if the criterion is for it at all.
-    """
-    if worth_it(chosen, without, study):
-        return False
-    if study.explains(chosen):
-        return True
-    return without.bic < chosen.bic or not lowers_error(chosen, without, study)
+    def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
+        """Search under another study; tell whether it was kept: not if the time was over."""
+        self.linear = fit_model(self.linear.anew, study.training, study.fitting)
+        chosen, found = self._look(study)
+        kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)
+        if kept:
+            self.study, self.chosen, self.found = study, chosen, found
+        return kept
 
-
-def sureness(fit: Fit) -> list[float]:
-    """Return how many standard errors each effect is from nothing, by its least sure parameter."""
-    structure = fit.structure
-    if fit.covariance is None:
-        return [np.inf] * len(structure.effects)
-    std = np.sqrt(np.diag(fit.covariance)) * structure.physical_derivative(fit.theta)
-    return [
-        min(
-            (
-                abs(value - p.neutral) / error
-                for p, value, error in zip(
-                    term.effect.parameters, term.values, std[structure.span(index)], strict=True
-                )
-                if p.neutral is not None and p.reported
-            ),
-            default=np.inf,
+    def _add_constant_force(self, study: Study) -> None:
+        chosen, structure = self.chosen, self.chosen.fit.structure
+        effect = next((effect for effect in study.catalogue if effect.only_rest), None)
+        runs = [*study.training, *study.held_out]
+        nuisance = [*chosen.fit.nuisance, *chosen.held.nuisance]
+        offset = find_offset(structure.chain(chosen.fit.theta), runs, nuisance)
+        if effect is None or offset is None:
+            return
+        holding = holding_force(structure.model(chosen.fit.theta).tables())
+        if abs(offset.force) < holding[offset.cart - 1]:
+            # What holds a cart as far from its equilibrium is there: no proof of a constant force.
+            return
+        pinned, loose = (
+            replace(
+                study,
+                training=tuple(run.with_zeros(width=width) for run in study.training),
+                held_out=tuple(run.with_zeros(width=width) for run in study.held_out),
+            )
+            for width in (1e-4, 0.5)  # noises: not off at all; off by the rounding
         )
-        for index, term in enumerate(fit.terms)
-    ]
+        candidate = Candidate(
+            effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
+        )
+        without = tuple(judge(fit_whole(h.fit.anew, pinned), pinned) for h in self.path)
+        fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
+        final = judge(fit, loose)
+        as_good = limits.OFFSET_AS_FREE * chosen.error
+        if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):
+            return
+        # The others were judged with the encoders' zeros free.
+        self.path, self.found = (*without, final), [*without, final]
+        self.study = replace(loose, fitting=self.study.fitting)
 
+    def _settle(self, study: Study) -> None:
+        """Go on until the cost falls no more: a search ends within some standard errors.
 
-def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
-    """Return the hypothesis without one of its effects, fitted from where it is."""
-    index = hypothesis.fit.structure.effects.index(effect)
-    return judge(fit_on(hypothesis.fit, hypothesis.fit.without(index), study), study)
-
-
-def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with the law that a richer one grew from in its place."""
-    if rich.effect.grows_from is None:
-        return None
-    index = hypothesis.fit.structure.effects.index(rich)
-    effect = find_effect(rich.effect.grows_from)
-    values = [hypothesis.fit.terms[index].values[rich.effect.names.index(name)]
-              for name in effect.names]  # fmt: skip
-    chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
-    plain = make_candidate(effect, rich.place, values, runs=study.training, chain=chain)
-    model = hypothesis.fit.without(index).with_effect(plain, values)
-    return judge(fit_on(hypothesis.fit, model, study), study)
-
-
-def steps_to(
-    chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
-) -> tuple[Hypothesis, ...]:
-    """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
-    steps = [chosen]
-    while effects := steps[0].fit.structure.effects:
-        known = {h.key: h for h in found}
-        rest = [(steps[0].key - {effect.key}, effect) for effect in effects]
-        smaller = [known.get(key) or _without(steps[0], effect, study) for key, effect in rest]
-        steps.insert(0, min(smaller, key=lambda h: h.error))
-    return tuple(steps)
+        The `bic` stays: rivals are compared as the search left them, and so is the chosen one.
+        """
+        fit = self.chosen.fit
+        # A hundredth of chi-square is a tenth of a standard error.
+        fit = study.fit(fit, scatter_free=fit.scattered, tolerance=0.01 / fit.n_points)
+        self.chosen = replace(judge(fit, study), bic=self.chosen.bic)

@@ -5,8 +5,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.structure import Candidate, Model, Structure, bench_scales
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.structure import Candidate, GapModel, Structure, bench_scales
 from pipeline.gap.follow.fit import Follow
 from pipeline.gap.follow.laws import Column, column_set
 from pipeline.plant.linear.chain import Chain
@@ -37,8 +37,8 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 
 
 def as_model(
-    follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[Run]
-) -> Model:
+    follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
+) -> GapModel:
     """Return the model with the effects that the laws are: of those that fit the largest first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
     chain = follow.laws.chain(follow.p)
@@ -59,7 +59,7 @@ def as_model(
 
 
 def make_candidate(
-    effect: Effect, place: int, values: Sequence[float], *, runs: Sequence[Run], chain: Chain
+    effect: Effect, place: int, values: Sequence[float], *, runs: Sequence[GapRun], chain: Chain
 ) -> Candidate:
     """Return an effect at a place, with the signs of values and its typical sizes there."""
     scales = bench_scales(runs, chain, effect=effect, place=place)
@@ -67,5 +67,5 @@ def make_candidate(
         effect=effect,
         place=place,
         signs=tuple(-1.0 if value < 0.0 else 1.0 for value in values),
-        scales=tuple(p.scale(scales) for p in effect.parameters),
+        scales=tuple(p.size(scales) for p in effect.parameters),
     )

@@ -6,62 +6,47 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.fit.linearise import Nuisance, simulate_run
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Hypothesis, Study
 from pipeline.gap.types import Contender, FoundEffect, NamedValue, RecordGap, Rival, Trace
 from pipeline.plant.nonlinear.effects import find_effect
-from pipeline.plant.nonlinear.effects.base import Term
+from pipeline.plant.nonlinear.effects.base import EffectTerm
+from pipeline.set_up import Units
 
 _MOST_RIVALS = 4  # listed
-_CONTENDERS = 3  # among which an experiment is to decide
 _SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # share of the samples, and of the largest input: a repeat
-_EDGES = 0.02  # share of the samples that may differ, by one at each edge of the input
 
 
 def list_effects(
-    path: Sequence[Hypothesis],
-    final: Fit,
-    found: Sequence[Hypothesis],
-    *,
-    position_unit: str,
-    input_unit: str,
+    path: Sequence[Hypothesis], final: GapFit, found: Sequence[Hypothesis], units: Units
 ) -> tuple[FoundEffect, ...]:
     """Return the effects of the final fit, each with its step on the path and its rivals."""
-    structure = final.structure
-    terms = structure.model(final.theta).terms
-    chosen = path[-1]
+    structure, chosen = final.structure, path[-1]
     same_size = {h.key: h for h in found if len(h.key) == len(chosen.key)} | {chosen.key: chosen}
     lowest = min(h.bic for h in same_size.values())
     weight = {key: float(np.exp(-0.5 * (h.bic - lowest))) for key, h in same_size.items()}
-    total = sum(weight.values())
-    to_physical = structure.physical_derivative(final.theta)
-    std = np.sqrt(np.diag(final.covariance)) * to_physical if final.covariance is not None else None
+    total, std = sum(weight.values()), None
+    if final.covariance is not None:
+        std = np.sqrt(np.diag(final.covariance)) * structure.physical_derivative(final.theta)
     places = [candidate.key for candidate in structure.effects]
     out = []
     for before, after in pairwise(path):
         (added,) = after.key - before.key
         index = places.index(added)
-        term, rest = terms[index], chosen.key - {added}
+        term, rest = final.terms[index], chosen.key - {added}
         # One effect instead of this one, or none of those chosen.
-        rivals = sorted(
-            (
-                (key, h)
-                for key, h in same_size.items()
-                if key != chosen.key and (rest < key or not key & chosen.key)
-            ),
-            key=lambda pair: pair[1].bic,
-        )
+        rivals = [
+            h
+            for key, h in same_size.items()
+            if key != chosen.key and (rest < key or not key & chosen.key)
+        ]
         # In one of many narrow valleys the curvature says nothing of the error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
-        values = _named_values(
-            term,
-            None if std is None or rugged else std[structure.span(index)],
-            position_unit=position_unit,
-            input_unit=input_unit,
-        )
+        known = None if std is None or rugged else std[structure.span(index)]
+        values = _named_values(term, known, units)
         reported = {p.name for p in term.effect.parameters if p.reported}
         out.append(
             FoundEffect(
@@ -73,13 +58,8 @@ def list_effects(
                 nrmse_before=before.error,
                 nrmse_after=after.error,
                 rivals=tuple(
-                    Rival(
-                        effect=find_effect(_stand_in(added, key - rest)[0]),
-                        where=_where(_stand_in(added, key - rest)),
-                        nrmse_after=h.error,
-                        confidence=weight[key] / total,
-                    )
-                    for key, h in rivals[:_MOST_RIVALS]
+                    _rival(_stand_in(added, h.key - rest), h, weight[h.key] / total)
+                    for h in sorted(rivals, key=lambda h: h.bic)[:_MOST_RIVALS]
                 ),
             )
         )
@@ -101,34 +81,29 @@ def list_suspects(found: Sequence[Hypothesis], effects: Sequence[FoundEffect]) -
     )
     weights = [float(np.exp(-0.5 * (h.bic - singles[0].bic))) for h in singles]
     return tuple(
-        Rival(
-            effect=find_effect(next(iter(h.key))[0]),
-            where=_where(next(iter(h.key))),
-            nrmse_after=h.error,
-            confidence=weight / sum(weights),
-        )
+        _rival(next(iter(h.key)), h, weight / sum(weights))
         for h, weight in zip(singles[:_MOST_RIVALS], weights, strict=False)
     )
 
 
-def _where(key: tuple[str, int]) -> dict[str, int]:
-    return find_effect(key[0]).where(key[1])
+def _rival(key: tuple[str, int], hypothesis: Hypothesis, confidence: float) -> Rival:
+    effect = find_effect(key[0])
+    where = effect.where(key[1])
+    return Rival(effect=effect, where=where, nrmse_after=hypothesis.error, confidence=confidence)
 
 
-def _named_values(
-    term: Term, std: np.ndarray | None, *, position_unit: str, input_unit: str
-) -> dict[str, NamedValue]:
+def _named_values(term: EffectTerm, std: np.ndarray | None, units: Units) -> dict[str, NamedValue]:
     return {
         p.name: NamedValue(
             value=float(value),
             std=None if std is None else float(std[i]),
-            unit=p.unit_text(position=position_unit, input=input_unit),
+            unit=p.unit_text(position=units.position, input=units.input),
         )
         for i, (p, value) in enumerate(zip(term.effect.parameters, term.values, strict=True))
     }
 
 
-def chain_std(fit: Fit) -> dict[str, float]:
+def chain_std(fit: GapFit) -> dict[str, float]:
     """Return the standard error of every mass, damping and spring by its name."""
     if fit.covariance is None:
         return {}
@@ -141,7 +116,7 @@ def chain_std(fit: Fit) -> dict[str, float]:
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
 
-def chain_covariance(fit: Fit) -> Array | None:
+def chain_covariance(fit: GapFit) -> Array | None:
     """Return the covariance of what `chain_std` has the standard errors of."""
     if fit.covariance is None:
         return None
@@ -151,7 +126,7 @@ def chain_covariance(fit: Fit) -> Array | None:
     return relative * np.outer(scale, scale)
 
 
-def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[Run, Nuisance, bool]]:
+def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[GapRun, Nuisance, bool]]:
     """Return every run with its nuisance parameters, and whether it was held out."""
     training = zip(study.training, hypothesis.fit.nuisance, strict=True)
     held_out = zip(study.held_out, hypothesis.held.nuisance, strict=True)
@@ -220,7 +195,7 @@ def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap,
     return tuple(out)
 
 
-def repeatability(runs: Sequence[Run]) -> float | None:
+def repeatability(runs: Sequence[GapRun]) -> float | None:
     """Return the relative difference of runs with the same input, or None without such.
 
     Of two runs the second is read at the times of the first, their inputs' first edges together.
@@ -244,12 +219,12 @@ def repeatability(runs: Sequence[Run]) -> float | None:
     return float(np.sqrt(squares / sizes)) if sizes else None
 
 
-def _edge(run: Run) -> float:
+def _edge(run: GapRun) -> float:
     """Return when the input first changes, or the run's start."""
     return float(run.knots[int(np.argmax(run.command != run.command[0]))])
 
 
-def _same_input(a: Run, b: Run, t_a: Array, t_b: Array) -> bool:
+def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
     """Tell whether two inputs are one over most of the runs, but for samples at their edges."""
     if t_a.size < _SAME_LENGTH * max(a.t.size, b.t.size):
         return False
@@ -257,7 +232,8 @@ def _same_input(a: Run, b: Run, t_a: Array, t_b: Array) -> bool:
         run.command[np.searchsorted(run.knots, t, side="right") - 1]
         for run, t in ((a, t_a), (b, t_b))
     )
-    return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < _EDGES)
+    # A few samples may differ, by one at each edge of the input.
+    return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < 0.02)
 
 
 def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
@@ -269,9 +245,11 @@ def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[C
     rivals = [one for one in others if one.key and not one.key <= chosen.key]
     if chosen.at_floor:
         rivals = [one for one in rivals if not one.key > chosen.key]
-    kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[: _CONTENDERS - 1]]
+    # Three, among which an experiment is to decide.
+    kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[:2]]
     likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
     return tuple(
-        Contender(model=one.fit.structure.model(one.fit.theta), weight=float(weight))
+        Contender(chain=model.chain, terms=model.terms, weight=float(weight))
         for one, weight in zip(kept, likely / likely.sum(), strict=True)
+        for model in [one.fit.structure.model(one.fit.theta)]
     )

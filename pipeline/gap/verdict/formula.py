@@ -19,10 +19,6 @@ from pipeline.arrays import Array
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.types import ForceFormula, FormulaTerm, LeftForce
 
-_MOST_TERMS = 3
-_DEAD = 1e-8  # of a column, that the others must leave of it
-_PER_TERM = 10  # windows
-
 
 @dataclass(frozen=True)
 class _Term:
@@ -92,10 +88,12 @@ def find_formula(
     left = force - basis @ (basis.T @ force)
     alone = columns - basis @ (basis.T @ columns)
     size = np.linalg.norm(columns, axis=0)
-    usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > _DEAD * size[j] > 0]
+    # Of a column the others must leave something.
+    usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > 1e-8 * size[j] > 0]
     best, lowest = (), _criterion(left, 0)
     free = force.size - linear.shape[1]
-    for count in range(1, min(_MOST_TERMS, free // _PER_TERM) + 1):
+    # Ten windows a term, and three terms at the most.
+    for count in range(1, min(3, free // 10) + 1):
         for chosen in combinations(usable, count):
             A = alone[:, chosen]
             rest = left - A @ np.linalg.lstsq(A, left, rcond=None)[0]

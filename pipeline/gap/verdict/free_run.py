@@ -6,13 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
 from pipeline.gap.types import FreeRun
 
 
-def free_runs(fit: Fit, runs: Sequence[Run], zeros: Mapping[str, Array]) -> tuple[FreeRun, ...]:
+def free_runs(
+    fit: GapFit, runs: Sequence[GapRun], zeros: Mapping[str, Array]
+) -> tuple[FreeRun, ...]:
     """Return the error of each record, all carts together, in the order of their ids.
 
     Of what was fitted to a record only its encoders' `zeros` (n,) are used. What a hand divides is

@@ -14,56 +14,51 @@ from numpy.polynomial import chebyshev
 
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import window_weights
-from pipeline.gap.data.runs import Run, cut_shots
+from pipeline.gap.data.runs import GapRun, cut_shots
 from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
-from pipeline.gap.fit.structure import Model
+from pipeline.gap.fit.structure import GapModel
 from pipeline.gap.types import LeftForce
 
-_WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2)  # s, at the usual pace
-_LEAD = 0.5  # of a window: what hides (a lag, a bent bristle) finds its place before one begins
 _DEGREE = 4  # of the polynomial through what a model is off by in a window
-_FEWEST = 9  # samples in a window
-_NOISE = 0.3  # of the force left that noise may make
-_MOVES = 4.0  # noises within which a cart stands still: friction then answers any force
 
 
 def left_forces(
-    model: Model, runs: Sequence[Run], nuisance: Sequence[Nuisance]
+    model: GapModel, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> tuple[LeftForce, ...]:
     """Return the force left on each cart of each run whose neighbours were measured."""
     found = []
     for run, own in zip(runs, nuisance, strict=True):
         best: list[LeftForce] = []
-        for length in _WINDOWS:
+        # Windows in s, at the usual pace.
+        for length in (0.05, 0.07, 0.1, 0.15, 0.2):
             forces = _of_run(model, run, own, length=length * run.pace)
             best = [force for force, _ in forces] or best
-            if forces and all(noise < _NOISE * _rms(force.force) for force, noise in forces):
+            # Noise makes less than a third of it.
+            if forces and all(noise < 0.3 * _rms(force.force) for force, noise in forces):
                 break
         found += best
     return tuple(found)
 
 
 def _of_run(
-    model: Model, run: Run, own: Nuisance, *, length: float
+    model: GapModel, run: GapRun, own: Nuisance, *, length: float
 ) -> list[tuple[LeftForce, float]]:
     """Return the force left on each cart, by windows of `length` s, and what noise makes of it."""
     width = round(length / run.record.sample_time) + 1
-    if not _FEWEST <= width <= run.t.size // 3:
+    if not 9 <= width <= run.t.size // 3:
         return []
-    cut = cut_shots(run, length=(1.0 + _LEAD) * length / run.pace)
+    # Half a window more: what hides (a lag, a bent bristle) finds its place before one begins.
+    cut = cut_shots(run, length=(1.0 + 0.5) * length / run.pace)
     cut = replace(cut, zero=np.where(run.free, own.zero, 0.0))
     read = simulate_run(model, cut, replace(fresh_nuisance(cut), scatter=own.scatter))
     first = np.array([end - width for start, end in pairwise(cut.shots) if end - start >= width])
     windows = first[:, None] + np.arange(width)
     w, w1, w2 = window_weights(t := cut.t[windows])
     n, chain = run.zero.size, model.structure.chain(model.theta)
-    x, simulated = np.zeros((n, run.t.size)), np.zeros((n, run.t.size))
-    for j, row in enumerate(run.rows):
-        x[row], simulated[row] = cut.y[j] - own.zero[row], read[j] - own.zero[row]
+    x, simulated = cut.by_cart(cut.y, own.zero), cut.by_cart(read, own.zero)
     speed = np.concatenate(
         [np.gradient(simulated[:, a:b], cut.t[a:b], axis=1) for a, b in pairwise(cut.shots)], axis=1
     )
-    u = np.interp(cut.t, run.knots, run.command) if run.knots.size != run.t.size else run.command
     off = x - simulated
     out = []
     for j, i in enumerate(run.rows):
@@ -75,7 +70,8 @@ def _of_run(
         for k, spring in ((i - 1, i), (i + 1, i + 1)):
             if 0 <= k < n:
                 force -= chain.k[spring] * (w * off[k][windows]).sum(1)
-        moves = np.ptp(x[i][windows], axis=1) > _MOVES * run.sigma[j]
+        # Within four noises a cart stands still: friction then answers any force.
+        moves = np.ptp(x[i][windows], axis=1) > 4.0 * run.sigma[j]
         if not moves.any():
             continue
         drift, rate = _smooth(t, off[i][windows])
@@ -87,7 +83,7 @@ def _of_run(
             t=t[moves],
             x=(simulated[i][windows] + drift)[moves],
             v=(speed[i][windows] + rate)[moves],
-            u=(u if i == 0 else 0.0 * u)[windows[moves]],
+            u=(run.input if i == 0 else 0.0 * run.t)[windows[moves]],
             acceleration=(w2 * x[i][windows]).sum(1)[moves],
             force=force[moves],
         )

@@ -13,14 +13,8 @@ from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import high_frequency_noise
 from pipeline.gap.types import Gap, Trace
-from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.plant.nonlinear.simulator.laws import arriving
-
-_WINDOWS = (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)  # s; half of one weighs anything
-_FEWEST = 9  # samples in a window
-_NOISE = 0.02  # of the force's range that noise may make
-_MOST = 400  # windows a record
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -82,94 +76,57 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     u = trace.u if cart == 1 else zero
     inputs = np.array([u, _arriving(u, model)])
     noise = high_frequency_noise(trace.measured - trace.final)
+    i, chain = cart - 1, model.chain
+    before, after = chain.k[i], chain.k[i + 1]
     best = None
-    for length in _WINDOWS:
+    # Windows in s; half of one weighs anything.
+    for length in (0.05, 0.07, 0.1, 0.15, 0.2, 0.3):
         if (windows := _cut(t, length=length)) is None:
             continue
-        best = _average(
-            windows, t, measured, simulated, inputs, chain=model.chain, cart=cart, noise=noise
+        local = t[windows]
+        s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
+        w, w1, w2 = window_weights(local)
+        # An input is held over the interval that follows its sample: the weight's exact share.
+        held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
+        pushes = [(held * push[windows[:, :-1]]).sum(1) for push in inputs]
+        own = chain.m[i] * w2 - chain.c[i] * w1 + (before + after) * w
+        means = []
+        for x in (measured, simulated):
+            springs = (w * (before * x[0] + after * x[2])[windows]).sum(1)
+            means.append((own * x[1][windows]).sum(1) - springs - pushes[1])
+        position = np.array([(w * x[windows]).sum(1) for x in measured])
+        velocity = np.array([-(w1 * x[windows]).sum(1) for x in measured])
+        best = ResidualForce(
+            experiment=trace.experiment,
+            cart=cart,
+            held_out=trace.held_out,
+            t=(w * local).sum(1),
+            measured=means[0],
+            model=means[1],
+            u=pushes[0],
+            arriving=pushes[1],
+            velocity=velocity[1],
+            position=position[1],
+            neighbours=position[[0, 2]],
+            neighbours_velocity=velocity[[0, 2]],
         )
-        if best.noise <= _NOISE * np.ptp(best.force):
+        # Noise makes less than a fiftieth of the force's range.
+        if noise * float(np.sqrt(np.median((own**2).sum(1)))) <= 0.02 * np.ptp(best.measured):
             break
-    if best is None:
-        return None
-    return ResidualForce(
-        experiment=trace.experiment,
-        cart=cart,
-        held_out=trace.held_out,
-        t=best.t,
-        measured=best.force,
-        model=best.model,
-        u=best.inputs[0],
-        arriving=best.inputs[1],
-        velocity=best.velocity[1],
-        position=best.position[1],
-        neighbours=best.position[[0, 2]],
-        neighbours_velocity=best.velocity[[0, 2]],
-    )
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Means:
-    t: Array
-    force: Array
-    model: Array
-    inputs: Array
-    position: Array
-    velocity: Array
-    noise: float
+    return best
 
 
 def _arriving(u: Array, model: AugmentedChain) -> Array:
     """Return what the drive passes on of the input, delays and lags apart."""
-    _, _, drive = model.tables()
+    drive = model.tables().drive
     return np.array([arriving(drive, float(one)) for one in u])
 
 
 def _cut(t: Array, *, length: float) -> np.ndarray | None:
     """Return the sample numbers (windows, samples) of overlapping windows, None if too short."""
     width = round(length * (t.size - 1) / float(t[-1] - t[0])) + 1
-    if width < _FEWEST or width > t.size:
+    if width < 9 or width > t.size:
         return None
-    count = min(t.size - width + 1, _MOST)
+    count = min(t.size - width + 1, 400)
     first = np.linspace(0, t.size - width, count).astype(int)
     return first[:, None] + np.arange(width)
-
-
-def _average(
-    windows: np.ndarray,
-    t: Array,
-    measured: Array,
-    simulated: Array,
-    inputs: Array,
-    *,
-    chain: Chain,
-    cart: int,
-    noise: float,
-) -> _Means:
-    local = t[windows]
-    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
-    w, w1, w2 = window_weights(local)
-    # An input is held over the interval that follows its sample: the weight's exact share of it.
-    s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
-    held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
-    pushes = np.array([(held * u[windows[:, :-1]]).sum(1) for u in inputs])
-    i = cart - 1
-    m, c = chain.m[i], chain.c[i]
-    before, after = chain.k[i], chain.k[i + 1]
-
-    force_weight = m * w2 - c * w1 + (before + after) * w
-
-    def force(x: Array) -> Array:
-        springs = (w * (before * x[0] + after * x[2])[windows]).sum(1)
-        return (force_weight * x[1][windows]).sum(1) - springs - pushes[1]
-
-    return _Means(
-        t=(w * local).sum(1),
-        force=force(measured),
-        model=force(simulated),
-        inputs=pushes,
-        position=np.array([(w * x[windows]).sum(1) for x in measured]),
-        velocity=np.array([-(w1 * x[windows]).sum(1) for x in measured]),
-        noise=noise * float(np.sqrt(np.median((force_weight**2).sum(1)))),
-    )

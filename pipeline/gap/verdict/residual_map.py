@@ -5,23 +5,19 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.types import ForceAgainst, LeftForce, Residual
+from pipeline.gap.types import ForceAgainst, LeftForce, Quantity, Residual
 from pipeline.gap.verdict.formula import find_formula
-
-_MOST_BINS = 20
-_FEWEST = 6  # windows in a bin
+from pipeline.set_up import Bench
 
 
-def map_residual(
-    forces: Sequence[LeftForce], *, springs: Sequence[bool], position: str, drive: str
-) -> tuple[Residual, ...]:
+def map_residual(forces: Sequence[LeftForce], bench: Bench) -> tuple[Residual, ...]:
     """Return what is left on each cart, the first first."""
-    found = []
+    found, position, drive = [], bench.units.position, bench.units.input
     for cart in sorted({force.cart for force in forces}):
         own = [force for force in forces if force.cart == cart]
-        on_springs = springs[cart - 1] or springs[cart]
+        on_springs = bench.springs[cart - 1] or bench.springs[cart]
         formula, said = find_formula(own, on_springs=on_springs, position=position, drive=drive)
-        axes = {
+        axes: dict[Quantity, tuple[str, list[Array]]] = {
             "position": (position, [force.mean(force.x) for force in own]),
             "velocity": (f"{position}/s", [force.mean(force.v) for force in own]),
             "input": (drive, [force.mean(force.u) for force in own]),
@@ -40,12 +36,13 @@ def _binned(
     values: Sequence[Array],
     said: Array | None,
     *,
-    quantity: str,
+    quantity: Quantity,
     unit: str,
 ) -> ForceAgainst:
     x, y = np.concatenate(values), np.concatenate([one.force for one in forces])
     run = np.repeat(np.arange(len(forces)), [one.force.size for one in forces])
-    count = int(np.clip(x.size // _FEWEST, 1, _MOST_BINS))
+    # Six windows in a bin, at the least.
+    count = int(np.clip(x.size // 6, 1, 20))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, count + 1)))
     bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(edges.size - 2, 0))
     kept = [bins == b for b in np.unique(bins)]

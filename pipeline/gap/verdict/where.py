@@ -1,20 +1,31 @@
-"""Where a run departs from the linear model: when, and what the cart was doing then."""
+"""Where a run departs from a model, what the cart does there, and what would show more of it."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.gap.data.runs import Run
-from pipeline.gap.fit.levenberg_marquardt import Fit
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.fit.levenberg_marquardt import GapFit
 from pipeline.gap.fit.linearise import simulate_run
-from pipeline.gap.types import GapWindow
+from pipeline.gap.search.hypothesis import Hypothesis
+from pipeline.gap.types import GapWindow, Verdict
+from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.words.phrases import phrases
 
-_WINDOW = 0.15  # of the run
-_MOST = 8  # windows shown
+# Which recording shows more of what is left, by what the cart does there: a key of the words.
+_SHOWS = {
+    "velocity near zero": "show_rest",
+    "fast motion": "show_motion",
+    "large displacement, positive side": "show_displacement",
+    "large displacement, negative side": "show_displacement",
+    "after an edge of the input": "show_edges",
+    "input on": "show_drive",
+    "input off": "show_motion",
+}
 
 
-def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
+def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
     """Return the windows that hold most of the misfit, the worst first.
 
     `share` is the window's part of that cart's squared misfit in that run.
@@ -25,7 +36,7 @@ def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
         for j, row in enumerate(run.rows):
             energy = ((run.y[j] - model[j]) / run.sigma[j]) ** 2
             total = float(energy.sum())
-            width = max(4, int(_WINDOW * run.t.size))
+            width = max(4, int(0.15 * run.t.size))
             if total <= 0.0 or run.t.size <= width:
                 continue
             inside = np.convolve(energy, np.ones(width), mode="valid")
@@ -40,10 +51,10 @@ def find_windows(fit: Fit, runs: Sequence[Run]) -> tuple[GapWindow, ...]:
             )
             found.append((float(inside[first]), window))
     found.sort(key=lambda pair: -pair[0])
-    return tuple(window for _, window in found[:_MOST])
+    return tuple(window for _, window in found[:8])
 
 
-def _what(run: Run, x: Array, energy: Array) -> str:
+def _what(run: GapRun, x: Array, energy: Array) -> str:
     """Return what the cart does where the misfit grows, judged by its excess over chance."""
     v = np.gradient(x, run.t)
     u = np.interp(run.t, run.knots, run.command)
@@ -74,3 +85,28 @@ def _what(run: Run, x: Array, energy: Array) -> str:
             if excess > score:
                 best, score = what, excess
     return best
+
+
+def choose_experiment(
+    verdict: Verdict,
+    chosen: Hypothesis,
+    close: Sequence[Hypothesis],
+    left: Sequence[GapWindow],
+    *,
+    repeated: bool,
+) -> str:
+    """Return what to record next: what tells the rivals apart, settles the name, or shows more.
+
+    `left` are the windows in which the chosen model still departs, the worst first; `repeated`:
+    runs of one input tell already by how much they differ.
+    """
+    if verdict == "ambiguous":
+        texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
+        return " ".join(sorted(texts))
+    if verdict == "named":
+        return chosen.fit.structure.effects[-1].effect.deciding_run
+    if verdict == "none":
+        return ""
+    words = phrases("gap")
+    shows = words.text(next((_SHOWS[w.what] for w in left if w.what in _SHOWS), "show_motion"))
+    return shows if repeated else f"{words.text('repeat_runs')} {shows}"

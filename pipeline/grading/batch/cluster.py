@@ -1,6 +1,6 @@
 """The same tasks on a Dask cluster: the hand-ins travel along, every machine has its own workers.
 
-Each Dask worker keeps worker processes as a single machine does (`worker_process.py`): a hand-in
+Each Dask worker keeps worker processes as a single machine does (`runner.Grader`): a hand-in
 that crashes or hangs takes one of them down, never the Dask worker.
 """
 
@@ -16,9 +16,8 @@ from distributed import Client, Security, WorkerPlugin, as_completed, get_worker
 from distributed.worker import Worker as DaskWorker
 
 from pipeline.errors import ConfigError, lacks_room
-from pipeline.grading.batch.runner import Executor, code_version
-from pipeline.grading.batch.worker import Setup, Task, failed, grading_line, read_grading
-from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.batch.runner import Executor, Grader, code_version
+from pipeline.grading.batch.worker import Setup, Task, failed
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import packed, unpacked
 
@@ -48,7 +47,7 @@ def run_on(address: str) -> Executor:
             f"{address}: no certificates in Dask's configuration (distributed.comm.tls)"
         )
 
-    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
+    def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
         try:
             client = Client(address, timeout=_CONNECT_LIMIT, set_as_default=False)
         except (OSError, TimeoutError) as error:
@@ -60,9 +59,9 @@ def run_on(address: str) -> Executor:
                 raise ConfigError(f"{address}: the scheduler has no workers") from None
             # Runs on one cluster at once have graders of their own, with their own rubric.
             graders = f"cartlab-graders-{uuid4()}"
-            client.register_plugin(Graders(setup, out_of=out_of), name=graders)
+            client.register_plugin(Graders(setup), name=graders)
             try:
-                yield from _through(client, tasks, graders=graders, out_of=out_of)
+                yield from _through(client, tasks, graders=graders, out_of=setup.rubric.out_of)
             finally:
                 client.unregister_worker_plugin(graders)
 
@@ -72,16 +71,15 @@ def run_on(address: str) -> Executor:
 class Graders(WorkerPlugin):
     """The worker processes of one Dask worker, started when needed, ended with it."""
 
-    def __init__(self, setup: Setup, *, out_of: float) -> None:
+    def __init__(self, setup: Setup) -> None:
         self._setup = setup
-        self._out_of = out_of
         self._code = code_version()
 
     def setup(self, worker: DaskWorker) -> None:
         """Make a folder for hand-ins; processes start with the first of them."""
         self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
-        self._idle: SimpleQueue[Worker] = SimpleQueue()
-        self._all: list[Worker] = []
+        self._idle: SimpleQueue[Grader] = SimpleQueue()
+        self._all: list[Grader] = []
         self.same_code = self._code == code_version()
 
     def teardown(self, worker: DaskWorker) -> None:
@@ -95,7 +93,7 @@ class Graders(WorkerPlugin):
         try:
             process = self._idle.get_nowait()
         except Empty:
-            process = Worker(replace(self._setup, scratch=self._folder.name), out_of=self._out_of)
+            process = Grader(replace(self._setup, scratch=Path(self._folder.name)))
             self._all.append(process)
         try:
             with tempfile.TemporaryDirectory(
@@ -107,13 +105,13 @@ class Graders(WorkerPlugin):
             self._idle.put(process)
 
 
-def _grade(task: Task, archive: bytes, plugin: str) -> bytes:
-    """Run on a Dask worker: return the outcome as a line of JSON."""
+def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
+    """Run on a Dask worker."""
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
         raise ConfigError("the cluster's workers run another version of cartlab, numpy or scipy")
-    return grading_line(graders.grade(task, archive))
+    return graders.grade(task, archive)
 
 
 def _threads(client: Client) -> int:
@@ -148,7 +146,7 @@ def _through(
         future = next(answers)
         task = under_way.pop(str(future.key))
         if future.status == "finished":
-            yield read_grading(future.result())
+            yield future.result()
         elif isinstance(error := future.exception(), ConfigError):
             raise error
         else:

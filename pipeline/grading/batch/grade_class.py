@@ -10,13 +10,8 @@ from functools import cache
 from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
-from pipeline.grading.batch.runner import (
-    Executor,
-    Limits,
-    Progress,
-    grade_batch,
-    run_here,
-)
+from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
+from pipeline.grading.batch.worker import Setup
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
@@ -30,11 +25,11 @@ from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
-from pipeline.report.numbers import count, listing
 from pipeline.resources import EXAMPLES
 from pipeline.submission import load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
 _NAMED = 8  # submissions in a remark
@@ -64,27 +59,49 @@ class Summary:
         return f"{self.total - len(self.failed)} of {self.total} graded{shared}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """How a class is graded.
+
+    Attributes
+    ----------
+    jobs : processes on this machine; cluster : or the address of a Dask scheduler.
+    time_limit, memory_limit : of each hand-in, in s and bytes.
+    figures : draw those of the feedback.
+    anonymous : leave names out of what is written, as a rubric may ask for itself.
+    gradebook : a database URL; default: `gradebook.sqlite` in the folder of the results.
+    lateness : a table that says who was late.
+    """
+
+    jobs: int = 1
+    cluster: str | None = None
+    time_limit: float = Setup.time_limit
+    memory_limit: int = Setup.memory_limit
+    figures: bool = True
+    anonymous: bool = False
+    gradebook: str | None = None
+    lateness: Path | None = None
+
+    def setup(self, rubric: Rubric, *, scratch: Path) -> Setup:
+        """Return what of it grades each hand-in."""
+        return Setup(
+            rubric=rubric,
+            scratch=scratch,
+            time_limit=self.time_limit,
+            memory_limit=self.memory_limit,
+            figures=self.figures,
+        )
+
+
 def grade_class(
     paths: Sequence[Path],
     *,
     rubric_file: Path,
     out: Path,
-    jobs: int,
-    cluster: str | None,
-    limits: Limits,
-    figures: bool,
-    progress: Progress,
-    anonymous: bool = False,
-    gradebook: str | None = None,
-    lateness: Path | None = None,
+    options: Options,
+    progress: Progress = silent,
 ) -> Summary:
     """Grade everything in `paths` into the folder `out`.
-
-    Parameters
-    ----------
-    anonymous : leave names out of what is written, as a rubric may ask for itself.
-    gradebook : a database URL; default: `gradebook.sqlite` in `out`.
-    lateness : a table that says who was late.
 
     Raises
     ------
@@ -92,34 +109,32 @@ def grade_class(
         folder holds another class, or another run is writing there.
     """
     rubric = load_rubric(rubric_file)
-    late_table = read_late_table(lateness) if lateness else {}
+    late_table = read_late_table(options.lateness) if options.lateness else {}
+    hidden = rubric.anonymous or options.anonymous
+    place = options.gradebook or out
     _refuse_submission(named_folder(out))
-    if gradebook is None:
+    if options.gradebook is None:
         _refuse_another_class(out, assignment=rubric_file.stem)
     with alone_in(out, private=True), scratch_in(out) as scratch:
-        known = _names_so_far(gradebook or out, assignment=rubric_file.stem)
+        known = _names_so_far(place, assignment=rubric_file.stem)
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        hidden = rubric.anonymous or anonymous
         # The rubric's file says which assignment it is: its title may be mended on the way.
-        with Gradebook(gradebook or out, assignment=rubric_file.stem, create=True) as book:
+        with Gradebook(place, assignment=rubric_file.stem, create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
                 hand_ins,
-                rubric=rubric,
+                setup=options.setup(rubric, scratch=scratch),
                 book=book,
-                scratch=scratch,
-                execute=_executor(jobs=jobs, cluster=cluster),
-                limits=limits,
-                figures=figures,
+                execute=_executor(options),
                 examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
                 progress=_nameless(progress, hand_ins) if hidden else progress,
             )
             now = rubric.model_copy(update={"anonymous": hidden})
             changes = book.finish(batch, rubric=now, shown=shown)
             remarks = [
-                *_beside(passed, unknown, late_file=lateness, hidden=hidden),
+                *_beside(passed, unknown, late_file=options.lateness, hidden=hidden),
                 *_told(batch, book, shown=shown),
             ]
             failed = [
@@ -128,14 +143,13 @@ def grade_class(
             ]
             total = len(hand_ins)
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
-            remarks += [f"{double}: see class.html" for double in doubles]
     return Summary(
-        total=len(hand_ins),
+        total=total,
         failed=tuple(sorted(failed)),  # the order of the names would tell
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
         lacks_room=len(batch.lacks_room),
-        remarks=tuple(remarks),
+        remarks=(*remarks, *(f"{double}: see class.html" for double in doubles)),
         changes=tuple(changes),
     )
 
@@ -224,14 +238,14 @@ def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
         return []
 
 
-def _executor(*, jobs: int, cluster: str | None) -> Executor:
-    if cluster is None:
-        return run_here(jobs=jobs)
+def _executor(options: Options) -> Executor:
+    if options.cluster is None:
+        return run_here(jobs=options.jobs)
     try:
         from pipeline.grading.batch.cluster import run_on
     except ModuleNotFoundError as error:
         raise ConfigError(f"--cluster needs {error.name}: pip install 'cartlab[cluster]'") from None
-    return run_on(cluster)
+    return run_on(options.cluster)
 
 
 def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:

@@ -5,54 +5,39 @@ import json
 import queue
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 
 import pipeline
+from pipeline.errors import ConfigError
 from pipeline.grading.batch.so_far import class_so_far
-from pipeline.grading.batch.worker import Setup, Task, failed
-from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.batch.worker import OUT_OF_MEMORY, Setup, Task, failed, read_grading
+from pipeline.grading.grade import Flag
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Batch, Grading, Member
 from pipeline.grading.intake.files import digest
 from pipeline.grading.intake.hand_ins import HandIn
-from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import find_shared, same_recordings, same_team, shared_flag
-from pipeline.grading.words import WORDS
-from pipeline.schemas.grade import Flag
-
-TIME_LIMIT = 120.0  # s for each hand-in
-MEMORY_LIMIT = 1_000_000_000  # bytes
-_COMPUTE_WITH = ("numpy", "scipy")
+from pipeline.processes import Ended, Failed, Supervisor
+from pipeline.resources import TEMPLATES
 
 Progress = Callable[[int, int, str], None]
-Executor = Callable[[Sequence[Task], Setup, float], Iterator[Grading]]
+Executor = Callable[[Sequence[Task], Setup], Iterator[Grading]]
 
 
-def _silent(done: int, total: int, what: str) -> None:
-    pass
-
-
-@dataclass(frozen=True, kw_only=True)
-class Limits:
-    """What one hand-in may take: seconds, and bytes beyond what a worker needs itself."""
-
-    time: float = TIME_LIMIT
-    memory: int = MEMORY_LIMIT
+def silent(done: int, total: int, what: str) -> None:
+    """Say nothing of a batch that nobody watches."""
 
 
 def grade_batch(
     hand_ins: Sequence[HandIn],
     *,
-    rubric: Rubric,
+    setup: Setup,
     book: Gradebook,
-    scratch: Path,
     execute: Executor,
-    limits: Limits | None = None,
-    figures: bool = False,
     examples: Callable[[], Iterable[bytes]] = tuple,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> Batch:
     """Grade what the gradebook does not know yet; every outcome is in it as soon as it is had.
 
@@ -64,44 +49,22 @@ def grade_batch(
     Parameters
     ----------
     execute : what runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    figures : draw those of the feedback, too.
     examples : packed fingerprints of recordings that were handed out with the task; asked for
         only where recordings are shared.
     progress : called with how many are done, of how many, and what was done last.
     """
-    limits = limits or Limits()
-    code, text = code_version(), rubric.model_dump_json()
-    rows: dict[str, Member] = {}
+    rows, new = _known_and_new(hand_ins, setup=setup, book=book)
     unsettled, no_room = set[str](), set[str]()
-    new = []
-    for hand_in in hand_ins:
-        task = _task(hand_in, basis=(code, text, figures))
-        outcome = book.known(task.key, figures=False)
-        if outcome is None and hand_in.problem:
-            outcome = failed(task, hand_in.problem, out_of=rubric.out_of)
-            book.put(outcome)
-        if outcome is None or not outcome.settled:
-            new.append(task)
-        else:
-            rows[task.id] = Member.of(outcome)
     total = len(hand_ins)
     progress(len(rows), total, "")
-    if new:
-        setup = Setup(
-            rubric=text,
-            time_limit=limits.time,
-            memory_limit=limits.memory,
-            scratch=str(scratch.resolve()),
-            figures=figures,
-        )
-        for outcome in execute(new, setup, rubric.out_of):
-            book.put(outcome)
-            rows[outcome.submission] = Member.of(outcome)
-            if outcome.status == "failed" and not outcome.settled:
-                unsettled.add(outcome.submission)
-            if outcome.lacks_room:
-                no_room.add(outcome.submission)
-            progress(len(rows), total, outcome.submission)
+    for outcome in execute(new, setup) if new else ():
+        book.put(outcome)
+        rows[outcome.submission] = outcome.member
+        if outcome.status == "failed" and not outcome.settled:
+            unsettled.add(outcome.submission)
+        if outcome.lacks_room:
+            no_room.add(outcome.submission)
+        progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
     before = class_so_far(rows, book)
     rows |= before.kept
@@ -118,20 +81,39 @@ def grade_batch(
     )
 
 
+def _known_and_new(
+    hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
+) -> tuple[dict[str, Member], list[Task]]:
+    """Return those of which the grade is known, or that nobody can open, and tasks for the rest."""
+    basis = code_version(), setup.rubric.model_dump_json(), setup.figures
+    rows, new = {}, []
+    for hand_in in hand_ins:
+        task = _task(hand_in, basis=basis)
+        outcome = book.known(task.key, figures=False)
+        if outcome is None and hand_in.problem:
+            outcome = failed(task, hand_in.problem, out_of=setup.rubric.out_of)
+            book.put(outcome)
+        if outcome is None or not outcome.settled:
+            new.append(task)
+        else:
+            rows[task.id] = outcome.member
+    return rows, new
+
+
 def run_here(*, jobs: int) -> Executor:
     """Return what runs tasks in so many worker processes on this machine."""
 
-    def execute(tasks: Sequence[Task], setup: Setup, out_of: float) -> Iterator[Grading]:
+    def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
         waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
         for task in tasks:
             waiting.put(task)
         # At most one outcome a worker waits to be stored: memory stays flat.
         answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
-        workers = [Worker(setup, out_of=out_of) for _ in range(min(jobs, len(tasks)))]
+        graders = [Grader(setup) for _ in range(min(jobs, len(tasks)))]
         threads = [
-            threading.Thread(target=_work, args=(worker, waiting, answers, stop), daemon=True)
-            for worker in workers
+            threading.Thread(target=_work, args=(grader, waiting, answers, stop), daemon=True)
+            for grader in graders
         ]
         for thread in threads:
             thread.start()
@@ -143,14 +125,70 @@ def run_here(*, jobs: int) -> Executor:
                 yield answer
         finally:
             stop.set()
-            for worker in workers:
-                worker.close()
+            for grader in graders:
+                grader.close()
 
     return execute
 
 
+class Grader:
+    """A process that grades: a crash of it, or a limit passed, is the outcome of that hand-in."""
+
+    def __init__(self, setup: Setup) -> None:
+        self._setup = setup
+        given = {
+            "rubric": setup.rubric.model_dump_json(),
+            "scratch": str(setup.scratch.resolve()),
+            "figures": setup.figures,
+        }
+        module = "pipeline.grading.batch.worker"
+        self._process = Supervisor(module, memory=setup.memory_limit, setup=given)
+
+    def run(self, task: Task, *, stop: threading.Event | None = None) -> Grading:
+        """Return the outcome of a task.
+
+        Raises
+        ------
+        ConfigError : no process starts on this machine.
+        """
+        too_large = f"needed more than {self._setup.memory_limit / 1e9:g} GB of memory"
+        try:
+            plain = self._process.do(asdict(task), limit=self._setup.time_limit, stop=stop)
+        except Ended as end:
+            if end.how == "start":
+                last = end.said.strip().splitlines() or ["nothing was said"]
+                raise ConfigError(f"the grading processes do not start: {last[-1]}") from None
+            reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
+            return self._failed(task, reasons.get(end.how, str(end)), detail=end.said)
+        except Failed as error:
+            self.close()  # after a fault a fresh process is surer
+            return self._failed(task, str(error))
+        outcome = read_grading(plain)
+        if not outcome.settled:
+            self.close()
+        if outcome.reason == OUT_OF_MEMORY:
+            return self._failed(task, too_large, authors=outcome.authors)
+        return outcome
+
+    def close(self) -> None:
+        """End the process; the next task starts another."""
+        self._process.close()
+
+    def _failed(
+        self, task: Task, reason: str, *, authors: Sequence[str] = (), detail: str = ""
+    ) -> Grading:
+        return failed(
+            task,
+            reason,
+            authors=authors,
+            out_of=self._setup.rubric.out_of,
+            settled=False,
+            detail=detail,
+        )
+
+
 def _work(
-    worker: Worker,
+    grader: Grader,
     waiting: "queue.SimpleQueue[Task]",
     answers: "queue.Queue[Grading | Exception]",
     stop: threading.Event,
@@ -159,9 +197,9 @@ def _work(
         try:
             task = waiting.get_nowait()
         except queue.Empty:
-            return worker.close()
+            return grader.close()
         try:
-            answers.put(worker.run(task))
+            answers.put(grader.run(task, stop=stop))
         except Exception as error:  # said where the outcomes are waited for
             answers.put(error)
             return
@@ -170,10 +208,11 @@ def _work(
 def code_version() -> str:
     """Return what changes whenever a grade may: a hash of code, words and what it computes with."""
     root = Path(pipeline.__file__).parent
-    versions = [pipeline.__version__, *(f"{name} {version(name)}" for name in _COMPUTE_WITH)]
-    total = hashlib.sha256(" ".join(versions).encode() + WORDS.path.read_bytes())
-    for path in sorted(root.rglob("*.py")):
-        total.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+    computes_with = (f"{name} {version(name)}" for name in ("numpy", "scipy", "h5py"))
+    versions = [pipeline.__version__, *computes_with]
+    total = hashlib.sha256(" ".join(versions).encode())
+    for path in (*sorted(root.rglob("*.py")), *sorted((TEMPLATES / "words").glob("*.toml"))):
+        total.update(path.name.encode() + b"\0" + path.read_bytes())
     return total.hexdigest()
 
 

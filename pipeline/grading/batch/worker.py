@@ -1,35 +1,28 @@
-"""A process that grades one hand-in after another, so that a bad one can be stopped.
-
-`python -m pipeline.grading.batch.worker` reads a line of JSON for each task on stdin and answers
-with one on stdout: the first line says how, every further one what. It ends with its stdin.
-"""
+"""The process that grades one hand-in after another, so that a bad one can be stopped."""
 
 import base64
-import faulthandler
-import json
-import os
 import re
-import sys
 import tempfile
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from pipeline.errors import PipelineError, lacks_room
-from pipeline.garbage import collect_seldom
+from pipeline.grading.grade import Grade, grade_text
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
+from pipeline.grading.judge.reweigh import findings_text
 from pipeline.grading.judge.run import Graded, grade_submission
 from pipeline.grading.rubric import Rubric
+from pipeline.grading.self_check.words import asked_note
 from pipeline.grading.similarity.prints import fingerprint
-from pipeline.processes import limit_memory
-from pipeline.schemas.grade import Grade, grade_text
+from pipeline.processes import serve
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_TOML_BYTES, NAME
 
-_GRACE = 30.0  # s; a worker without a parent to stop it ends by itself so long after the limit
 OUT_OF_MEMORY = "needs more memory than allowed"
 _DETAIL = 20_000  # characters of a traceback
 _TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")
@@ -38,20 +31,19 @@ _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """How to grade: the same for all tasks of a worker.
+    """How to grade: the same for all hand-ins of a batch.
 
     Attributes
     ----------
-    rubric : as JSON.
-    time_limit : s for each hand-in; memory_limit : bytes beyond what the worker needs itself.
     scratch : where hand-ins are copied to while they are graded.
+    time_limit : s for each hand-in; memory_limit : bytes beyond what the worker needs itself.
     figures : draw those of the feedback, too.
     """
 
-    rubric: str
-    time_limit: float
-    memory_limit: int
-    scratch: str
+    rubric: Rubric
+    scratch: Path
+    time_limit: float = 120.0
+    memory_limit: int = 1_000_000_000
     figures: bool = False
 
 
@@ -87,16 +79,19 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
             graded = grade_submission(
                 submission, rubric=rubric, name=task.id, days_late=task.days_late
             )
+            grade = graded.grade
+            grade = grade.model_copy(update={"notes": (*grade.notes, *asked_note(opened))})
             records = graded.analysis.records if graded.analysis else ()
             drawn, detail = _figures(submission, graded, rubric) if figures else ((), "")
             return Grading(
                 submission=task.id,
-                authors=graded.grade.authors,
+                authors=grade.authors,
                 key=task.key,
-                status=graded.grade.status,
-                reason=graded.grade.reason,
+                status=grade.status,
+                reason=grade.reason,
                 days_late=task.days_late,
-                grade=grade_text(graded.grade),
+                grade=grade_text(grade),
+                findings=findings_text(graded.verdicts) if graded.verdicts else "",
                 fingerprints=fingerprint(records),
                 figures=drawn,
                 owner=task.owner,
@@ -191,57 +186,37 @@ def failed(
     )
 
 
-# ----------------------------------------------------------------------------- lines
+def plain_grading(outcome: Grading) -> dict[str, Any]:
+    """Return an outcome as plain data."""
+    return asdict(outcome) | {"fingerprints": base64.b64encode(outcome.fingerprints).decode()}
 
 
-def grading_line(outcome: Grading) -> bytes:
-    """Return an outcome as one line of JSON."""
-    plain = asdict(outcome)
-    plain["fingerprints"] = base64.b64encode(outcome.fingerprints).decode()
-    return json.dumps(plain).encode() + b"\n"
+def read_grading(plain: Mapping[str, Any]) -> Grading:
+    """Return the outcome of which `plain_grading`, and JSON, made this."""
+    return Grading(
+        **{
+            **plain,
+            "fingerprints": base64.b64decode(plain["fingerprints"]),
+            "authors": tuple(plain["authors"]),
+            "figures": tuple((name, svg) for name, svg in plain["figures"]),
+        }
+    )
 
 
-def read_grading(line: bytes) -> Grading:
-    """Return the outcome that `grading_line` wrote."""
-    plain = json.loads(line)
-    plain["fingerprints"] = base64.b64decode(plain["fingerprints"])
-    plain["authors"] = tuple(plain["authors"])
-    plain["figures"] = tuple((name, svg) for name, svg in plain["figures"])
-    return Grading(**plain)
+def _prepare(
+    rubric: str, scratch: str, *, figures: bool
+) -> Callable[[dict[str, Any], object], dict[str, Any]]:
+    """Return what grades a hand-in by a rubric, given as JSON."""
+    asked = Rubric.model_validate_json(rubric)
 
-
-def task_line(task: Task | Setup) -> bytes:
-    """Return a task or the setup as one line of JSON."""
-    return json.dumps(asdict(task)).encode() + b"\n"
-
-
-# --------------------------------------------------------------------------- process
-
-
-def main() -> None:
-    """Answer every task on stdin; stdout is for answers only."""
-    collect_seldom()
-    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what a library prints is no answer
-    tasks = sys.stdin.buffer
-    setup = Setup(**json.loads(tasks.readline()))
-    rubric = Rubric.model_validate_json(setup.rubric)
-    limit_memory(setup.memory_limit)
-    answers.write(b"ready\n")
-    answers.flush()
-    for line in tasks:
-        plain = json.loads(line)
-        task = Task(**{**plain, "sources": tuple(plain["sources"])})
-        faulthandler.dump_traceback_later(setup.time_limit + _GRACE, exit=True)
-        outcome = grade_task(
-            task, rubric=rubric, scratch=Path(setup.scratch), figures=setup.figures
+    def grade(task: dict[str, Any], _: object) -> dict[str, Any]:
+        whole = Task(**{**task, "sources": tuple(task["sources"])})
+        return plain_grading(
+            grade_task(whole, rubric=asked, scratch=Path(scratch), figures=figures)
         )
-        faulthandler.cancel_dump_traceback_later()
-        answers.write(grading_line(outcome))
-        answers.flush()
-        if not outcome.settled:
-            return  # after a fault a fresh process is surer
+
+    return grade
 
 
 if __name__ == "__main__":
-    main()
+    serve(_prepare)

@@ -14,17 +14,18 @@ from typing import TYPE_CHECKING, Self
 from sqlalchemy import Connection, Row, select
 
 from pipeline.errors import ConfigError
+from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import Override
+from pipeline.grading.gradebook.override import HandPoints, WantedPoints
 from pipeline.grading.gradebook.rows import (
     GRADING,
     Entry,
     add_list,
     add_row,
     by_other_rubrics,
-    carry_overrides,
+    carry_over,
     class_list,
     final_entry,
     known_grading,
@@ -33,8 +34,6 @@ from pipeline.grading.gradebook.rows import (
     newest_of,
     pages,
     points_of,
-    put_brief,
-    put_lacking_briefs,
     read_figures,
     read_flag,
     read_members,
@@ -46,13 +45,13 @@ from pipeline.grading.gradebook.schema import (
     batches,
     entries,
     figures,
+    findings,
     gradings,
     overrides,
     submissions,
 )
 from pipeline.grading.gradings import Batch, Grading, Member, person
 from pipeline.grading.rubric import Rubric
-from pipeline.schemas.grade import read_grade
 from pipeline.submission.complaints import nearest
 
 if TYPE_CHECKING:
@@ -84,7 +83,6 @@ class Gradebook:
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._database = Database(place, create=create)
-        put_lacking_briefs(self._database)
         self._now = now
         self._assignment = assignment
 
@@ -126,10 +124,12 @@ class Gradebook:
                     "deducted": grade.deducted,
                 },
             )
-            put_brief(connection, number, grade)
             for position, (name, svg) in enumerate(grading.figures):
                 drawn = {"grading_id": number, "position": position, "name": name, "svg": svg}
                 add_row(connection, figures, drawn)
+            if grading.findings:
+                kept = {"grading_id": number, "found": grading.findings}
+                add_row(connection, findings, kept)
 
     def prints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
         """Return all fingerprints that differ, or those of some gradings, see `Entry.grading`.
@@ -162,7 +162,7 @@ class Gradebook:
         """
         listed, points, by_hand = [], {}, set()
         with self._database.writing() as connection:
-            carry_overrides(connection, batch.moved, assignment=self._assignment or "")
+            carry_over(connection, batch.moved, assignment=self._assignment or "")
             for position, key in enumerate(batch.keys):
                 row = newest_of(connection, key, assignment=self._assignment or "")
                 shared = batch.shared.get(row.name)
@@ -259,6 +259,12 @@ class Gradebook:
         with self._database.reading() as connection:
             return read_figures(connection, entry.grading)
 
+    def findings(self, entry: Entry) -> str:
+        """Return what the checks found in a submission; "" where that was not kept."""
+        mine = select(findings.c.found).where(findings.c.grading_id == entry.grading)
+        with self._database.reading() as connection:
+            return connection.scalar(mine) or ""
+
     def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
         """Return the submission's id and all that ever happened to it, see `read_events`.
 
@@ -295,7 +301,7 @@ class Gradebook:
 
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
-    ) -> Override:
+    ) -> HandPoints:
         """Give a criterion points by hand, which every later grading keeps; None takes them back.
 
         Raises
@@ -305,25 +311,17 @@ class Gradebook:
         """
         with self._database.writing() as connection:
             last, row = self._find(connection, team)
-            return self._give(
-                connection, row, criterion, points, why=why, by=by, rubric=read_rubric(last)
-            )
+            asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
+            return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     # ----------------------------------------------------------------------- in parts
 
     def _give(
-        self,
-        connection: Connection,
-        row: Row,
-        criterion: str,
-        points: float | None,
-        *,
-        why: str,
-        by: str,
-        rubric: Rubric,
-    ) -> Override:
+        self, connection: Connection, row: Row, asked: WantedPoints, *, by: str, rubric: Rubric
+    ) -> HandPoints:
         """Add an override of the submission of a line."""
-        why, by = why.strip(), by.strip()
+        criterion, points = asked.criterion, asked.points
+        why, by = asked.why.strip(), by.strip()
         if not why or not by:
             raise ConfigError("an override needs a reason (--why) and a name (--by)")
         out_of = {c.id: c.points for c in rubric.criteria}
@@ -334,12 +332,12 @@ class Gradebook:
             raise ConfigError(
                 f"{criterion}: expected 0 to {out_of[criterion]:g} points, found {points:g}"
             )
-        given = Override(
+        given = HandPoints(
             criterion=criterion,
             points=points,
             why=why,
             by=by,
-            at=self._at(),
+            at=asked.at or self._at(),
             authors=last_named(connection, row.submission_id),
         )
         add_row(connection, overrides, {**asdict(given), "submission_id": row.submission_id})

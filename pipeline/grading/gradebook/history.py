@@ -7,16 +7,18 @@ from typing import Any, Literal
 
 from sqlalchemy import Connection, and_, select
 
+from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.changes import rubric_changes
+from pipeline.grading.gradebook.requests import hide_people
 from pipeline.grading.gradebook.schema import (
     batches,
     entries,
     gradings,
     overrides,
+    request_events,
     submissions,
 )
 from pipeline.grading.words import on_one_line
-from pipeline.schemas.grade import read_grade
 
 FAILED = "could not be graded: "  # before the reason, in the text of an event
 
@@ -30,14 +32,15 @@ class Event:
     at : ISO 8601, UTC.
     what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
         overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
-        taken back.
-    points, out_of : of the submission, or of the one criterion that an override is about.
-    text : flags, or why.
-    by : who, of an override.
+        taken back; `asked`, `answered`, `reopened`: another look at a criterion, `points` where the
+        answer gave others.
+    points, out_of : of the submission, or of the one criterion that the event is about.
+    text : flags, why, or the answer.
+    by : who, of an override and of a request; "" for a student who is not to be named.
     """
 
     at: str
-    what: Literal["graded", "listed", "removed", "override"]
+    what: Literal["graded", "listed", "removed", "override", "asked", "answered", "reopened"]
     points: float | None
     out_of: float | None = None
     criterion: str = ""
@@ -50,6 +53,7 @@ def read_events(connection: Connection, submission: int, *, named: bool = True) 
     found = [
         *_graded(connection, submission),
         *_overridden(connection, submission),
+        *_requested(connection, submission, named=named),
         *_listed(connection, submission, named=named),
     ]
     return sorted(found, key=lambda event: event.at)
@@ -74,6 +78,21 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
             criterion=row.criterion,
             text=row.why,
             by=row.by,
+        )
+
+
+def _requested(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
+    """Yield who asked for another look, and what was answered."""
+    mine = select(request_events).where(request_events.c.submission_id == submission)
+    for row in connection.execute(mine.order_by(request_events.c.id)):
+        asked = row.what == "asked"
+        yield Event(
+            at=row.at,
+            what=row.what,
+            points=row.points,
+            criterion=row.criterion,
+            text=row.text if named else hide_people(row.text, (row.by * asked, *row.authors)),
+            by="" if asked and not named else row.by,
         )
 
 
@@ -155,5 +174,15 @@ def event_words(event: Event) -> str:
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
     if event.what == "removed":
         return f"removed   {event.text}"
+    if event.what in ("asked", "answered", "reopened"):
+        return _request_words(event)
     note = f"  ({event.text})" if event.text else ""
     return f"{event.what:8}  {event.points:g} of {event.out_of:g}{note}"
+
+
+def _request_words(event: Event) -> str:
+    """Return a step of a request for another look; what people wrote is put on one line."""
+    by = f"by {event.by}" if event.by else "by the team"
+    points = "" if event.points is None else f"{event.points:g} by hand, "
+    said = " ".join(event.text.split())
+    return f"{event.what:8}  {event.criterion}: {points}{by}" + (f": {said}" if said else "")

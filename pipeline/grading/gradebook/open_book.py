@@ -2,16 +2,17 @@
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import Connection, Row, Select, func, insert, select
 
 from pipeline.errors import ConfigError
+from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import Event, read_events
-from pipeline.grading.gradebook.override import Override, Wish
+from pipeline.grading.gradebook.override import HandPoints, WantedPoints
 from pipeline.grading.gradebook.rows import (
     OVERRIDE,
     Entry,
@@ -22,7 +23,6 @@ from pipeline.grading.gradebook.rows import (
     read_rubric,
 )
 from pipeline.grading.gradebook.schema import (
-    briefs,
     entries,
     gradings,
     looks,
@@ -30,7 +30,6 @@ from pipeline.grading.gradebook.schema import (
     submissions,
 )
 from pipeline.grading.rubric import Rubric
-from pipeline.schemas.grade import Flag
 
 State = tuple[int, int, int]
 
@@ -38,7 +37,7 @@ State = tuple[int, int, int]
 class Conflict(ConfigError):
     """A change rests on what is no longer so; `now` is what somebody else gave, if anything."""
 
-    def __init__(self, text: str, *, now: Override | None) -> None:
+    def __init__(self, text: str, *, now: HandPoints | None) -> None:
         super().__init__(text)
         self.now = now
 
@@ -49,13 +48,18 @@ class Listing:
 
     Attributes
     ----------
+    line : under another name where a page is anonymous.
+    submission : its name in the gradebook.
+    seen : who marked the grading as looked at, or "".
     shared : the flag for recordings that stand in other submissions too.
     first_key : of what was first handed in under this name.
     made_of : what the line was worked out from.
     """
 
     line: Line
+    submission: str
     grading: int
+    seen: str
     shared: Flag | None
     first_key: str
     made_of: tuple[Any, ...]
@@ -63,16 +67,10 @@ class Listing:
 
 @dataclass(frozen=True, kw_only=True)
 class ClassNow:
-    """The class list as it counts.
-
-    Attributes
-    ----------
-    seen : who marked a grading as looked at, by its number.
-    """
+    """The class list as it counts."""
 
     rubric: Rubric
     listings: tuple[Listing, ...]
-    seen: Mapping[int, str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +92,48 @@ class TeamNow:
     events: Sequence[Event]
 
 
+@dataclass(frozen=True, kw_only=True)
+class Together:
+    """Points that a person gave several submissions in one go: all at the same moment.
+
+    Attributes
+    ----------
+    at : ISO 8601, UTC, to the microsecond; by it they are found again.
+    criterion, why : of one of them.
+    teams : so many got something new.
+    """
+
+    at: str
+    by: str
+    criterion: str = ""
+    why: str = ""
+    teams: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class Undone:
+    """What was given back in one go; `kept` are submissions that somebody changed since."""
+
+    at: str
+    back: int
+    kept: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Tried:
+    """What points by hand would make of a submission.
+
+    Attributes
+    ----------
+    version : of the criterion now; to be sent along with the change.
+    """
+
+    submission: str
+    now: Grade
+    after: Grade
+    version: str
+
+
 class OpenBook(Gradebook):
     """A gradebook of which several processes show the newest, and change no more than they saw."""
 
@@ -110,40 +150,35 @@ class OpenBook(Gradebook):
             last = self._last(connection)
             rubric = read_rubric(last)
             given, first_keys = _given(connection, last), _first_keys(connection, last)
+            seen = _seen(connection, last)
             known = before.listings if before and before.rubric == rubric else ()
             made = {listing.made_of: listing for listing in known}
-            columns = gradings.c.id, gradings.c.submission_id, briefs.c.grade.label("brief")
-            rows = [
-                (row, (row.id, row.shared, *given.get(row.submission_id, ())))
-                for row in connection.execute(class_list(last, *columns))
-            ]
-            # Few have points by hand, and those need all of the grade.
-            by_hand = {row.submission_id for row, of in rows if of not in made} & given.keys()
-            whole = class_list(last).where(entries.c.submission_id.in_(by_hand))
-            entry_of = {
-                row.submission_id: as_it_counts(
-                    row,
-                    given[row.submission_id].values(),
-                    shared=read_flag(row.shared),
-                    rubric=rubric,
+            columns = gradings.c.id, gradings.c.submission_id
+            rests_on = {
+                row.position: (
+                    row.id,
+                    row.shared,
+                    seen.get(row.id, ""),
+                    *given.get(row.submission_id, ()),
                 )
-                for row in connection.execute(whole)
+                for row in connection.execute(class_list(last, *columns))
             }
-            listings = []
-            for row, made_of in rows:
-                if (listing := made.get(made_of)) is None:
-                    shared, entry = read_flag(row.shared), entry_of.get(row.submission_id)
-                    listing = Listing(
-                        line=Line.of(entry.grade)
-                        if entry
-                        else Line.read(row.brief, shared=shared is not None),
-                        grading=row.id,
-                        shared=shared,
-                        first_key=first_keys[row.submission_id],
-                        made_of=made_of,
-                    )
-                listings.append(listing)
-            return ClassNow(rubric=rubric, listings=tuple(listings), seen=_seen(connection, last))
+            listed = {at: made[of] for at, of in rests_on.items() if of in made}
+            rows = class_list(last)
+            if listed:
+                new = [at for at in rests_on if at not in listed]
+                rows = rows.where(entries.c.position.in_(new))
+            for row in connection.execute(rows):
+                listed[row.position] = Listing(
+                    line=_line(row, given.get(row.submission_id), rubric=rubric),
+                    submission=row.name,
+                    grading=row.id,
+                    seen=seen.get(row.id, ""),
+                    shared=read_flag(row.shared),
+                    first_key=first_keys[row.submission_id],
+                    made_of=rests_on[row.position],
+                )
+            return ClassNow(rubric=rubric, listings=tuple(listed[at] for at in rests_on))
 
     def team(self, name: str) -> TeamNow:
         """Return all of a submission.
@@ -176,7 +211,7 @@ class OpenBook(Gradebook):
         why: str,
         by: str,
         seen: str,
-    ) -> Override:
+    ) -> HandPoints:
         """Give points by hand as `override` does, where nobody else did since.
 
         Parameters
@@ -190,11 +225,10 @@ class OpenBook(Gradebook):
         with self._database.changing() as connection:
             last, row = self._find(connection, team)
             _check_seen(connection, row, criterion, seen)
-            return self._give(
-                connection, row, criterion, points, why=why, by=by, rubric=read_rubric(last)
-            )
+            asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
+            return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
-    def undo(self, team: str, criterion: str, *, by: str, seen: str) -> Override:
+    def undo(self, team: str, criterion: str, *, by: str, seen: str) -> HandPoints:
         """Give a criterion what it had before its last change; twice: what it had after.
 
         Raises
@@ -208,46 +242,88 @@ class OpenBook(Gradebook):
             rows = connection.execute(_overrides().where(*own)).all()
             if not rows:
                 raise ConfigError(f"{criterion}: nothing was changed by hand")
-            before = rows[-2] if len(rows) > 1 and rows[-2].points is not None else None
-            return self._give(
-                connection,
-                row,
-                criterion,
-                before.points if before else None,
-                why=before.why if before else "taken back",
-                by=by,
-                rubric=read_rubric(last),
-            )
+            asked = _before(rows[:-1], team, criterion)
+            return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
-    def change_all(self, wishes: Sequence[Wish], *, by: str) -> int:
-        """Give points by hand, all of them or, where one cannot be, none; say how many were new.
+    def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
+        """Give points by hand, all of them or, where one cannot be, none.
 
         Raises
         ------
-        ConfigError : with the line of the table.
+        ConfigError : with the line of the table, if they are from one.
+        Conflict : one of them rests on what is no longer so.
         """
         new = 0
         with self._database.changing() as connection:
             last = self._last(connection)
-            rubric = read_rubric(last)
-            columns = submissions.c.name, gradings.c.submission_id
+            rubric, at = read_rubric(last), self._at()
+            columns = submissions.c.name, gradings.c.id, gradings.c.submission_id
             named = {row.name: row for row in connection.execute(class_list(last, *columns))}
             for wish in wishes:
+                where = f"line {wish.line}: " if wish.line else ""
                 row = named.get(wish.submission)
                 if row is None:
-                    raise ConfigError(f"line {wish.line}: no such submission is in the class")
+                    raise ConfigError(f"{where}no such submission is in the class")
+                if wish.seen:
+                    _check_seen(connection, row, wish.criterion, wish.seen)
                 newest = _newest_overrides(connection, row.submission_id).get(wish.criterion)
                 if newest is not None and (newest.points, newest.why) == (wish.points, wish.why):
                     continue
                 try:
-                    self._give(
-                        connection, row, wish.criterion, wish.points, why=wish.why, by=by,
-                        rubric=rubric,
-                    )  # fmt: skip
+                    self._give(connection, row, replace(wish, at=at), by=by, rubric=rubric)
                 except ConfigError as error:
-                    raise ConfigError(f"line {wish.line}: {error}") from None
+                    raise ConfigError(f"{where}{error}") from None
                 new += 1
-        return new
+        return Together(at=at, by=by, teams=new)
+
+    def try_all(self, wishes: Sequence[WantedPoints]) -> list[Tried]:
+        """Return what points by hand would make of submissions, without giving them.
+
+        Those that are not in the class are left out.
+        """
+        wished = {wish.submission: wish for wish in wishes}
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            rubric = read_rubric(last)
+            mine = class_list(last).where(submissions.c.name.in_(wished))
+            return [
+                _try(connection, row, wished[row.name], rubric=rubric)
+                for row in connection.execute(mine).all()
+            ]
+
+    def undo_all(self, at: str, *, by: str) -> Undone:
+        """Give back what all criteria had that were changed in one go.
+
+        What somebody changed since stays as it is now.
+        """
+        back, kept = 0, []
+        with self._database.changing() as connection:
+            last = self._last(connection)
+            rubric, now = read_rubric(last), self._at()
+            for row in connection.execute(_changed_at(last, at)).all():
+                ever = overrides.c.submission_id == row.submission_id
+                own = _overrides().where(ever, overrides.c.criterion == row.criterion)
+                *before, newest = connection.execute(own).all()
+                if newest.id != row.id:
+                    kept.append(row.name)
+                    continue
+                wish = replace(_before(before, row.name, row.criterion), at=now)
+                self._give(connection, row, wish, by=by, rubric=rubric)
+                back += 1
+        return Undone(at=now, back=back, kept=tuple(kept))
+
+    def changed_together(self) -> list[Together]:
+        """Return what was given to several submissions in one go, the newest first."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
+            columns = overrides.c.at, overrides.c.by
+            teams = func.count(overrides.c.submission_id.distinct())
+            mine = select(*columns, func.min(overrides.c.criterion).label("criterion"),
+                          func.max(overrides.c.why).label("why"), teams.label("teams"))  # fmt: skip
+            mine = mine.where(overrides.c.submission_id.in_(of_class)).group_by(*columns)
+            mine = mine.having(teams > 1).order_by(func.max(overrides.c.id).desc())
+            return [Together(**row) for row in connection.execute(mine).mappings()]
 
     def mark(self, team: str, *, by: str, seen: bool) -> None:
         """Say that somebody looked at a submission as it is graded now, or did not."""
@@ -256,7 +332,7 @@ class OpenBook(Gradebook):
             values = {"grading_id": row.id, "at": self._at(), "by": by, "seen": seen}
             connection.execute(insert(looks).values(values))
 
-    def changes_since(self, number: int) -> list[tuple[str, Override]]:
+    def changes_since(self, number: int) -> list[tuple[str, HandPoints]]:
         """Return the submission and content of each override after one of a number."""
         with self._database.reading() as connection:
             mine = _overrides().where(
@@ -285,10 +361,19 @@ class OpenBook(Gradebook):
         return dict(found)
 
 
-def _given(connection: Connection, batch: Row) -> dict[int, dict[int, Override]]:
+def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
+    """Return a line of the class as it counts; few have points by hand, and need all of a grade."""
+    shared = read_flag(row.shared)
+    if given:
+        return Line.of(as_it_counts(row, given.values(), shared=shared, rubric=rubric).grade)
+    line = Line.model_validate_json(row.grade)
+    return line.sharing() if shared else line
+
+
+def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
     """Return all that was ever given by hand in a class: by submission, by its own number."""
     of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
-    given: dict[int, dict[int, Override]] = defaultdict(dict)
+    given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
     mine = _overrides().where(overrides.c.submission_id.in_(of_class))
     for row in connection.execute(mine):
         given[row.submission_id][row.id] = _read_override(row)
@@ -318,9 +403,41 @@ def _overrides() -> Select:
     return select(*columns, *OVERRIDE).join(submissions).order_by(overrides.c.id)
 
 
-def _read_override(row: Row) -> Override:
+def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
+    """Return what a criterion had by hand before its last change, of all that it ever had."""
+    last = earlier[-1] if earlier and earlier[-1].points is not None else None
+    return WantedPoints(
+        submission=team,
+        criterion=criterion,
+        points=last.points if last else None,
+        why=last.why if last else "taken back",
+    )
+
+
+def _changed_at(batch: Row, at: str) -> Select:
+    """Return the query for all that a class was given by hand at one moment."""
+    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
+    return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(of_class))
+
+
+def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
+    """Return what a line of the class would be with points by hand."""
+    shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
+    rows = connection.execute(_overrides().where(own)).all()
+    ever = [_read_override(one) for one in rows]
+    new = HandPoints(criterion=wish.criterion, points=wish.points, why=wish.why, by="", at="")
+    newest = {one.criterion: one for one in rows}.get(wish.criterion)
+    return Tried(
+        submission=row.name,
+        now=as_it_counts(row, ever, shared=shared, rubric=rubric).grade,
+        after=as_it_counts(row, [*ever, new], shared=shared, rubric=rubric).grade,
+        version=_version(row, newest),
+    )
+
+
+def _read_override(row: Row) -> HandPoints:
     """Return what a row of that says."""
-    return Override(**{column.name: row._mapping[column.name] for column in OVERRIDE})
+    return HandPoints(**{column.name: row._mapping[column.name] for column in OVERRIDE})
 
 
 def _newest_overrides(connection: Connection, submission: int) -> dict[str, Row]:
@@ -332,10 +449,15 @@ def _version(row: Row, newest: Row | None) -> str:
     return f"{row.id}.{newest.id if newest is not None else 0}"
 
 
-def _check_seen(connection: Connection, row: Row, criterion: str, seen: str) -> None:
+def find_version(connection: Connection, row: Row, criterion: str) -> tuple[str, HandPoints | None]:
+    """Return what the points of a criterion rest on, and what was given by hand last."""
     newest = _newest_overrides(connection, row.submission_id).get(criterion)
-    if seen != _version(row, newest):
+    return _version(row, newest), _read_override(newest) if newest is not None else None
+
+
+def _check_seen(connection: Connection, row: Row, criterion: str, seen: str) -> None:
+    version, given = find_version(connection, row, criterion)
+    if seen != version:
         raise Conflict(
-            f"{criterion}: was changed, or graded anew, after this page was shown",
-            now=_read_override(newest) if newest is not None else None,
+            f"{criterion}: was changed, or graded anew, after this page was shown", now=given
         )

@@ -7,17 +7,16 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
-from pipeline.grading.gradings import person
+from pipeline.grading.grade import Criterion, Grade, GradeOverride
+from pipeline.grading.gradings import go_with
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
-from pipeline.schemas.grade import Criterion, Grade
-from pipeline.schemas.grade import Override as ByHand
 
 _HEADS = ("submission", "criterion", "points", "why")  # of a table with points for many
 
 
 @dataclass(frozen=True, kw_only=True)
-class Override:
+class HandPoints:
     """Points that a person gave one criterion of one submission.
 
     Attributes
@@ -35,13 +34,8 @@ class Override:
     authors: tuple[str, ...] = ()
 
     def concerns(self, authors: tuple[str, ...]) -> bool:
-        """Whether the submission is still that of the people it was given to.
-
-        A submission that cannot be read names no authors: then its name decides.
-        """
-        if not authors or not self.authors:
-            return True
-        return not set(map(person, authors)).isdisjoint(map(person, self.authors))
+        """Whether the submission is still that of the people it was given to."""
+        return go_with(self.authors, authors)
 
 
 def read_points(text: str) -> float | None:
@@ -60,17 +54,26 @@ def read_points(text: str) -> float | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wish:
-    """A row of the table; points None: the automatic ones again."""
+class WantedPoints:
+    """What somebody asks for; points None: the automatic ones again.
 
-    line: int
+    Attributes
+    ----------
+    line : of a table that says so, 0 where none does.
+    seen : what the change rests on, from `TeamNow.versions`; "" for whatever holds now.
+    at : when; "" for now. Those given in one go have the same.
+    """
+
     submission: str
     criterion: str
     points: float | None
     why: str
+    line: int = 0
+    seen: str = ""
+    at: str = ""
 
 
-def read_wishes(path: Path) -> list[Wish]:
+def read_wishes(path: Path) -> list[WantedPoints]:
     """Read a CSV with the columns submission, criterion, points (or auto) and why.
 
     Raises
@@ -92,13 +95,18 @@ def read_wishes(path: Path) -> list[Wish]:
         except ConfigError as error:
             raise ConfigError(f"{path.name} line {line}: {error}") from None
         wishes.append(
-            Wish(line=int(str(line)), submission=submission, criterion=criterion, points=given,
-                 why=why)
-        )  # fmt: skip
+            WantedPoints(
+                submission=submission,
+                criterion=criterion,
+                points=given,
+                why=why,
+                line=int(str(line)),
+            )
+        )
     return wishes
 
 
-def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: Rubric) -> Grade:
+def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
     """Return the grade with points given by hand, by criterion; lateness is taken off anew.
 
     A criterion that was never judged, as the submission could not be graded, is added.
@@ -122,7 +130,7 @@ def with_overrides(grade: Grade, overrides: Mapping[str, Override], *, rubric: R
         "points": float(earned - deducted),
         "deducted": float(deducted),
         "overrides": tuple(
-            ByHand(criterion=key, points=points, why=overrides[key].why)
+            GradeOverride(criterion=key, points=points, why=overrides[key].why)
             for key, points in sorted(given.items())
         ),
     }
@@ -138,6 +146,8 @@ def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
     points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
+    if points == criterion.points:  # a comment alone
+        return criterion.model_copy(update={"message": f"{criterion.message} {why}"})
     changed = {
         "points": points,
         "outcome": "pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",

@@ -9,26 +9,25 @@ from pydantic import ValidationError
 from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, insert, select
 
 from pipeline.errors import ConfigError
-from pipeline.grading.gradebook.class_lines import Line
-from pipeline.grading.gradebook.override import Override, with_overrides
+from pipeline.grading.grade import Flag, Grade, read_grade
+from pipeline.grading.gradebook.override import HandPoints, with_overrides
 from pipeline.grading.gradebook.schema import (
     Database,
     batches,
-    briefs,
     entries,
     figures,
     gradings,
     overrides,
+    request_events,
     submissions,
 )
 from pipeline.grading.gradings import Grading, Member
 from pipeline.grading.rubric import Rubric
-from pipeline.schemas.grade import Flag, Grade, read_grade
 
 _PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
 # What a grading has in columns of its name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
-OVERRIDE = [overrides.c[f.name] for f in fields(Override)]
+OVERRIDE = [overrides.c[f.name] for f in fields(HandPoints)]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
 _MEMBER = (
     submissions.c.name.label("submission"),
@@ -55,7 +54,7 @@ class Entry:
 
     submission: str
     grade: Grade
-    overrides: Mapping[str, Override]
+    overrides: Mapping[str, HandPoints]
     owner: str
     key: str
     grading: int
@@ -93,23 +92,6 @@ def known_grading(
         return None
     own = {name: value for name, value in row.items() if name != "id"}
     return Grading(**own, figures=read_figures(connection, row["id"]) if drawn else ())
-
-
-def put_brief(connection: Connection, grading: int, grade: Grade) -> None:
-    """Add what the table of a class shows of a grading."""
-    connection.execute(insert(briefs).values(grading_id=grading, grade=Line.of(grade).text))
-
-
-def put_lacking_briefs(database: Database) -> None:
-    """Add the briefs of gradings by a version that kept none."""
-    lacking = select(gradings.c.id).outerjoin(briefs).where(briefs.c.grading_id.is_(None))
-    with database.reading() as connection:
-        numbers = connection.scalars(lacking.order_by(gradings.c.id)).all()
-    for page in pages(numbers):
-        with database.changing() as connection:
-            whole = select(gradings.c.id, gradings.c.grade).where(gradings.c.id.in_(page))
-            for row in connection.execute(whole.where(gradings.c.id.in_(lacking))).all():
-                put_brief(connection, row.id, read_grade(row.grade))
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
@@ -182,10 +164,8 @@ def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
 
 def class_list(batch: Row, *columns: ColumnElement) -> Select:
     """Return the query for the lines of a class list, in order; default: with their grades."""
-    joined = (
-        entries.join(gradings, entries.c.grading_id == gradings.c.id)
-        .join(submissions, entries.c.submission_id == submissions.c.id)
-        .join(briefs, briefs.c.grading_id == gradings.c.id)
+    joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
+        submissions, entries.c.submission_id == submissions.c.id
     )
     chosen = select(*(columns or _ENTRY), entries.c.position, entries.c.shared)
     mine = chosen.select_from(joined).where(entries.c.batch_id == batch.id)
@@ -199,7 +179,7 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
     first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
     return as_it_counts(
         row,
-        [Override(**o) for o in rows],
+        [HandPoints(**o) for o in rows],
         shared=shared,
         rubric=rubric,
         first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
@@ -207,7 +187,12 @@ def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric
 
 
 def as_it_counts(
-    row: Row, ever: Iterable[Override], *, shared: Flag | None, rubric: Rubric, first_key: str = ""
+    row: Row,
+    ever: Iterable[HandPoints],
+    *,
+    shared: Flag | None,
+    rubric: Rubric,
+    first_key: str = "",
 ) -> Entry:
     """Return a line with all overrides that there ever were of its submission."""
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
@@ -287,25 +272,27 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
     return connection.scalar(named.order_by(gradings.c.id.desc()).limit(1)) or ()
 
 
-def carry_overrides(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
-    """Put in, for who goes on under another name, what was given by hand under the old one.
+def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
+    """Put in, for who goes on under another name, what people gave or asked under the old one.
 
-    All that is not there yet, so that it stays right when the name changes back.
+    That is points by hand and requests: all that is not there yet, so that it stays right when the
+    name changes back.
     """
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
         submissions.c.name.in_([*moved, *moved.values()]),
     )
     numbers = {row.name: row.id for row in connection.execute(named)}
-    given = {}
-    for name, number in numbers.items():
-        mine = select(*OVERRIDE).where(overrides.c.submission_id == number)
-        rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
-        given[name] = [dict(row) for row in rows]
-    for old, new in moved.items():
-        for values in given[old]:
-            if values not in given[new]:
-                add_row(connection, overrides, {**values, "submission_id": numbers[new]})
+    for table in (overrides, request_events):
+        columns = [column for column in table.c if column.name not in ("id", "submission_id")]
+        there = {}
+        for name, number in numbers.items():
+            mine = select(*columns).where(table.c.submission_id == number).order_by(table.c.id)
+            there[name] = [dict(row) for row in connection.execute(mine).mappings()]
+        for old, new in moved.items():
+            for values in there[old]:
+                if values not in there[new]:
+                    add_row(connection, table, {**values, "submission_id": numbers[new]})
 
 
 def read_flag(text: str) -> Flag | None:

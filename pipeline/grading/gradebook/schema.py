@@ -149,6 +149,14 @@ figures = Table(
     Column("svg", Deflated, nullable=False),
 )
 
+# What the checks found in a grading: by it another rubric's points are known without grading again.
+findings = Table(
+    "findings",
+    metadata,
+    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
+    Column("found", Deflated, nullable=False),
+)
+
 # A batch that ran to its end, and its class list: for each submission the grading that counts,
 # the flag for data shared with others, and the points given out at the time.
 batches = Table(
@@ -188,14 +196,6 @@ overrides = Table(
     Index("overrides_by_submission", "submission_id"),
 )
 
-# What the table of a class shows of a grade: to read 2,000 whole ones takes seconds.
-briefs = Table(
-    "briefs",
-    metadata,
-    Column("grading_id", ForeignKey("gradings.id"), primary_key=True),
-    Column("grade", Words, nullable=False),
-)
-
 # Who looked at a grading; the newest counts, so that a mark can be taken back.
 looks = Table(
     "looks",
@@ -206,6 +206,34 @@ looks = Table(
     Column("by", Words, nullable=False),
     Column("seen", Boolean, nullable=False),
     Index("looks_by_grading", "grading_id"),
+)
+
+# Requests for another look at a criterion: `asked`, `answered`, `reopened`. The newest event of one
+# says how it stands; an answer has points only where it gave others.
+request_events = Table(
+    "request_events",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("submission_id", ForeignKey("submissions.id"), nullable=False),
+    Column("at", Text, nullable=False),
+    Column("criterion", Text, nullable=False),
+    Column("what", Text, nullable=False),
+    Column("text", Words, nullable=False),
+    Column("points", Float),
+    Column("by", Words, nullable=False),
+    Column("authors", Names, nullable=False),
+    Index("request_events_by_submission", "submission_id"),
+)
+
+# Whether students may read the feedback of an assignment; the newest counts.
+releases = Table(
+    "releases",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("assignment", String(255), nullable=False),
+    Column("at", Text, nullable=False),
+    Column("by", Words, nullable=False),
+    Column("released", Boolean, nullable=False),
 )
 
 _REFUSE = "a gradebook is only added to"

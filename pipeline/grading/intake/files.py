@@ -16,10 +16,16 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.lms_names import parse_name
-from pipeline.grading.intake.unpack import HAND_IN, STRANGE_ARCHIVES, Limits, is_debris, unpack
-from pipeline.names import first_few
+from pipeline.grading.intake.unpack import (
+    HAND_IN,
+    STRANGE_ARCHIVES,
+    UnpackLimits,
+    is_debris,
+    unpack,
+)
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.words.numbers import first_few
 
 _DEEPEST = 12  # folders below the hand-in's
 _ARCHIVES_IN_ARCHIVES = 3
@@ -156,7 +162,7 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
                 yield entry.stat(follow_symlinks=False).st_size, str(name), Path(entry.path)
 
 
-def _less(limits: Limits, folder: Path) -> Limits:
+def _less(limits: UnpackLimits, folder: Path) -> UnpackLimits:
     """Return what is left of the limits beside what is in a folder."""
     sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))

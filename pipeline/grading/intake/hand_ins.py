@@ -4,7 +4,7 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 
@@ -27,6 +27,7 @@ from pipeline.grading.intake.unpack import (
 )
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
+from pipeline.words.progress import Progress, silent
 
 _DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
 _LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on every system
@@ -66,11 +67,7 @@ class _Walk:
     """What is no hand-in where folders are looked through, and whom to tell of what was none."""
 
     skip: set[Path]
-    say: Callable[[str], None]
-
-
-def _silent(text: str) -> None:
-    pass
+    say: Progress
 
 
 def find_hand_ins(
@@ -79,7 +76,7 @@ def find_hand_ins(
     scratch: Path,
     skip: Iterable[Path] = (),
     known: Iterable[str] = (),
-    say: Callable[[str], None] = _silent,
+    say: Progress = silent,
 ) -> tuple[HandIn, ...]:
     """Return the hand-ins in folders, trees and archives, in the order of their ids.
 

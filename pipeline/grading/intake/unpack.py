@@ -42,7 +42,7 @@ STRANGE_ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tbz", ".tgz", ".xz",
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class UnpackLimits:
     """What an archive may be.
 
     Attributes
@@ -59,15 +59,17 @@ class Limits:
     whole: bool = True
 
 
-HAND_IN = Limits()
-CLASS = Limits(members=200_000, total=50_000_000_000, ratio=1e4, directory=24_000_000, whole=False)
+HAND_IN = UnpackLimits()
+CLASS = UnpackLimits(
+    members=200_000, total=50_000_000_000, ratio=1e4, directory=24_000_000, whole=False
+)
 
 
 @dataclass(kw_only=True)
 class _Budget:
     """What is left of the limits while an archive is read."""
 
-    limits: Limits
+    limits: UnpackLimits
     members: int = field(init=False)
     total: int = field(init=False)
 
@@ -85,7 +87,7 @@ def is_debris(path: PurePosixPath) -> bool:
     )
 
 
-def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, str]:
+def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosixPath, str]:
     """Unpack a zip archive into a new folder; return what was refused: member and reason.
 
     Only regular files are written.
@@ -108,7 +110,7 @@ def unpack(archive: Path, into: Path, *, limits: Limits) -> dict[PurePosixPath, 
         raise SubmissionError(f"{shown}: {_why(error)}{again}") from None
 
 
-def member_names(archive: Path, *, limits: Limits = HAND_IN) -> list[PurePosixPath]:
+def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PurePosixPath]:
     """Return the files that may be unpacked and are no debris; none where it is no archive.
 
     Raises
@@ -204,7 +206,7 @@ class _Bounded(io.BufferedReader):
 
 
 @contextmanager
-def _opened(archive: Path, *, limits: Limits) -> Iterator[zipfile.ZipFile]:
+def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]:
     """Open an archive that is not too large and whose contents fit the memory."""
     size = archive.stat().st_size
     if size > limits.total:

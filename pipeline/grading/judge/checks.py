@@ -13,15 +13,17 @@ from pipeline.grading.judge.checks_loop import (
     judge_hardware,
     judge_prefilter,
 )
+from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
 from pipeline.grading.judge.laws import MOST_WIDENING, judge_laws
-from pipeline.grading.judge.work import ALL, NONE, Verdict, Work, asked_pieces, mean_share
+from pipeline.grading.judge.work import Verdict, Work, asked_pieces
 from pipeline.grading.mistakes.impossible import not_positive
 from pipeline.grading.mistakes.state_model import model_harm
 from pipeline.grading.references.reference import OFF_SCALE, Reference, is_linear, off_scale
-from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, credit, percent_off, rounding
-from pipeline.grading.rubric import is_damping, matching
+from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, percent_off, rounding
+from pipeline.grading.rubric import matching
 from pipeline.grading.words import WORDS
-from pipeline.names import first_few
+from pipeline.names import read_name
+from pipeline.words.numbers import first_few
 
 _NAMED = 4  # so many are named in a message
 
@@ -80,11 +82,11 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             reasons = [OFF_SCALE]
         why = reasons[0] if reasons else "these are first guesses, and no recording decides them"
         return Verdict(share=None, message=f"Not checked: {why}.")
-    shares, off, wrong = [], [], set()
+    deviations, off, wrong = [], [], set()
     for name in judged:
         if name not in table:
             wrong.add(name)
-            shares.append(NONE)
+            deviations.append(_deviation(NO_CREDIT, name))
             off.append(f"{name} is not reported")
             continue
         error = (
@@ -92,8 +94,8 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
             if name in known
             else NO_CREDIT
         )
-        shares.append(_credit(error, name, criterion))
-        if shares[-1] < 1:
+        deviations.append(_deviation(error, name))
+        if earned_by(criterion, deviations[-1]) < 1:
             wrong.add(name)
             there = f", your recordings give {known[name].said}" if name in known else ""
             off.append(f"{name}: you report {as_typed(table[name])}{there}")
@@ -107,20 +109,18 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
     message = f"{'; '.join(off[:_NAMED])}." if off else right
     look = f" {WORDS.text('judged_loosely')}" if loose else ""
     return Verdict(
-        share=mean_share(shares),
+        share=earned(criterion, deviations),
+        models=(tuple(deviations),),
         message=message + left + look,
         explained=bool(wrong) and wrong <= work.named[criterion.check],
         expected={n: known[n].value for n in judged if n in known},
         found={n: float(table[n]) for n in judged if n in table},
+        agrees={n: n not in wrong for n in judged if n in table},
     )
 
 
-def _credit(error: Fraction, name: str, asks: asked.Parameters | asked.InitialFinal) -> Fraction:
-    if is_damping(name):
-        full, none = asks.damping_full_percent, asks.damping_none_percent
-    else:
-        full, none = asks.full_percent, asks.none_percent
-    return credit(error, full=full, none=none)
+def _deviation(error: Fraction, name: str) -> Deviation:
+    return Deviation(error=error, by="damping" if read_name(name).is_damping else "number")
 
 
 def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
@@ -130,17 +130,20 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
     both = [
         n
         for n in names
-        if n in initial and n in final and not (is_damping(n) and n not in work.references.initial)
+        if n in initial
+        and n in final
+        and not (read_name(n).is_damping and n not in work.references.initial)
     ]
     if not both:
         return Verdict(share=None, message="Not checked: no parameter is in both tables.")
-    shares, apart = [], []
+    deviations, apart = [], []
     for name in both:
-        shares.append(_credit(between(initial[name], final[name]), name, criterion))
-        if shares[-1] < 1:
+        deviations.append(_deviation(between(initial[name], final[name]), name))
+        if earned_by(criterion, deviations[-1]) < 1:
             apart.append(f"{name}: first {as_typed(initial[name])}, then {as_typed(final[name])}")
     return Verdict(
-        share=mean_share(shares),
+        share=earned(criterion, deviations),
+        models=(tuple(deviations),),
         message=f"{'; '.join(apart[:_NAMED])}." if apart else "Both estimates agree.",
         expected={n: float(initial[n]) for n in both},
         found={n: float(final[n]) for n in both},
@@ -192,37 +195,29 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
         return Verdict(
             share=None, message="Not checked: neither a table nor a fit to compare with."
         )
-    shares = []
-    for entry in entries:
-        damping = entry.kind == "damping"
-        shares.append(
-            credit(
-                entry.error,
-                full=criterion.damping_full_percent if damping else criterion.full_percent,
-                none=criterion.damping_none_percent if damping else criterion.none_percent,
-            )
-        )
-    # The noughts and ones are given away; a wrong one among them costs as a wrong number does.
-    counted = [
-        share
-        for share, entry in zip(shares, entries, strict=True)
-        if entry.kind != "exact" or share < 1
-    ]
+    deviations = tuple(
+        Deviation(error=e.error, by="number" if e.kind == "stiffness" else e.kind) for e in entries
+    )
+    shares = [earned_by(criterion, deviation) for deviation in deviations]
     off = [e for e, share in zip(entries, shares, strict=True) if share < 1]
     named = "; ".join(
         f"{e.name} = {as_typed(e.typed)}, expected {e.right[0]:.4g}" for e in off[:_NAMED]
     )
-    share, message = mean_share(counted), f"{named}." if off else "A and B follow from the table."
-    springs = work.analysis.springs
+    message = f"{named}." if off else "A and B follow from the table."
+    springs = work.analysis.bench.springs
     n, tied = len(springs) - 1, springs[0] or springs[-1]
-    if harm := model_harm(space, entries, models=work.state_models, n=n, tied=tied):
-        share = min(share, limits.KEPT_IF_HARMFUL)
+    harm = model_harm(space, entries, models=work.state_models, n=n, tied=tied)
+    most = limits.KEPT_IF_HARMFUL if harm else ALL
+    if harm:
         message = f"{WORDS.text(f'model_{harm}')} {message}"
     return Verdict(
-        share=share,
+        share=min(earned(criterion, deviations), most),
+        models=(deviations,),
+        most=most,
         message=message,
         expected={e.name: e.right[0] for e in entries if e.kind != "exact" or e in off},
         found={e.name: float(e.typed) for e in entries if e.kind != "exact" or e in off},
+        agrees={e.name: e not in off for e in entries if e.kind != "exact" or e in off},
     )
 
 

@@ -1,6 +1,7 @@
 """The checks of the closed loop: gains, claims, prefilter, hardware."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
@@ -8,14 +9,16 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.grading import limits
 from pipeline.grading import rubric as asked
-from pipeline.grading.judge.work import NONE, Verdict, Work, mean_share
+from pipeline.grading.judge.earned import ALL, NONE, Deviation, earned, earned_by
+from pipeline.grading.judge.work import Verdict, Work
 from pipeline.grading.mistakes.controller import Controller, does, same_gains
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers
 from pipeline.grading.references.reference import OFF_SCALE, Reference, off_scale
-from pipeline.grading.references.tolerance import as_typed, credit, exact, percent_off, rounding
+from pipeline.grading.references.tolerance import NO_CREDIT, as_typed, exact, percent_off, rounding
 from pipeline.grading.words import WORDS
+from pipeline.results import Stage
 
-Judged = Callable[[LoopNumbers], Fraction]
+Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
 
 def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
@@ -28,12 +31,25 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
     return work.controller, work.controller.gains
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Best:
+    """The share of the model on which the gains earn most, and what they do on it."""
+
+    share: Fraction
+    numbers: LoopNumbers
+    models: tuple[tuple[Deviation, ...], ...]
+
+
 def _best(
-    controller: Controller, gains: Array, judged: Judged
-) -> tuple[Fraction, LoopNumbers] | None:
-    """Return the share of the model on which the gains earn most, and what they do on it."""
-    found = [(judged(numbers), numbers) for numbers in controller.numbers(gains)]
-    return max(found, key=lambda one: one[0], default=None)
+    criterion: asked.Criterion, controller: Controller, gains: Array, judged: Judged
+) -> _Best | None:
+    every = controller.numbers(gains)
+    models = tuple(map(judged, every))
+    found = [(earned(criterion, one), numbers) for one, numbers in zip(models, every, strict=True)]
+    if not found:
+        return None
+    share, numbers = max(found, key=lambda one: one[0])
+    return _Best(share=share, numbers=numbers, models=models)
 
 
 def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
@@ -44,28 +60,25 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
     controller, gains = loop
     goal = controller.goal
 
-    def judged(numbers: LoopNumbers) -> Fraction:
+    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         if not numbers.stable or numbers.settling_time is None:
-            return NONE
+            return (Deviation(error=NO_CREDIT, by="settling"),)
         over = Fraction(max(numbers.overshoot - goal.overshoot_percent, 0.0))
         late = Fraction(100 * max(numbers.settling_time / goal.settling_time - 1, 0.0))
-        full, none = criterion.settling_full_percent, criterion.settling_none_percent
-        return min(
-            credit(over, full=criterion.overshoot_full, none=criterion.overshoot_none),
-            credit(late, full=full, none=none),
-        )
+        return Deviation(error=over, by="overshoot"), Deviation(error=late, by="settling")
 
-    best = _best(controller, gains, judged)
+    best = _best(criterion, controller, gains, judged)
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
-    share, numbers = best
-    only_on_paper = ""
+    numbers, most, only_on_paper = best.numbers, ALL, ""
     if runaway := controller.runaway(gains):
         if numbers.stable:
             only_on_paper = f" {WORDS.text('only_on_paper', does=does(numbers))}"
-        share, numbers = min(share, limits.KEPT_IF_HARMFUL), runaway
+        most, numbers = limits.KEPT_IF_HARMFUL, runaway
     return Verdict(
-        share=share,
+        share=min(best.share, most),
+        models=best.models,
+        most=most,
         message=f"On your carts: {does(numbers)}; the goal is {goal.overshoot_percent:g} % and "
         f"{goal.settling_time:g} s.{only_on_paper}",
         expected={
@@ -77,6 +90,7 @@ def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
             **_claimable(numbers),
             "poles": [[p.real, p.imag] for p in numbers.poles],
         },
+        agrees={"gains": min(best.share, most) == 1},
     )
 
 
@@ -93,31 +107,33 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
     controller, gains = loop
     claims = {"overshoot_percent": controller.overshoot, "settling_time": controller.settling}
 
-    def judged(numbers: LoopNumbers) -> Fraction:
-        shares = [NONE, NONE]
+    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
+        over = late = NO_CREDIT
         if controller.overshoot is not None and np.isfinite(numbers.overshoot):
             off = abs(Fraction(controller.overshoot) - Fraction(numbers.overshoot))
-            off = max(off - rounding(controller.overshoot), Fraction(0))
-            shares[0] = credit(off, full=criterion.overshoot_full, none=criterion.overshoot_none)
+            over = max(off - rounding(controller.overshoot), Fraction(0))
         if controller.settling is not None and numbers.settling_time is not None:
-            shares[1] = credit(
-                percent_off(controller.settling, Reference.at(numbers.settling_time), sigmas=0.0),
-                full=criterion.settling_full_percent,
-                none=criterion.settling_none_percent,
-            )
-        return mean_share(shares)
+            right = Reference.at(numbers.settling_time)
+            late = percent_off(controller.settling, right, sigmas=0.0)
+        return Deviation(error=over, by="overshoot"), Deviation(error=late, by="settling")
 
-    best = _best(controller, gains, judged)
+    best = _best(criterion, controller, gains, judged)
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
-    share, expected = best[0], _claimable(best[1])
+    share, expected = best.share, _claimable(best.numbers)
     return Verdict(
         share=share,
+        models=best.models,
         message="What the gains give."
         if share == 1
-        else f"Simulated on your carts with these gains: {does(best[1])}.",
+        else f"Simulated on your carts with these gains: {does(best.numbers)}.",
         expected=expected,
         found={name: float(v) for name, v in claims.items() if v is not None},
+        agrees={
+            name: earned_by(criterion, off) == 1
+            for (name, claim), off in zip(claims.items(), judged(best.numbers), strict=True)
+            if claim is not None
+        },
     )
 
 
@@ -131,22 +147,24 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     if typed is None:
         return Verdict(share=NONE, message="No prefilter is reported.")
 
-    def judged(numbers: LoopNumbers) -> Fraction:
+    def judged(numbers: LoopNumbers) -> tuple[Deviation, ...]:
         signed = typed if numbers.prefilter > 0 else -typed
-        error = percent_off(signed, Reference.at(abs(numbers.prefilter)), sigmas=0.0)
-        return credit(error, full=criterion.full_percent, none=criterion.none_percent)
+        right = Reference.at(abs(numbers.prefilter))
+        return (Deviation(error=percent_off(signed, right, sigmas=0.0)),)
 
-    best = _best(controller, gains, judged)
+    best = _best(criterion, controller, gains, judged)
     if best is None:
         return Verdict(share=NONE, message="These gains cannot be simulated.")
-    share, right = best[0], best[1].prefilter
+    share, right = best.share, best.numbers.prefilter
     return Verdict(
         share=share,
+        models=best.models,
         message="One over the static gain of the loop, as it should be."
         if share == 1
         else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
         expected={"prefilter": right},
         found={"prefilter": float(typed)},
+        agrees={"prefilter": share == 1},
     )
 
 
@@ -162,14 +180,16 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
         if check.experiment in runs and check.loop == "closed":
             closed.setdefault(check.experiment, []).append(check.nrmse)
     if not closed:
-        reasons = [s.reason for s in work.analysis.skipped if s.stage.startswith("hardware")]
+        skipped = work.analysis.skipped
+        reasons = [one.reason for one in skipped if one.stage is Stage.HARDWARE_CHECK]
         why = reasons[0] if reasons else "the controller that ran is not stated"
         return Verdict(share=NONE, message=f"The loop cannot be compared: {why}.")
     errors = {run: 100 * float(np.sqrt(np.mean(np.square(e)))) for run, e in closed.items()}
     run = min(errors, key=lambda name: errors[name])
-    error = exact(errors[run])
+    deviation = Deviation(error=exact(errors[run]))
     return Verdict(
-        share=credit(error, full=criterion.full_percent, none=criterion.none_percent),
+        share=earned(criterion, [deviation]),
+        models=((deviation,),),
         message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
         + (" The gains that ran are not those reported." if _others_ran(work) else ""),
         expected={"nrmse_percent": criterion.full_percent},

@@ -5,11 +5,12 @@ from dataclasses import replace
 from fractions import Fraction
 
 from pipeline.grading import rubric as asked
-from pipeline.grading.judge.work import ALL, Verdict
+from pipeline.grading.grade import Code, Flag
+from pipeline.grading.judge.earned import ALL
+from pipeline.grading.judge.work import Verdict
 from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.words import WORDS
-from pipeline.schemas.grade import Code, Flag
 
 # The check that a remark is about; one on a table of parameters names its table in the evidence.
 _ABOUT: Mapping[Code, str] = {

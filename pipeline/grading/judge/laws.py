@@ -14,8 +14,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.grading.references.tolerance import rounding
-from pipeline.grading.rubric import is_damping
-from pipeline.names import parameter_names
+from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
 
@@ -47,7 +46,8 @@ def judge_laws(
         return None
     half = {name: float(rounding(final[name])) for name in names}
     percent = {
-        name: (damping_percent if is_damping(name) else frequency_percent) / 100 for name in names
+        name: (damping_percent if read_name(name).is_damping else frequency_percent) / 100
+        for name in names
     }
 
     def box(step: int) -> dict[str, float]:

@@ -1,16 +1,16 @@
 """Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 
 from pipeline.errors import SubmissionError
+from pipeline.grading.grade import CODES, Flag, Grade
+from pipeline.grading.judge.award import award
 from pipeline.grading.judge.checks import judge
-from pipeline.grading.judge.costs import charge
-from pipeline.grading.judge.work import Verdict, Work, missing_flag
+from pipeline.grading.judge.work import Verdict, Work, data_flag, missing_flag
 from pipeline.grading.mistakes.controller import diagnose_controller, reported_controller
 from pipeline.grading.mistakes.no_fit import copied_final
-from pipeline.grading.mistakes.recordings import bad_runs, data_flag
 from pipeline.grading.mistakes.reduced import diagnose_reduced
 from pipeline.grading.mistakes.state_model import diagnose_state_space, state_models
 from pipeline.grading.mistakes.tables import diagnose_tables
@@ -23,22 +23,29 @@ from pipeline.grading.references.reference import (
 )
 from pipeline.grading.references.signs import turned_round
 from pipeline.grading.references.springs import with_all_springs
-from pipeline.grading.references.tolerance import exact, late_deduction, rounding, to_step
+from pipeline.grading.references.tolerance import late_deduction, rounding
 from pipeline.grading.rubric import Rubric
 from pipeline.ingest.columns import conversion
 from pipeline.results import Analysis
-from pipeline.schemas.base import Units
-from pipeline.schemas.grade import CODES, Criterion, Flag, Grade, Outcome
+from pipeline.soundness.bad_recordings import find_bad_recordings
 from pipeline.submission import Experiment, InputOverride, Reported, Submission, System
+from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Graded:
-    """A grade, and the analysis of the student's recordings it rests on (None where it failed)."""
+    """A grade, and what it rests on.
+
+    Attributes
+    ----------
+    analysis : of the student's recordings, None where it failed.
+    verdicts : by criterion, also where what it requires was not passed; none where it failed.
+    """
 
     grade: Grade
     analysis: Analysis | None
+    verdicts: Mapping[str, Verdict] = field(default_factory=dict)
 
 
 def grade_submission(
@@ -47,7 +54,7 @@ def grade_submission(
     rubric: Rubric,
     name: str,
     days_late: float = 0.0,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> Graded:
     """Analyse a submission's recordings under the rubric's system and grade what it reports.
 
@@ -62,24 +69,53 @@ def grade_submission(
         )
         return Graded(grade=grade, analysis=None)
 
-    count = submission.system.carts
-    if count != rubric.system.carts:
-        carts = f"{count} cart{'s' if count > 1 else ''}"
-        reason = f"the submission is for {carts}, the rubric for {rubric.system.carts}"
-        return failed(reason)
-    submission, notes = under_rubric(submission, rubric)
-    say = progress or (lambda text: None)
     try:
-        analysis = analyse(submission, design=False, progress=say)
+        judged = analyse_under(submission, rubric=rubric, progress=progress)
     except SubmissionError as error:
         return failed(str(error))
-    analysis, springs = with_all_springs(submission, analysis, progress=say)
+    springs, notes, analysis = judged.springs, judged.notes, judged.analysis
     if springs:
         asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
         notes = (*notes, f"{asked}; judged with them")
-    grade = grade_analysis(submission, analysis, rubric=rubric, name=name, days_late=days_late)
-    grade = grade.model_copy(update={"springs": springs, "notes": (*notes, *grade.notes)})
-    return Graded(grade=grade, analysis=analysis)
+    graded = grade_analysis(
+        judged.submission, analysis, rubric=rubric, name=name, days_late=days_late
+    )
+    more = {"springs": springs, "notes": (*notes, *graded.grade.notes)}
+    return replace(graded, grade=graded.grade.model_copy(update=more))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Analysed:
+    """A submission under a rubric's system, analysed; `notes` say what of its own gave way.
+
+    `springs` : that the recordings ask for and the rubric has not.
+    """
+
+    submission: Submission
+    analysis: Analysis
+    springs: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def analyse_under(
+    submission: Submission, *, rubric: Rubric, progress: Progress = silent
+) -> Analysed:
+    """Analyse a submission's recordings under the rubric's system.
+
+    Raises
+    ------
+    SubmissionError : none can be read, or the carts are not as many as the rubric's.
+    """
+    count = submission.system.carts
+    if count != rubric.system.carts:
+        carts = f"{count} cart{'s' if count > 1 else ''}"
+        raise SubmissionError(
+            f"the submission is for {carts}, the rubric for {rubric.system.carts}"
+        )
+    submission, notes = under_rubric(submission, rubric)
+    analysis = analyse(submission, design=False, progress=progress)
+    analysis, springs = with_all_springs(submission, analysis, progress=progress)
+    return Analysed(submission=submission, analysis=analysis, springs=springs, notes=notes)
 
 
 def grade_analysis(
@@ -89,15 +125,50 @@ def grade_analysis(
     rubric: Rubric,
     name: str,
     days_late: float = 0.0,
-) -> Grade:
+) -> Graded:
     """Grade a submission against the analysis of its own recordings: a pure function.
 
     Parameters
     ----------
     submission : under the rubric's system, see `under_rubric`.
     """
+    work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
+    verdicts = {criterion.id: judge(criterion, work) for criterion in rubric.criteria}
+    criteria = award(rubric.criteria, verdicts, flags, rubric=rubric)
+    earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
+    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=days_late)
+    grade = Grade(
+        submission=name,
+        authors=tuple(author.id for author in submission.authors),
+        status="graded",
+        points=float(earned - deducted),
+        out_of=rubric.out_of,
+        days_late=days_late,
+        deducted=float(deducted),
+        criteria=criteria,
+        flags=flags,
+        units=analysis.bench.units,
+        notes=signed,
+    )
+    return Graded(grade=grade, analysis=analysis, verdicts=verdicts)
+
+
+def prepare_work(
+    submission: Submission, analysis: Analysis, *, rubric: Rubric
+) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
+    """Return what the checks work on, all flags in the order of their codes, and what to note."""
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
-    submission, n = submission.model_copy(update={"reported": reported}), rubric.system.carts
+    submission = submission.model_copy(update={"reported": reported})
+    work, told = _prepare(submission, analysis, rubric=rubric)
+    flags = sorted([*told, *_flags(work)], key=lambda flag: CODES.index(flag.code))
+    return work, tuple(flags), signed
+
+
+def _prepare(
+    submission: Submission, analysis: Analysis, *, rubric: Rubric
+) -> tuple[Work, tuple[Flag, ...]]:
+    """Return what the checks work on, and the flags of the tables of parameters."""
+    reported, n = submission.reported or Reported(), rubric.system.carts
     measured, chain = in_scale(
         recompute(analysis),
         trusted_chain(analysis) if is_linear(analysis) else None,
@@ -111,16 +182,13 @@ def grade_analysis(
         analysis=analysis,
         copied=copied_final(reported, references=measured),
     )
-    tables = [{name: float(typed) for name, typed in reported.final.items() if typed > 0}]
+    positive = {name: typed for name, typed in reported.final.items() if typed > 0}
+    tables = [{name: float(typed) for name, typed in positive.items()}]
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
     if chain is None and not diagnosis.possible:
         tables = []  # a model may well be right where its table was copied wrongly
-    digits = {
-        name: float(rounding(typed) / abs(Fraction(typed)))
-        for name, typed in reported.final.items()
-        if typed > 0
-    }
+    digits = {n: float(rounding(typed) / abs(Fraction(typed))) for n, typed in positive.items()}
     work = Work(
         submission=submission,
         analysis=analysis,
@@ -130,26 +198,10 @@ def grade_analysis(
         state_models=state_models(
             tables, rounding=digits, known=references.final, chain=chain, n=n
         ),
-        bad=bad_runs(analysis),
+        bad=find_bad_recordings(analysis),
         named=diagnosis.named,
     )
-    flags = sorted([*diagnosis.flags, *_flags(work)], key=lambda flag: CODES.index(flag.code))
-    criteria = _criteria(work, flags)
-    earned = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
-    deducted = late_deduction(earned, late=rubric.late, step=rubric.step, days_late=days_late)
-    return Grade(
-        submission=name,
-        authors=tuple(author.id for author in submission.authors),
-        status="graded",
-        points=float(earned - deducted),
-        out_of=rubric.out_of,
-        days_late=days_late,
-        deducted=float(deducted),
-        criteria=criteria,
-        flags=tuple(flags),
-        units=Units(position=analysis.position_unit, input=analysis.input_unit),
-        notes=signed,
-    )
+    return work, diagnosis.flags
 
 
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
@@ -205,43 +257,7 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     return experiment.model_copy(update={"input": InputOverride(sign=own.sign)})
 
 
-# ------------------------------------------------------------------ criteria and flags
-
-
-def _criteria(work: Work, flags: Sequence[Flag]) -> tuple[Criterion, ...]:
-    done: dict[str, Criterion] = {}
-    for asked in work.rubric.criteria:
-        parents = [done[p] for p in asked.requires if done[p].outcome in ("fail", "skip")]
-        verdict = _waits_for(parents[0]) if parents else judge(asked, work)
-        verdict = charge(verdict, asked, flags, rubric=work.rubric)
-        points = to_step((verdict.share or 0) * exact(asked.points), work.rubric.step)
-        outcome = _outcome(verdict.share, points, out_of=exact(asked.points))
-        advised = outcome in ("partial", "fail") and not verdict.explained
-        more = f" {asked.message}" if asked.message and advised else ""
-        done[asked.id] = Criterion(
-            id=asked.id,
-            title=asked.title,
-            outcome=outcome,
-            points=float(points),
-            out_of=asked.points,
-            message=verdict.message + more,
-            expected=verdict.expected,
-            found=verdict.found,
-        )
-    return tuple(done.values())
-
-
-def _waits_for(parent: Criterion) -> Verdict:
-    how = "not passed" if parent.outcome == "fail" else "skipped"
-    on = f"{parent.id!r} ({parent.title or parent.id})"
-    return Verdict(share=None, message=f"Not checked: it builds on {on}, which was {how}.")
-
-
-def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> Outcome:
-    """Return how a criterion went, by the points it is given: what rounding forgives has passed."""
-    if share is None:
-        return "skip"
-    return "pass" if points == out_of else "fail" if points == 0 else "partial"
+# ------------------------------------------------------------------------------- flags
 
 
 def _flags(work: Work) -> list[Flag]:

@@ -6,17 +6,16 @@ from fractions import Fraction
 from functools import cached_property
 from typing import Any
 
+from pipeline.grading.grade import Flag
+from pipeline.grading.judge.earned import ALL, Deviation
 from pipeline.grading.mistakes.controller import Controller
 from pipeline.grading.mistakes.explain import Label
-from pipeline.grading.mistakes.state_model import Entry, StateModel, compare_entries
+from pipeline.grading.mistakes.state_model import MatrixEntry, StateMatrices, compare_entries
 from pipeline.grading.references.reference import References
 from pipeline.grading.rubric import RequiredRuns, Rubric, matching
-from pipeline.names import first_few
 from pipeline.results import Analysis
-from pipeline.schemas.grade import Flag
 from pipeline.submission import Experiment, Reported, Submission
-
-ALL, NONE = Fraction(1), Fraction(0)  # shares of the points
+from pipeline.words.numbers import first_few
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +34,7 @@ class Work:
     rubric: Rubric
     references: References
     controller: Controller | None
-    state_models: Sequence[StateModel]
+    state_models: Sequence[StateMatrices]
     bad: Mapping[str, str]
     named: Mapping[Label, frozenset[str]]
 
@@ -45,7 +44,7 @@ class Work:
         return missing_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
 
     @cached_property
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[MatrixEntry]:
         """The entries of A and B beside what they may rightly be; none where they are not there."""
         space = self.reported.state_space
         n = self.rubric.system.carts
@@ -61,7 +60,13 @@ class Work:
 class Verdict:
     """The share of the points; None where nothing could be judged, and `message` says why.
 
-    `explained`: a known mistake is behind all that is lost, and its flag says more than advice.
+    Attributes
+    ----------
+    explained : a known mistake is behind all that is lost, and its flag says more than advice.
+    models : how far the numbers are off on each model that they may rest on, of which the best
+        counts; none where no tolerance decides.
+    most : the share that is kept at most, whatever the tolerances.
+    agrees : of each number that is judged on its own, whether nothing is lost by it.
     """
 
     share: Fraction | None
@@ -69,11 +74,9 @@ class Verdict:
     expected: dict[str, Any] = field(default_factory=dict)
     found: dict[str, Any] = field(default_factory=dict)
     explained: bool = False
-
-
-def mean_share(shares: Sequence[Fraction]) -> Fraction:
-    """Return the mean of some shares; at least one."""
-    return sum(shares, NONE) / len(shares)
+    models: tuple[tuple[Deviation, ...], ...] = ()
+    most: Fraction = ALL
+    agrees: Mapping[str, bool] = field(default_factory=dict)
 
 
 # ------------------------------------------------------------- what must be handed in
@@ -103,6 +106,20 @@ def missing_flag(missing: list[str]) -> Flag:
         parameters=tuple(missing),
         message=f"not handed in: {first_few(missing, 6)}.",
         evidence={"missing": missing},
+    )
+
+
+def data_flag(bad: Mapping[str, str]) -> Flag:
+    """Return the flag for the runs that do not hold what they should."""
+    first, problem = next(iter(bad.items()))
+    others = len(bad) - 1
+    have = "run has" if others == 1 else "runs have"
+    more = f" ({others} more {have} a problem)" if others else ""
+    return Flag(
+        code="data_problem",
+        parameters=tuple(bad),
+        message=f"{first}: {problem.rstrip('.')}{more}.",
+        evidence={"problems": dict(bad)},
     )
 
 

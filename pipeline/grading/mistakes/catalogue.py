@@ -9,18 +9,16 @@ from decimal import Decimal
 import numpy as np
 
 from pipeline.grading import limits
+from pipeline.grading.grade import Code
+from pipeline.grading.mistakes.factors import FACTORS, LOG10, TURN, Factor, Of
 from pipeline.grading.mistakes.step_turns import StepTurns, step_turns
 from pipeline.grading.references.reference import Reference, is_explained
 from pipeline.grading.references.tolerance import as_typed
-from pipeline.grading.rubric import is_damping
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.results import Analysis
-from pipeline.schemas.grade import Code
 from pipeline.submission import Reported
 
-_TURN = 2 * math.pi
-_LOG10 = math.log10(math.e)
 # (periods counted, periods there): one too many, or one too few.
 _COUNTS = [pair for k in range(1, 11) for pair in ((k + 1, k), (k, k + 1))]
 
@@ -42,6 +40,8 @@ class Mistake:
     table_wide : believed, it explains every other wrong number of the table too.
     tries : so many of its kind are tried, of which one meets the numbers the easier.
     beside : numbers that are right where it is this mistake.
+    from_time_records : it comes of reading a decay or a step; so in a final table only where that
+        was taken over from the initial one.
     """
 
     codes: tuple[Code, ...]
@@ -54,6 +54,7 @@ class Mistake:
     table_wide: bool = False
     tries: int = 1
     beside: frozenset[str] = frozenset()
+    from_time_records: bool = False
 
     def help(self, typed: Decimal, reference: Reference) -> str:
         """Return what helps with one number."""
@@ -77,41 +78,25 @@ def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
     if reference.high <= limits.BLURRED_DAMPING * reference.low:
         return True
     initial, final = reported.initial.get(name), reported.final.get(name)
-    return initial is None or final is None or final > limits.OWN_FINAL * initial
+    return initial is None or final is None or final > Decimal("1.5") * initial
 
 
 def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) -> list[Mistake]:
     """Return every mistake that can be tried on a table, single ones before combined ones."""
-    read = {name: read_name(name) for name in references}
-    sure = {n: r for n, r in references.items() if 0 < r.high <= limits.VAGUE * r.low}
-    every_omega = {n: r for n, r in references.items() if read[n].is_frequency and r.low > 0}
-    every_zeta = {
-        n: r
-        for n, r in references.items()
-        if read[n].is_ratio and not read[n].is_by_eye and r.low > 0
-    }
-    gains = {n: r for n, r in sure.items() if read[n].is_gain}
-    omegas = {n: r for n, r in sure.items() if read[n].is_frequency}
-    own_omegas = {n: r for n, r in omegas.items() if not read[n].is_by_eye}
-    own_zetas = {n: r for n, r in every_zeta.items() if n in sure}
-    told = {n: r for n, r in every_zeta.items() if _may_be_log10(n, r, reported)}
-    hertz, scales = list(_hertz(omegas, every_omega)), list(_gain_mistakes(gains, analysis))
-    log10 = Mistake(
-        codes=("log10_for_ln",),
-        said=("log10",),
-        predicted=_times(every_zeta, _LOG10) if told else {},  # vague ones as well
-        tolerance=limits.LOG10_DAMPING,
-        whole=True,
-    )
-    miscounts = list(_miscounts(own_omegas, own_zetas, every_zeta))
-    found = [*hertz, *scales, log10, *miscounts]
-    found += [*_swaps(gains), *_swaps(own_omegas), *_swaps(own_zetas)]
-    if {_damping(name) for name in own_omegas} == own_zetas.keys():
-        found += _swaps(own_omegas, {n: _with_slack(r) for n, r in own_zetas.items()})
-    found += [*_swapped(hertz, own_omegas), *_swapped(scales, gains), *_swapped([log10], own_zetas)]
+    of = _groups(references, reported)
+    gains, omegas, zetas = of["gains"], of["own frequencies"], of["own dampings"]
+    hertz = _by_factor(of, "frequencies", "all frequencies")
+    scales = [*_by_factor(of, "gains", "sharp gains"), *_gain_mistakes(gains, analysis)]
+    log10 = _by_factor(of, "dampings")
+    miscounts = [*_miscounts(omegas, zetas, of["all dampings"]), *_by_factor(of, "sharp dampings")]
+    found = [*hertz, *scales, *log10, *miscounts]
+    found += [*_swaps(gains), *_swaps(omegas), *_swaps(zetas)]
+    if {_damping(name) for name in omegas} == zetas.keys():
+        found += _swaps(omegas, {n: _with_slack(r) for n, r in zetas.items()})
+    found += [*_swapped(hertz, omegas), *_swapped(scales, gains), *_swapped(log10, zetas)]
     found += _in_counts(scales)
     for miscount in miscounts:
-        found += _miscount_and(miscount, own_omegas, every_zeta)
+        found += _miscount_and(miscount, omegas, of["all dampings"])
     found = [mistake for mistake in found if mistake.predicted]
     if is_explained(analysis):
         return found
@@ -123,25 +108,65 @@ def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) 
     ]
 
 
+def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Reference]]:
+    """Return the numbers of a table in the groups in which mistakes are made."""
+    read = {name: read_name(name) for name in references}
+    sure = {n for n, r in references.items() if 0 < r.high <= limits.VAGUE * r.low}
+    frequencies = {n: r for n, r in references.items() if read[n].is_frequency and r.low > 0}
+    dampings = {
+        n: r
+        for n, r in references.items()
+        if read[n].is_ratio and not read[n].is_by_eye and r.low > 0
+    }
+    gains = {n: r for n, r in references.items() if n in sure and read[n].is_gain}
+    told = {n: r for n, r in frequencies.items() if n in sure}
+    own = {n: r for n, r in dampings.items() if n in sure}
+    shows_log10 = any(_may_be_log10(n, r, reported) for n, r in dampings.items())
+    return {
+        "frequencies": told,
+        "all frequencies": frequencies if frequencies.keys() > told.keys() else {},
+        "own frequencies": {n: r for n, r in told.items() if not read[n].is_by_eye},
+        "gains": gains,
+        "sharp gains": {n: r for n, r in gains.items() if r.within(limits.SHARP)},
+        "all dampings": dampings,
+        "own dampings": own,
+        "dampings": dampings if shows_log10 else {},  # vague ones as well
+        "sharp dampings": {n: r for n, r in own.items() if r.within(limits.SHARP)},
+    }
+
+
+def _by_factor(of: Mapping[str, Numbers], *groups: Of) -> list[Mistake]:
+    """Return the mistakes of the table of factors in some groups of numbers."""
+    found = []
+    for row in [row for row in FACTORS if row.of in groups]:
+        numbers = of[row.of]
+        # A decrement is taken of one decay, and wrong beside a frequency that is right.
+        alone = row.of == "sharp dampings"
+        for some in [{n: r} for n, r in numbers.items()] if alone else [numbers]:
+            beside = [n for n in of["own frequencies"] if alone and _damping(n) in some]
+            found.append(_mistake(row, some, beside=frozenset(beside)))
+    return found
+
+
+def _mistake(row: Factor, numbers: Numbers, *, beside: frozenset[str]) -> Mistake:
+    return Mistake(
+        codes=(row.code,),
+        said=(row.said,),
+        predicted=_times(numbers, row.factor),
+        tolerance=row.tolerance,
+        whole=row.whole,
+        least=row.least,
+        tries=row.tries,
+        beside=beside,
+        from_time_records=row.from_time_records,
+    )
+
+
 def _times(references: Numbers, factor: float) -> dict[str, Reference]:
     return {name: reference.times(factor) for name, reference in references.items()}
 
 
 # -------------------------------------------------------------------- frequencies
-
-
-def _hertz(omegas: Numbers, every: Numbers) -> Iterator[Mistake]:
-    """Hz for rad/s, or converted twice; of a vague number only beside a sharper one."""
-    hertz = Mistake(
-        codes=("hz_for_rad_s",),
-        said=("hertz",),
-        predicted=_times(omegas, 1 / _TURN),
-        tolerance=limits.UNMISTAKABLE,
-    )
-    yield hertz
-    if every.keys() > omegas.keys():
-        yield replace(hertz, predicted=_times(every, 1 / _TURN), least=2)
-    yield replace(hertz, predicted=_times(omegas, _TURN), said=("hertz_twice",))
 
 
 def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator[Mistake]:
@@ -159,6 +184,7 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
             whole=True,
             least=len(fast) + 1,
             tries=len(_COUNTS),
+            from_time_records=True,
         )
         if damped:
             yield both
@@ -170,18 +196,6 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
                 one = {name: fast[name], zeta: damped[zeta]}
                 tries = len(_COUNTS) * limits.ONE_OF_SEVERAL
                 yield replace(both, predicted=one, least=2, tries=tries)
-    for zeta, reference in zetas.items():
-        # The decrement alone, not blurred by friction: over half a period, or over two.
-        for factor, said in ((0.5, "half_decrement"), (2.0, "twice_decrement")):
-            if reference.within(limits.SHARP):
-                yield Mistake(
-                    codes=("peak_count",),
-                    said=(said,),
-                    predicted={zeta: reference.times(factor)},
-                    tolerance=limits.READ,
-                    tries=2,
-                    beside=frozenset(n for n in omegas if _damping(n) == zeta),
-                )
 
 
 def _with_slack(zeta: Reference) -> Reference:
@@ -202,10 +216,10 @@ def _miscount_and(miscount: Mistake, omegas: Numbers, zetas: Numbers) -> Iterato
     omega = {n: r for n, r in miscount.predicted.items() if n in omegas}
     zeta = {n: r for n, r in miscount.predicted.items() if n in zetas}
     if omega:
-        slow = {**_times(omega, 1 / _TURN), **zeta}
+        slow = {**_times(omega, 1 / TURN), **zeta}
         yield miscount.together_with("hz_for_rad_s", "and_hertz", slow)
     if omega and zeta:
-        damped = {**omega, **_times(zeta, _LOG10)}
+        damped = {**omega, **_times(zeta, LOG10)}
         both = miscount.together_with("log10_for_ln", "and_log10", damped)
         yield replace(both, least=2)
 
@@ -214,17 +228,6 @@ def _miscount_and(miscount: Mistake, omegas: Numbers, zetas: Numbers) -> Iterato
 
 
 def _gain_mistakes(gains: Numbers, analysis: Analysis) -> Iterator[Mistake]:
-    # Who reads from peak to peak does so for every cart; of one alone a sharp reference tells.
-    sharp = {n: r for n, r in gains.items() if r.within(limits.SHARP)}
-    for some in (gains, sharp):
-        for factor, said in ((2.0, "peak_to_peak"), (0.5, "input_peak_to_peak")):
-            yield Mistake(
-                codes=("peak_to_peak",),
-                said=(said,),
-                predicted=_times(some, factor),
-                tolerance=limits.READ,
-                whole=some is gains,
-            )
     turns = {name: step_turns(name, analysis) for name in gains}
     yield from _peaks(turns)
     yield from _swinging(turns, gains)
@@ -252,6 +255,7 @@ def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
             tolerance=limits.TURN_READ,
             whole=True,
             tries=len(peaks),
+            from_time_records=True,
         )
 
 
@@ -268,6 +272,7 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistak
             whole=True,
             least=min(2, len(gains)),
             tries=2 * len(edges),
+            from_time_records=True,
         )
 
 
@@ -317,14 +322,14 @@ def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mis
             codes=("carts_swapped",),
             said=("swapped",),
             predicted=predicted,
-            tolerance=limits.DAMPING if is_damping(next(iter(moved))) else limits.READ,
+            tolerance=limits.DAMPING if read_name(next(iter(moved))).is_damping else limits.READ,
             whole=True,
             least=2,
         )
 
 
 def _damping(omega: str) -> str:
-    return omega.replace("omega", "zeta").removesuffix("_n")
+    return read_name(omega).damping
 
 
 def _swapped(mistakes: Sequence[Mistake], references: Numbers) -> Iterator[Mistake]:

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import DataError
 from pipeline.grading import limits
+from pipeline.grading.grade import Flag
 from pipeline.grading.mistakes.loop_numbers import LoopNumbers, loop_numbers
 from pipeline.grading.mistakes.state_model import own_chain
 from pipeline.grading.references.reference import is_explained
@@ -20,8 +21,7 @@ from pipeline.plant.limits import MASS_SPRING_ERROR
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.robustness import level_error_percent, static_levels
 from pipeline.results import Analysis
-from pipeline.schemas.grade import Flag
-from pipeline.submission import Design, StateFeedback, Submission
+from pipeline.submission import Design, StateFeedbackController, Submission
 from pipeline.workflow import reference_design
 
 
@@ -116,7 +116,7 @@ class Controller:
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False
         ratio = numbers.settling_time / float(self.settling)
-        return max(ratio, 1 / ratio) > limits.OTHER_GAINS
+        return max(ratio, 1 / ratio) > 2.5  # whatever the prefilter
 
     def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
         """Whether the reported prefilter is one over the static gain of this loop.
@@ -153,7 +153,7 @@ def reported_controller(
     ran = [
         e.controller.gains
         for e in submission.experiments
-        if isinstance(e.controller, StateFeedback) and e.controller.gains
+        if isinstance(e.controller, StateFeedbackController) and e.controller.gains
     ]
     controller = Controller(
         gains=np.array([float(g) for g in feedback.gains]) if feedback.gains else None,
@@ -273,7 +273,7 @@ def same_gains(a: Array, b: Array) -> bool:
     scale = np.empty_like(a)
     for part in (0, 1):
         scale[part::2] = max(float(np.abs(a[part::2]).max()), float(np.abs(b[part::2]).max()))
-    return bool(np.all(np.abs(a - b) <= limits.SAME_GAINS * np.maximum(scale, 1e-300)))
+    return bool(np.all(np.abs(a - b) <= 0.02 * np.maximum(scale, 1e-300)))
 
 
 def _slip(controller: Controller) -> tuple[str, Array | None]:

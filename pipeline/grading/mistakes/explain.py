@@ -7,12 +7,11 @@ from decimal import Decimal
 from typing import Literal
 
 from pipeline.grading import limits
+from pipeline.grading.grade import Code
 from pipeline.grading.mistakes.catalogue import Mistake
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import Typed
-from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
-from pipeline.schemas.grade import Code
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
 # With little damping a step peaks at twice its level, which is also what peak to peak gives: of a
@@ -24,7 +23,7 @@ Label = Literal["initial", "final"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Explained:
+class ExplainedNumbers:
     """Numbers of one table that a mistake explains; `rival` explains them as well."""
 
     mistake: Mistake
@@ -37,7 +36,7 @@ class Explained:
 class Explanation:
     """The mistakes found, and the numbers that none explains or several do."""
 
-    explained: tuple[Explained, ...]
+    explained: tuple[ExplainedNumbers, ...]
     left: tuple[str, ...]
 
     @property
@@ -62,7 +61,7 @@ def explain(
     typed = {name: Typed.of(number) for name, number in table.items()}
     ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
     remaining, codes = list(off), frozenset[Code]()
-    found: list[Explained] = []
+    found: list[ExplainedNumbers] = []
     while remaining:
         nothing = _Cover(codes=frozenset(), fits=())
         covers = [_cover(way, remaining) for way in ways]
@@ -77,7 +76,7 @@ def explain(
             for c in covers
             if not best.codes <= c.codes
             and best.explained & c.explained
-            and score[id(c)] > score[id(best)] - limits.MARGIN
+            and score[id(c)] > score[id(best)] - 2  # e-folds; a less likely one is out
         ]
         rival = None
         shared = frozenset.intersection(best.codes, *(c.codes for c in rivals))
@@ -96,7 +95,9 @@ def explain(
             codes |= best.codes
             for mistake, names in best.fits:
                 own = remaining if mistake.table_wide else names
-                found.append(Explained(mistake=mistake, table=label, names=tuple(own), rival=rival))
+                found.append(
+                    ExplainedNumbers(mistake=mistake, table=label, names=tuple(own), rival=rival)
+                )
         wide = any(m.table_wide for m, _ in best.fits) and not rivals
         remaining = [n for n in remaining if n not in best.explained and not wide]
     explained = {name for one in found for name in one.names}
@@ -159,7 +160,7 @@ class _Tried:
         """Whether a number beside others that it makes is off as honest numbers are off."""
         by_eye = self.label == "initial" and read_name(name).is_by_eye
         limit = limits.NEAR_BY_EYE if by_eye else limits.NEAR
-        return not is_damping(name) and self.errors[name] <= 100 * limit
+        return not read_name(name).is_damping and self.errors[name] <= 100 * limit
 
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:

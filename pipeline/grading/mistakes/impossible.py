@@ -4,13 +4,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 
-from pipeline.grading import limits
+from pipeline.grading.grade import Flag
 from pipeline.grading.references.tolerance import as_typed, rounding
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.plant.limits import HEAVY_DAMPING
 from pipeline.plant.linear.laws import orders
-from pipeline.schemas.grade import Flag
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,7 +68,8 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
     """Return the orders that a table breaks by more than rounding and honest error."""
-    slack = limits.ORDER_INITIAL if initial else limits.ORDER_FINAL
+    # Fitted numbers are good to some percent; first estimates are read off a plot.
+    slack = 1.2 if initial else 1.1
     heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []
     for lesser, greater, reason in orders(list(table)):

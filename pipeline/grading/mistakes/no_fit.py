@@ -7,7 +7,6 @@ from math import exp
 from pipeline.grading import limits
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import half_digit, is_vague, percent_off, rounding
-from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.submission import Reported
 
@@ -21,17 +20,18 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]
-    if not both or len(same) < limits.COPIED * len(both):
+    most = 0.75  # of the numbers in both tables
+    if not both or len(same) < most * len(both):
         return []
     if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
         return []
     fitted = [name for name in both if read_name(name).is_by_eye]
-    if len([name for name in fitted if name in same]) < limits.COPIED * len(fitted):
+    if len([name for name in fitted if name in same]) < most * len(fitted):
         return []
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < limits.COINCIDENCE else []
+    return same if chance < 3e-3 else []  # rarely does a fit agree so
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
@@ -42,21 +42,24 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
     """
     if not typed:
         return 1.0
-    damping = is_damping(name)
+    damping = read_name(name).is_damping
     half = half_digit(typed) / abs(Fraction(typed))
-    apart, surprise = limits.APART_DAMPING_BLURRED if damping else limits.APART_BLURRED, 0.0
+    # How far the two estimates of a number usually lie apart: less where there is no doubt of it.
+    apart, surprise = 0.15 if damping else 0.01, 0.0
     if reference is not None and reference.low > 0:
         # A single digit stands for more than what grading excuses of it.
         hidden = half - rounding(typed) / abs(Fraction(typed))
         off = max(float(percent_off(typed, reference, sigmas=limits.SIGMAS) / 100 - hidden), 0.0)
-        if reference.within(limits.NO_DOUBT_DAMPING if damping else limits.NO_DOUBT):
-            apart = limits.APART_DAMPING if damping else limits.APART
+        if reference.within(1.05 if damping else 1.01):
+            apart = 0.03 if damping else 0.003
             if off == 0:
                 return 1.0
         measured = not damping and not read_name(name).is_by_eye
-        if not measured or off <= limits.SLIPPED:
-            surprise = min(0.5 * (off / apart) ** 2, limits.SURPRISE)
-    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * limits.NORMAL))
+        # One measured further off is wrong by a slip, maybe in both tables; some fit badly.
+        if not measured or off <= 0.2:
+            surprise = min(0.5 * (off / apart) ** 2, 3.0)
+    # A normal difference has the density 1/√(4π) at zero.
+    again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * 3.5))
     return again * exp(-surprise)
 
 

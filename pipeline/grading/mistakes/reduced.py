@@ -11,12 +11,12 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.grading import limits
+from pipeline.grading.grade import Code, Flag
+from pipeline.grading.mistakes.factors import FACTORS, MISREAD_RATIO
 from pipeline.grading.references.reference import is_explained
 from pipeline.grading.words import WORDS
+from pipeline.names import read_name
 from pipeline.results import Analysis, SinePoint
-from pipeline.schemas.grade import Code, Flag
-
-_TURN = 2 * np.pi
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
-    off = ratio > np.log(limits.TABLE_OFF)
+    off = ratio > np.log(1.3)  # wrong by an unknown slip
     return [_flag("data_problem", "reduced_off", rows)] if off else []
 
 
@@ -60,7 +60,7 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
             if near:
                 best = min(near, key=lambda p: abs(p.omega - omega))
                 matched.append((table.cart, float(ratio), best))
-    if len(matched) < limits.FEWEST_ROWS:
+    if len(matched) < 4:  # fewer single nothing out
         return None
     return _Rows(
         cart=np.array([cart for cart, _, _ in matched]),
@@ -77,7 +77,7 @@ def _is_clear(point: SinePoint, analysis: Analysis) -> bool:
 def _share(reported: Array, predicted: Array) -> float:
     """Return the share of the rows that are what is predicted."""
     with np.errstate(all="ignore"):
-        return float(np.mean(np.abs(np.log(reported / predicted)) <= limits.RATIO))
+        return float(np.mean(np.abs(np.log(reported / predicted)) <= MISREAD_RATIO))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -92,23 +92,20 @@ class _Slip:
 
 def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
     """Yield all that may have gone wrong with the whole table."""
-    # A column headed in Hz that holds rad/s, and the other way round.
-    for stretch, said in ((1 / _TURN, "reduced_radians"), (_TURN, "reduced_hertz")):
-        moved = _rows(analysis, stretch=stretch)
+    for row in [row for row in FACTORS if row.of == "frequencies of rows"]:
+        moved = _rows(analysis, stretch=row.factor)
         if moved is not None:
-            yield _Slip(code="hz_for_rad_s", said=said, predicted=moved.measured, rows=moved)
+            yield _Slip(code=row.code, said=row.said, predicted=moved.measured, rows=moved)
     if rows is None:
         return
+    for row in [row for row in FACTORS if row.of == "ratios of rows"]:
+        predicted = row.factor * rows.measured
+        yield _Slip(code=row.code, said=row.said, predicted=predicted, rows=rows)
     counts = [r.encoder_step(int(c)) for r in analysis.records for c in r.carts]
     count = float(np.median(counts)) if counts else 0.0
-    factors: list[tuple[Code, str, float]] = [
-        ("peak_to_peak", "reduced_twice", 2.0),
-        ("peak_to_peak", "reduced_half", 0.5),
-    ]
     if count not in (0.0, 1.0):
-        factors.append(("counts_for_length", "reduced_counts", 1 / count))
-    for code, said, factor in factors:
-        yield _Slip(code=code, said=said, predicted=factor * rows.measured, rows=rows)
+        predicted = rows.measured / count
+        yield _Slip(code="counts_for_length", said="reduced_counts", predicted=predicted, rows=rows)
 
 
 def _flag(code: Code, said: str, rows: _Rows) -> Flag:
@@ -137,28 +134,24 @@ def _against_time_records(analysis: Analysis) -> list[Flag]:
     """Return the flags that the fit to the table, against steps and decays, gives rise to."""
     if not is_explained(analysis):
         return []
-    ratios: dict[str, list[float]] = {"K": [], "omega": []}
-    measured = {"K": "step", "omega": "log_decrement"}
+    ratios: dict[str, list[float]] = {"fitted gains": [], "fitted frequencies": []}
     for row in analysis.rows:
-        symbol = row.name.partition("_")[0]
-        if symbol in ratios and row.initial and row.final and row.initial.value > 0:
-            if row.initial.source == measured[symbol]:
-                ratios[symbol].append(row.final.value / row.initial.value)
-    slips: tuple[tuple[Code, str, float, str], ...] = (
-        ("peak_to_peak", "K", 2.0, "twice"),
-        ("peak_to_peak", "K", 0.5, "half of"),
-        ("hz_for_rad_s", "omega", _TURN, "2π times"),
-        ("hz_for_rad_s", "omega", 1 / _TURN, "1/2π of"),
-    )
-    for code, symbol, factor, words in slips:
-        values = np.array(ratios[symbol])
-        if values.size and np.all(np.abs(np.log(values / factor)) <= limits.RATIO):
-            what = "gains" if symbol == "K" else "frequencies"
+        read = read_name(row.name)
+        of, measured = "fitted frequencies", "log_decrement"
+        if read.is_gain:
+            of, measured = "fitted gains", "step"
+        elif not read.is_frequency:
+            continue
+        if row.initial and row.final and row.initial.value > 0 and row.initial.source == measured:
+            ratios[of].append(row.final.value / row.initial.value)
+    for slip in [row for row in FACTORS if row.of in ratios]:
+        values = np.array(ratios[slip.of])
+        if values.size and np.all(np.abs(np.log(values / slip.factor)) <= slip.tolerance):
             return [
                 Flag(
-                    code=code,
+                    code=slip.code,
                     parameters=tuple(f"bode.x{table.cart}" for table in analysis.tables),
-                    message=WORDS.text("reduced_fitted", what=what, factor=words),
+                    message=WORDS.text("reduced_fitted", slip=WORDS.text(slip.said)),
                     evidence={"ratio": float(values[0])},
                 )
             ]

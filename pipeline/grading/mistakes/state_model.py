@@ -11,15 +11,14 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.grading import limits
+from pipeline.grading.grade import Flag
 from pipeline.grading.references.reference import Reference
 from pipeline.grading.references.tolerance import percent_off
-from pipeline.grading.rubric import is_damping
 from pipeline.grading.words import WORDS
-from pipeline.names import parameter_names
+from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.recovery import recover_from_parameters
-from pipeline.schemas.grade import Flag
-from pipeline.submission import StateSpace
+from pipeline.submission import ReportedStateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]
 
@@ -29,7 +28,7 @@ _NULLS = ("omega_x", "omega_y")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class StateModel:
+class StateMatrices:
     """What [A B] may rightly be, (2n, 2n + 1), NaN where unknown, and how vaguely that is known."""
 
     right: Array
@@ -37,7 +36,7 @@ class StateModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class MatrixEntry:
     """One entry of A or B: as typed, what it may be, and how far it is off (percent).
 
     `error` is what is left beyond the slack of the models, `bare` what it is without.
@@ -61,7 +60,9 @@ class Entry:
         return self.bare > limits.WRONG[self.kind]
 
 
-def compare_entries(space: StateSpace, *, models: Sequence[StateModel], n: int) -> list[Entry]:
+def compare_entries(
+    space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int
+) -> list[MatrixEntry]:
     """Compare every entry with what the right A and B may be.
 
     An entry is as good as its best match: an A that follows from a wrong table is right.
@@ -77,7 +78,7 @@ def compare_entries(space: StateSpace, *, models: Sequence[StateModel], n: int) 
             continue
         kind = kinds[i][j]
         entries.append(
-            Entry(
+            MatrixEntry(
                 name=_entry_name(i, j, n=n),
                 kind=kind,
                 typed=number,
@@ -96,7 +97,7 @@ def state_models(
     known: Mapping[str, Reference],
     chain: Chain | None,
     n: int,
-) -> list[StateModel]:
+) -> list[StateMatrices]:
     """Return [A B] of the reference and of the student's tables.
 
     A table gives a cart's own terms directly; its couplings only as differences of large numbers,
@@ -112,7 +113,7 @@ def state_models(
     reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
     if chain is not None and reference is None:
         right = _matrices(chain)
-        models.append(StateModel(right=right, slack=np.zeros_like(right)))
+        models.append(StateMatrices(right=right, slack=np.zeros_like(right)))
     for values in (*([reference] if reference else []), *tables):
         for make in (_implied, _direct, _by_own_frequencies):
             right = make(values, n)
@@ -121,7 +122,7 @@ def state_models(
             slack = _spread(make, values, right, rounding=rounding, n=n)
             if values is reference:
                 _put_dampings(right, slack, values, known=known)
-            models.append(StateModel(right=right, slack=slack))
+            models.append(StateMatrices(right=right, slack=slack))
     return models
 
 
@@ -203,7 +204,7 @@ def _spread(
     variance = np.zeros_like(right)
     for name, value in values.items():
         error = np.hypot(
-            limits.HONEST_DAMPING if is_damping(name) else limits.HONEST,
+            limits.HONEST_DAMPING if read_name(name).is_damping else limits.HONEST,
             rounding.get(name, 0.0) / np.sqrt(3.0),
         )
         moved = make({**values, name: value * (1 + error)}, n)
@@ -243,7 +244,7 @@ def _entry_name(i: int, j: int, *, n: int) -> str:
     return f"A({i + 1}, {j + 1})" if j < 2 * n else f"B({i + 1})"
 
 
-def _matrix(space: StateSpace, n: int) -> dict[tuple[int, int], Decimal]:
+def _matrix(space: ReportedStateSpace, n: int) -> dict[tuple[int, int], Decimal]:
     typed = {(i, j): value for i, row in enumerate(space.A) for j, value in enumerate(row)}
     return typed | {(i, 2 * n): value for i, value in enumerate(space.B)}
 
@@ -266,10 +267,10 @@ Harm = Literal["unstable", "wrong_way"]
 
 
 def model_harm(
-    space: StateSpace,
-    entries: Sequence[Entry],
+    space: ReportedStateSpace,
+    entries: Sequence[MatrixEntry],
     *,
-    models: Sequence[StateModel],
+    models: Sequence[StateMatrices],
     n: int,
     tied: bool,
 ) -> Harm | None:
@@ -301,7 +302,8 @@ def model_harm(
 
 def _grows(A: Array) -> bool:
     found = np.linalg.eigvals(A)
-    return bool(found.real.max() > limits.GROWS * float(np.abs(found).max()))
+    # Less is what a computer leaves of a free body.
+    return bool(found.real.max() > 1e-6 * float(np.abs(found).max()))
 
 
 def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
@@ -328,7 +330,11 @@ def _drives_back(A: Array, B: Array, *, tied: bool) -> bool:
 
 
 def diagnose_state_space(
-    space: StateSpace, entries: Sequence[Entry], *, models: Sequence[StateModel], n: int
+    space: ReportedStateSpace,
+    entries: Sequence[MatrixEntry],
+    *,
+    models: Sequence[StateMatrices],
+    n: int,
 ) -> list[Flag]:
     """Return a flag where entries are wrong, with the slip that explains them all, if any.
 
@@ -359,7 +365,7 @@ def diagnose_state_space(
     ]
 
 
-def _slip(space: StateSpace, *, models: Sequence[StateModel], n: int) -> str:
+def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
     """Return the first known slip that turns the right [A B] into the one reported, or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
     A = {at: number for at, number in typed.items() if at[1] < 2 * n}

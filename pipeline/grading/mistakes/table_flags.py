@@ -4,13 +4,12 @@ from collections.abc import Mapping, Sequence
 from decimal import Decimal
 
 from pipeline.grading import limits
-from pipeline.grading.mistakes.explain import Explained, Label, Table
+from pipeline.grading.grade import CODES, Code, Flag
+from pipeline.grading.mistakes.explain import ExplainedNumbers, Label, Table
 from pipeline.grading.references.reference import Reference, References
 from pipeline.grading.references.tolerance import as_typed, percent_off
-from pipeline.grading.rubric import is_damping
 from pipeline.grading.words import WORDS
 from pipeline.names import read_name
-from pipeline.schemas.grade import CODES, Code, Flag
 from pipeline.submission import Reported
 
 _TOLD: dict[Label, str] = {"initial": "first_estimate", "final": "final_estimate"}
@@ -18,7 +17,7 @@ OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 
 
 def specific_flags(
-    explained: Sequence[Explained], tables: Mapping[Label, Table], references: References
+    explained: Sequence[ExplainedNumbers], tables: Mapping[Label, Table], references: References
 ) -> list[Flag]:
     """Return one flag a code, over both tables; the first number stands for all in the text."""
     flags = []
@@ -66,7 +65,8 @@ def off_flag(
     worst = max(names, key=error)
     reference, typed = known[worst], table[worst]
     ratio = float(typed) / reference.value if reference.value else 0.0
-    look = {"K": "look_gain", "o": "look_frequency", "z": "look_damping"}.get(worst[0], "look")
+    looks = {"K": "look_gain", "omega": "look_frequency", "zeta": "look_damping"}
+    look = looks.get(read_name(worst).symbol, "look")
     if any(abs(ratio / 10.0**power - 1) < 0.05 for power in (-3, -2, -1, 1, 2, 3)):
         look = "look_power"
     code: Code = "initial_off" if label == "initial" else "final_off"
@@ -140,7 +140,7 @@ def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) ->
 
 def limit(name: str, table: str) -> float:
     """Return from how many percent on a reported number is worth a remark."""
-    if is_damping(name):
+    if read_name(name).is_damping:
         return limits.OFF_DAMPING
     if table == "final":
         return limits.OFF_FINAL

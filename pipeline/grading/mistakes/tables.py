@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from pipeline.grading import limits
+from pipeline.grading.grade import Code, Flag
 from pipeline.grading.mistakes.catalogue import Mistake, known_mistakes
-from pipeline.grading.mistakes.explain import Explained, Explanation, Label, Table, explain
+from pipeline.grading.mistakes.explain import ExplainedNumbers, Explanation, Label, Table, explain
 from pipeline.grading.mistakes.impossible import BrokenOrder, broken_orders, not_positive
 from pipeline.grading.mistakes.table_flags import (
     OTHER,
@@ -20,14 +21,9 @@ from pipeline.grading.mistakes.table_flags import (
 from pipeline.grading.mistakes.transient import transient_fits
 from pipeline.grading.references.reference import Reference, References, is_linear
 from pipeline.grading.references.tolerance import percent_off
-from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.results import Analysis
-from pipeline.schemas.grade import Code, Flag
 from pipeline.submission import Reported
-
-# What comes of reading a decay or a step; in a final table only where it was taken over.
-_FROM_TIME_RECORDS = {"peak_count", "log10_for_ln", "peak_for_steady_state", "transient_used"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,24 +54,12 @@ def diagnose_tables(
         label: _judge(label, reported, references=references, analysis=analysis, copied=copied)
         for label in tables
     }
-    alone = {label: one.explain() for label, one in judged.items()}
-    # What one table alone leaves open the mistakes of the other may decide.
-    found: dict[Label, Explanation] = {
-        label: one.explain(believed=alone[OTHER[label]].codes)
-        if alone[OTHER[label]].codes
-        else alone[label]
-        for label, one in judged.items()
-    }
+    found = _explain_both(judged)
     flags = [flag for one in judged.values() for flag in one.flags]
     left: dict[Label, list[str]] = {}
     for label, one in judged.items():
         rest = [n for n in found[label].left if one.errors[n] > limit(n, label)]
-        broken = [
-            law
-            for law in one.laws
-            if not one.errors
-            or (set(law.names) & set(rest) and (law.is_plain or set(law.names) <= set(rest)))
-        ]
+        broken = one.broken_laws(set(rest))
         flags += [law.flag(tables[label], label) for law in broken]
         impossible = {name for law in broken for name in law.names}
         left[label] = [name for name in rest if name not in impossible]
@@ -94,11 +78,15 @@ def diagnose_tables(
         if names
     ]
     named = {name for flag in flags for name in flag.parameters}
-    # On a bench that is not linear an estimate from large motions and one from small ones differ.
-    apart = _disagreements(reported, references, blurred=True) if is_linear(analysis) else []
     # A mistake in one of the tables parts them; also where the recordings give no number.
-    kinds = {name[0] for one in explained for name in one.names}
-    if apart := [one for one in apart if one[1] not in named and one[1][0] not in kinds]:
+    symbols = {read_name(name).symbol for one in explained for name in one.names}
+    # On a bench that is not linear an estimate from large motions and one from small ones differ.
+    apart = [
+        (size, name)
+        for size, name in _disagreements(reported, references, blurred=True)
+        if is_linear(analysis) and name not in named and read_name(name).symbol not in symbols
+    ]
+    if apart:
         flags.append(disagreement_flag(reported, apart))
     corrected = _corrected(reported.final, explained, references.final)
     corrected |= {name: references.final[name].value for name in left["final"]}
@@ -108,6 +96,17 @@ def diagnose_tables(
     }
     possible = not broken_orders({n: Decimal(v) for n, v in corrected.items()}, initial=False)
     return Diagnosis(flags=tuple(flags), corrected=corrected, named=named_in, possible=possible)
+
+
+def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]:
+    """Return the mistakes of each table: what one leaves open those of the other may decide."""
+    alone = {label: one.explain() for label, one in judged.items()}
+    return {
+        label: one.explain(believed=alone[OTHER[label]].codes)
+        if alone[OTHER[label]].codes
+        else alone[label]
+        for label, one in judged.items()
+    }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -131,6 +130,14 @@ class _Judged:
     mistakes: list[Mistake]
     laws: list[BrokenOrder]
     flags: list[Flag]
+
+    def broken_laws(self, off: set[str]) -> list[BrokenOrder]:
+        """Return the laws it breaks by numbers that are off and that nothing explains."""
+        return [
+            law
+            for law in self.laws
+            if not self.errors or (off & set(law.names) and (law.is_plain or set(law.names) <= off))
+        ]
 
     def explain(self, *, believed: frozenset[Code] = frozenset()) -> Explanation:
         """Return the mistakes that explain what is off."""
@@ -178,7 +185,7 @@ def _judge(
         mistakes = known_mistakes(there, analysis, reported)
     if label == "final":
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
-        if len(suspect) >= min(2, analysis.carts):
+        if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
     if any(law.is_of_gains for law in laws):  # a plain fact goes before a guess at one of them
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
@@ -226,14 +233,14 @@ def _near(a: Decimal, b: Decimal) -> bool:
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
     """Whether a mistake can be in a final table: one of a decay or a step only if taken over."""
-    if not _FROM_TIME_RECORDS & set(mistake.codes):
+    if not mistake.from_time_records:
         return True
     both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
     return all(reported.final[n] == reported.initial[n] for n in both)
 
 
 def _corrected(
-    final: Table, explained: Sequence[Explained], known: Mapping[str, Reference]
+    final: Table, explained: Sequence[ExplainedNumbers], known: Mapping[str, Reference]
 ) -> dict[str, float]:
     """Return the final table as it would be without the mistakes found in it."""
     corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
@@ -254,7 +261,7 @@ def _disagreements(
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():
         initial = reported.initial.get(name)
-        guess = is_damping(name) and name not in references.initial
+        guess = read_name(name).is_damping and name not in references.initial
         if initial is None or guess or final <= 0 or initial <= 0:
             continue
         bounds = [float(final)]
@@ -271,7 +278,7 @@ def _disagreements(
             value=float(final), low=min(bounds), high=max(bounds), std=0.0, source="final"
         )
         error = float(percent_off(initial, allowed, sigmas=0.0))
-        worth = 2 * limits.OFF_DAMPING if is_damping(name) else limits.OFF_EACH_OTHER
+        worth = 2 * limits.OFF_DAMPING if read_name(name).is_damping else limits.OFF_EACH_OTHER
         by_eye = limit(name, "initial") == limits.OFF_BY_EYE
         if error > (worth + limits.OFF_BY_EYE if by_eye else worth):
             apart.append((error / worth, name))

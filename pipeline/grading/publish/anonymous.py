@@ -7,12 +7,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.gradebook.history import FAILED, Event
 from pipeline.grading.similarity.shared import shared_message
 from pipeline.output import csv_text
-from pipeline.schemas.grade import Flag, Grade
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
@@ -56,11 +56,7 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
     it could not be graded; platforms put the student's name into that of an archive. What students
     call their runs and files stays.
     """
-    own = names[grade.submission]
-    hidden = {
-        "submission": own,
-        "authors": (),
-        "reason": hidden_reason(grade.reason, grade.submission, own),
+    hidden = _hidden_names(grade, names) | {
         "flags": tuple(
             _hidden(flag, names) if flag.code == "shared_data" else flag for flag in grade.flags
         ),
@@ -70,8 +66,13 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
 
 def anonymous_line(line: Line, names: Mapping[str, str]) -> Line:
     """Return the line of an anonymised grade."""
-    own = names[line.name]
-    return replace(line, name=own, authors=(), reason=hidden_reason(line.reason, line.name, own))
+    return line.model_copy(update=_hidden_names(line, names))
+
+
+def _hidden_names(grade: Grade | Line, names: Mapping[str, str]) -> dict[str, object]:
+    own = names[grade.submission]
+    reason = hidden_reason(grade.reason, grade.submission, own)
+    return {"submission": own, "authors": (), "reason": reason}
 
 
 def hidden_reason(reason: str, submission: str, own: str) -> str:

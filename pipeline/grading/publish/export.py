@@ -13,23 +13,22 @@ Each form is a table with a row for every student. Given the table that the plat
 
 import html
 import json
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.platforms import FORMS, WORKSHEET
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, on_one_line, points_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file
-from pipeline.report.words import with_symbols
-from pipeline.schemas.grade import Grade
-
-_HOURS = 24.0
+from pipeline.words.text import with_symbols
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,10 +69,11 @@ def export(
     if roster:
         own = Roster.read(roster, platform=platform)
         own.check_maximum(rubric.out_of, title=title)
-        text, strangers = _filled(own, platform, students, rubric, title=title)
+        text, strangers = _fill_own(own, platform, students, rubric, title=title)
         remarks += strangers
     elif platform == "canvas":
-        text = _canvas([s for s in students if not s.uploader], rubric, title=title)
+        named = [s for s in students if not s.uploader]
+        text = _make_table(platform, named, rubric, title=title)
         sent = [f"{s.name} ({s.grade.submission})" for s in students if s.uploader]
         if sent:
             remarks.append(
@@ -82,10 +82,8 @@ def export(
                     f"the file's name: {', '.join(sent)}"
                 )
             )
-    elif platform == "moodle":
-        text = _moodle(students, rubric, title=title)
     else:
-        text = _gradescope(students, rubric)
+        text = _make_table(platform, students, rubric, title=title)
     folder.mkdir(parents=True, exist_ok=True)
     files = [table or folder / f"{platform}.csv"]
     write_file(files[0], text)
@@ -94,59 +92,71 @@ def export(
     return Exported(files=tuple(files), remarks=tuple(remarks))
 
 
-def _filled(
+def _fill_own(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> tuple[str, list[Remark]]:
     """Return a platform's own table with the grades in it, and what did not fit."""
-    most = points_text(rubric.out_of)
-    columns: dict[str, Callable[[Student], str]]
+    form = WORKSHEET if _has_numbers(platform, "Identifier" in roster.table) else FORMS[platform]
+    there = {name: text for name, text in form.if_there.items() if name in roster.table}
+    columns = {
+        name.format(title=title): lambda student, text=text: text.format_map(
+            values_of(student, rubric)
+        )
+        for name, text in {**form.filled, **there}.items()
+    }
+    return roster.fill(
+        students, columns, keep=form.kept or None,
+        possible=points_text(rubric.out_of) if platform == "canvas" else "",
+    )  # fmt: skip
+
+
+def _make_table(
+    platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
+) -> str:
+    """Return a table as the platform imports it, made without its own."""
+    numbered = bool(students) and all(student.number for student in students)
+    form = WORKSHEET if _has_numbers(platform, numbered) else FORMS[platform]
+    head = [name.format(title=title) for name in form.new]
+    rows = []
+    for student in students:
+        values = values_of(student, rubric)
+        rows.append([text.format_map(values) for text in form.new.values()])
     if platform == "canvas":
-        columns = {title: lambda student: student.points}
-        return roster.filled(students, columns, keep=_CANVAS, possible=most)
-    if platform == "moodle":
-        grade = "Grade" if "Identifier" in roster.table else f"{title} (Real)"
-        columns = {grade: lambda student: student.points}
-        if "Feedback comments" in roster.table:
-            columns["Feedback comments"] = _comment
-        return roster.filled(students, columns)
-    columns = {"Total Score": lambda student: student.points, "Max Points": lambda student: most}
-    return roster.filled(students, columns)
+        possible = [f"    {POINTS_POSSIBLE}", *[""] * (len(head) - 2), points_text(rubric.out_of)]
+        rows.insert(0, possible)
+    if platform == "gradescope":  # a column a criterion
+        for i, c in enumerate(rubric.criteria, start=1):
+            head.append(f"{i}: {c.title or c.id} ({c.points} pts)")
+            for row, student in zip(rows, students, strict=True):
+                judged = () if student.undecided else student.grade.criteria
+                row.append("".join(points_text(own.points) for own in judged if own.id == c.id))
+    return csv_text(head, rows)
 
 
-# --------------------------------------------------------------------------- Canvas
-
-# All that is about the student: the importer wants "Section" to be the last of them.
-_CANVAS = (
-    "Student", "ID", "SIS User ID", "SIS Login ID", "Integration ID", "Root Account", "Section",
-)  # fmt: skip
+def _has_numbers(platform: Platform, numbered: bool) -> bool:
+    """Whether it is Moodle's table of participants."""
+    return platform == "moodle" and numbered
 
 
-def _canvas(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
-    head = ("Student", "ID", "SIS User ID", "SIS Login ID", "Section", title)
-    possible = (f"    {POINTS_POSSIBLE}", "", "", "", "", points_text(rubric.out_of))
-    rows = [(s.name or s.id, s.number, s.id, s.id, "", s.points) for s in students]
-    return csv_text(head, [possible, *rows])
-
-
-# --------------------------------------------------------------------------- Moodle
-
-
-def _moodle(students: Sequence[Student], rubric: Rubric, *, title: str) -> str:
-    if students and all(s.number for s in students):
-        head = (
-            "Identifier", "Full name", "ID number", "Status", "Grade", "Maximum Grade",
-            "Grade can be changed", "Last modified (submission)", "Last modified (grade)",
-            "Feedback comments",
-        )  # fmt: skip
-        most = points_text(rubric.out_of)
-        rows = [
-            (f"Participant {s.number}", s.name, s.id, "", s.points, most, "Yes", "-", "-",
-             _comment(s))
-            for s in students
-        ]  # fmt: skip
-        return csv_text(head, rows)
-    head = ("ID number", f"{title} (Real)", f"{title} (Feedback)")
-    return csv_text(head, [(s.id or s.name, s.points, _comment(s)) for s in students])
+def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
+    """Return all that a column may say of a student, by name."""
+    first, _, last = student.name.partition(" ")
+    return {
+        "name": student.name,
+        "id": student.id,
+        "name_or_id": student.name or student.id,
+        "id_or_name": student.id or student.name,
+        "number": student.number,
+        "first_name": first,
+        "last_name": last,
+        "sid": "" if "@" in student.id else student.id,
+        "email": student.id if "@" in student.id else "",
+        "points": student.points,
+        "most": points_text(rubric.out_of),
+        "status": "Graded" if student.points else "Ungraded",
+        "late": _clock(student.grade.days_late),
+        "comment": _comment(student),
+    }
 
 
 def _comment(student: Student) -> str:
@@ -175,45 +185,8 @@ def _told(grade: Grade) -> list[str]:
     return [with_symbols(told(flag)) for flag in grade.flags]
 
 
-# ----------------------------------------------------------------------- Gradescope
-
-
-def _gradescope(students: Sequence[Student], rubric: Rubric) -> str:
-    head = [
-        "First Name", "Last Name", "SID", "Email", "Sections", "Total Score", "Max Points",
-        "Status", "Submission ID", "Submission Time", "Lateness (H:M:S)", "View Count",
-        "Submission Count",
-    ]  # fmt: skip
-    head += [
-        f"{i}: {c.title or c.id} ({c.points} pts)" for i, c in enumerate(rubric.criteria, start=1)
-    ]
-    rows = []
-    for s in students:
-        first, _, last = s.name.partition(" ")
-        given = {c.id: c.points for c in s.grade.criteria if not s.undecided}
-        rows.append(
-            [
-                first,
-                last,
-                "" if "@" in s.id else s.id,
-                s.id if "@" in s.id else "",
-                "",
-                s.points,
-                points_text(rubric.out_of),
-                "Graded" if s.points else "Ungraded",
-                s.number,
-                "",
-                _clock(s.grade.days_late),
-                "",
-                "",
-                *(points_text(given[c.id]) if c.id in given else "" for c in rubric.criteria),
-            ]
-        )
-    return csv_text(head, rows)
-
-
 def _clock(days: float) -> str:
-    seconds = round(days * _HOURS * 3600)
+    seconds = round(days * 24 * 3600)
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 

@@ -8,6 +8,7 @@ from numbers import Real
 from typing import Any
 
 from pipeline import __version__
+from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
@@ -19,7 +20,6 @@ from pipeline.report.document import (
     Heading,
     Picture,
     Section,
-    Span,
     Table,
     Tile,
     Tiles,
@@ -28,15 +28,14 @@ from pipeline.report.document import (
     cell,
     make_table,
     paragraph,
-    spans,
 )
 from pipeline.report.figures.style import WIDTH
-from pipeline.report.numbers import NOTHING, percent, significant, typeset, unit_text
-from pipeline.report.numbers import count as counted
 from pipeline.report.render.html import render_html
-from pipeline.report.words import capital, clean, name_span, rich
-from pipeline.schemas.base import Units
-from pipeline.schemas.grade import Criterion, Flag, Grade, Outcome
+from pipeline.set_up import Units
+from pipeline.words.numbers import NOTHING, percent, significant, typeset, unit_text
+from pipeline.words.numbers import count as counted
+from pipeline.words.spans import Span, spans
+from pipeline.words.text import capital, clean, name_span, rich
 
 _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
@@ -44,8 +43,6 @@ TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "ski
 _ENTRY = re.compile(r"([AB])\((\d+)(?:, (\d+))?\)")
 _SHARE = "_percent"  # ends the name of a number that is a percentage itself
 _FINEST = 2  # decimals of such a number
-_MOST_ROWS = 60  # of one criterion
-_LONGEST_TEXT = 200  # letters of a value that is no number
 
 
 def feedback_page(
@@ -91,20 +88,13 @@ def _summary(grade: Grade) -> list[Block]:
     by_hand = Tile(spans("Set by hand"), spans(counted_criteria(len(overrides))))
     if grade.status == "failed":
         tile = Tile(spans("Points"), spans(points), tone="" if overrides else "bad")
-        how, then = "", "Fix it and hand it in again, or talk to your instructor."
-        if overrides:
-            how, then = " automatically", "Its points were given by hand."
-        said = Span(f"This submission could not be graded{how}. ", "strong")
+        key = "failed_by_hand" if overrides else "failed"
+        then = WORDS.text(f"{key}_then")
         first, *others = map(sentence, grade.reason.split("\n"))
-        told: list[Block] = (
-            [
-                paragraph(said, "Each of these is a reason:"),
-                bullet_list(map(spans, (first, *others))),
-                paragraph(then),
-            ]
-            if others
-            else [paragraph(said, f"{first} {then}")]
-        )
+        told: list[Block] = [paragraph(WORDS.spans(key, why=f"{first} {then}"))]
+        if others:
+            why = paragraph(WORDS.spans(key, why=WORDS.text("failed_reasons")))
+            told = [why, bullet_list(map(spans, (first, *others))), paragraph(then)]
         return [Tiles((tile, by_hand) if overrides else (tile,)), *told, *_notes(grade)]
     passed = sum(c.outcome == "pass" for c in grade.criteria)
     tiles = [
@@ -144,27 +134,24 @@ def _lost(grade: Grade) -> list[Block]:
     """Return where points were lost, most first."""
     lost = [c for c in grade.criteria if c.points < c.out_of]
     if not lost:
-        praise = "" if grade.flags else " Well done."
-        return [paragraph(f"All points were earned.{praise}")]
+        return [paragraph(WORDS.text("earned_all_but_look" if grade.flags else "earned_all"))]
     lost.sort(key=lambda c: c.points - c.out_of)
-    return [
-        paragraph("Points were lost here, most first:"),
-        bullet_list(
-            spans(
-                Span(clean(c.title or c.id), "strong"),
-                f" ({points_text(c.points)} of {points_text(c.out_of)}): ",
-                rich(sentence(c.message)),
-            )
-            for c in lost
-        ),
-    ]
+    where = bullet_list(
+        WORDS.spans(
+            "lost_here",
+            title=clean(c.title or c.id),
+            points=points_text(c.points),
+            out_of=points_text(c.out_of),
+            why=rich(sentence(c.message)),
+        )
+        for c in lost
+    )
+    return [paragraph(WORDS.text("lost")), where]
 
 
 def _notes(grade: Grade) -> list[Block]:
-    if not grade.notes:
-        return []
     notes = bullet_list(rich(sentence(note)) for note in grade.notes)
-    return [paragraph("To know, without points lost for it:"), notes]
+    return [paragraph(WORDS.text("notes")), notes] if grade.notes else []
 
 
 def sentence(text: str) -> str:
@@ -185,7 +172,7 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
         blocks += [
             Heading(rich(_capital(WORDS.text(f"title_{flag.code}")))),
             paragraph(rich(sentence(told(flag)))),
-            paragraph(Span("Where to look: ", "strong"), rich(WORDS.text(f"place_{flag.code}"))),
+            paragraph(WORDS.spans("where", place=rich(WORDS.text(f"place_{flag.code}")))),
         ]
     return blocks
 
@@ -200,21 +187,16 @@ def _capital(text: str) -> str:
 def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
     """Return every criterion with its numbers; those passed are folded."""
     checks = {criterion.id: criterion.check for criterion in rubric.criteria}
-    overview = make_table(
-        next(numbers),
-        "Points by criterion.",
-        ("Criterion", "Points", "Outcome"),
+    rows = [
         [
-            [
-                cell(clean(c.title or c.id)),
-                cell(f"{points_text(c.points)} of {points_text(c.out_of)}"),
-                cell(WORDS.text(f"outcome_{c.outcome}"), TONES[c.outcome]),
-            ]
-            for c in grade.criteria
-        ],
-        "lrl",
-    )
-    blocks: list[Block] = [overview]
+            clean(c.title or c.id),
+            f"{points_text(c.points)} of {points_text(c.out_of)}",
+            cell(WORDS.text(f"outcome_{c.outcome}"), TONES[c.outcome]),
+        ]
+        for c in grade.criteria
+    ]
+    head = WORDS.cells("points_head")
+    blocks: list[Block] = [make_table(next(numbers), WORDS.text("points"), head, rows, "lrl")]
     for criterion in grade.criteria:
         title = _capital(clean(criterion.title or criterion.id))
         said = paragraph(rich(sentence(criterion.message)))
@@ -222,13 +204,9 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
             criterion, check=checks.get(criterion.id, ""), units=grade.units, numbers=numbers
         )
         inside: list[Block] = [said, *([table] if table else [])]
-        if criterion.outcome == "pass":
-            blocks.append(Details(spans(f"{title}: passed"), tuple(inside)))
-        else:
-            blocks += [
-                Heading(spans(f"{title}: {WORDS.text(f'outcome_{criterion.outcome}')}")),
-                *inside,
-            ]
+        head = spans(f"{title}: {WORDS.text(f'outcome_{criterion.outcome}')}")
+        passed = criterion.outcome == "pass"
+        blocks += [Details(head, tuple(inside))] if passed else [Heading(head), *inside]
     return blocks
 
 
@@ -243,31 +221,17 @@ def numbers_table(
     ]
     if not names:
         return None
-    head = {
-        "initial": ("Yours", "From your recordings"),
-        "final": ("Yours", "From your recordings"),
-        "initial_final": ("Final", "Initial"),
-        "claims": ("Yours", "What the gains give"),
-        "gains": ("What the gains give", "Goal"),
-        "hardware": ("Measured", "Full points up to"),
-    }.get(check, ("Yours", "Expected"))
-    compared = check not in ("gains", "hardware")
+    key = f"columns_{check}"
+    head = WORDS.cells(key if key in WORDS.by_key else "columns_numbers")
+    compared = len(head) == 4
     rows = []
-    for name in names[:_MOST_ROWS]:
+    for name in names[:60]:
         expected, found = criterion.expected.get(name), criterion.found.get(name)
-        row = [
-            cell(_label(name, units)), cell(_value(name, found)), cell(_value(name, expected))
-        ]  # fmt: skip
-        rows.append([*row, cell(_off(name, found, expected))] if compared else row)
-    more = len(names) - len(rows)
-    caption = f"{_capital(clean(criterion.title or criterion.id))}, in numbers."
-    return make_table(
-        next(numbers),
-        caption + (f" {more} more are in grade.json." if more > 0 else ""),
-        ("Quantity", *head, *(["Difference"] if compared else [])),
-        rows,
-        "lddd" if compared else "ldd",
-    )
+        row = [_label(name, units), _value(name, found), _value(name, expected)]
+        rows.append([*row, _off(name, found, expected)] if compared else row)
+    more, title = len(names) - len(rows), _capital(clean(criterion.title or criterion.id))
+    caption = WORDS.text("in_numbers_and_more" if more else "in_numbers", title=title, more=more)
+    return make_table(next(numbers), caption, head, rows, "lddd" if compared else "ldd")
 
 
 def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table | None:
@@ -283,7 +247,7 @@ def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table 
     unit = _unit(of, units) if isinstance(of, str) else ""
     of_what = f" of {clean(of)}{f', in {unit}' if unit else ''}" if isinstance(of, str) else ""
     heads = [_called(name) for name in found]
-    row = [cell(_value(name, value)) for name, value in found.items()]
+    row = [_value(name, value) for name, value in found.items()]
     sides = ("l" if isinstance(value, bool | str) else "r" for value in found.values())
     return make_table(next(numbers), rich(f"The numbers{of_what}."), heads, [row], "".join(sides))
 
@@ -315,10 +279,8 @@ def _unit(name: str, units: Units | None) -> str:
         return unit_text(f"{clean(units.position)}/({clean(units.input)} s^2)") if units else ""
     if units is None:
         return "rad/s" if read_name(name).is_frequency else ""
-    position, drive = clean(units.position), clean(units.input)
-    if name == "prefilter":
-        return f"{drive}/{position}"
-    return unit_text(read_name(name).unit(position=position, input=drive))
+    units = Units(position=clean(units.position), input=clean(units.input))
+    return units.stiffness if name == "prefilter" else unit_text(read_name(name).unit(units))
 
 
 def _value(name: str, value: Any) -> str:
@@ -328,7 +290,7 @@ def _value(name: str, value: Any) -> str:
         number = round(float(value), _FINEST) if name.endswith(_SHARE) else float(value)
         # A number that was typed with fewer digits is shown as it was.
         return min(significant(number), typeset(f"{number:.6g}"), key=len)
-    return clean(value)[:_LONGEST_TEXT] if isinstance(value, str) else NOTHING
+    return clean(value)[:200] if isinstance(value, str) else NOTHING
 
 
 def _off(name: str, found: Any, expected: Any) -> str:
@@ -363,4 +325,4 @@ def _picture(number: int, file: str, svg: str) -> Picture:
 def alternative(svg: str) -> str:
     """Return what a figure says of itself in words."""
     title = _TITLE.search(svg)
-    return unescape(title[1]) if title else "A figure of your recordings."
+    return unescape(title[1]) if title else WORDS.text("some_figure")

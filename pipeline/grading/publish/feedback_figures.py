@@ -5,7 +5,8 @@ from functools import partial
 from typing import Any
 
 from pipeline.arrays import Array
-from pipeline.names import gain_name, own_omega, own_zeta
+from pipeline.grading.grade import Criterion
+from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.plant.linear.recovery import transfer_functions
 from pipeline.report.figures.grading import (
     reported_bode_figure,
@@ -14,10 +15,10 @@ from pipeline.report.figures.grading import (
 )
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import to_svg
-from pipeline.report.words import clean, name_span
+from pipeline.report.sections.page import Page
 from pipeline.results import Analysis, Record
-from pipeline.schemas.grade import Criterion
 from pipeline.submission import Reported
+from pipeline.words.text import clean, name_span
 
 _RESPONSE = "response"  # begins a figure's name
 _MOST_CARTS = 3  # whose table stands for transfer functions
@@ -30,7 +31,7 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
     Without the curve where the table is not complete or stands for no response.
     """
     curve = _response({name: float(v) for name, v in (reported.final if reported else {}).items()})
-    if curve and (len(curve[0]) != analysis.carts or analysis.carts > _MOST_CARTS):
+    if curve and (len(curve[0]) != analysis.bench.n or analysis.bench.n > _MOST_CARTS):
         curve = None
     drawn = []
     with drawing():
@@ -39,7 +40,7 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
                 response,
                 chain=analysis.chain,
                 reported=curve,
-                units=(clean(analysis.position_unit), clean(analysis.input_unit)),
+                units=Page(analysis).units,
             )
             told = "the curve of the reported final table" if curve else "no complete final table"
             alt = f"Measured frequency response of cart {response.cart}, its fit, and {told}."
@@ -65,7 +66,7 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
         if name in c.expected
     }
     records = {record.id: record for record in analysis.records}
-    unit, drawn = clean(analysis.position_unit), []
+    unit, drawn = clean(analysis.bench.units.position), []
 
     def keep(draw: Callable[..., Any], names: Sequence[str], *, record: Record, **how) -> None:
         reported = ", ".join(f"{name_span(name).text} {pairs[name][0]:.4g}" for name in names)
@@ -76,9 +77,9 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
         drawn.append((f"{file}.svg", to_svg(figure, name=file, alt=f"{clean(record.id)}: {told}.")))
 
     with drawing():
-        for cart in range(1, analysis.carts + 1):
-            gain = gain_name(cart, n=analysis.carts)
-            own = [own(cart, n=analysis.carts) for own in (own_omega, own_zeta)]
+        for cart in range(1, analysis.bench.n + 1):
+            gain = gain_name(cart, n=analysis.bench.n)
+            own = [own(cart, n=analysis.bench.n) for own in (own_omega, own_zeta)]
             steps = [step for step in analysis.step_gains if step.cart == cart]
             decays = [decay for decay in analysis.log_decrements if decay.cart == cart]
             if gain in pairs and steps:
@@ -108,7 +109,7 @@ def is_response(file: str) -> bool:
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:
     """Return the gains and polynomials that a table stands for, None where it stands for none."""
-    sizes = [abs(v) for name, v in values.items() if name.startswith(("K", "omega"))]
+    sizes = [abs(v) for name, v in values.items() if not read_name(name).is_damping]
     if any(not 1 / _LARGEST < size < _LARGEST for size in sizes):
         return None
     if any(not abs(v) < _LARGEST for v in values.values()):

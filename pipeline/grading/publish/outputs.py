@@ -5,11 +5,12 @@ The files are a function of the gradebook alone: written again at any time, they
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import ConfigError
+from pipeline.grading.grade import Flag, grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
 from pipeline.grading.publish.anonymous import KEY_FILE, STRANGER, anonymise, key_text, pseudonyms
@@ -21,7 +22,7 @@ from pipeline.grading.similarity.doubles import Double, find_doubles, with_recor
 from pipeline.grading.words import on_one_line
 from pipeline.output import csv_text, own_folder, write_file
 from pipeline.resources import TEMPLATES
-from pipeline.schemas.grade import Flag, grade_text
+from pipeline.words.progress import Progress, silent
 
 FEEDBACK = "feedback"
 _PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
@@ -32,9 +33,7 @@ _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "
 _AFTER = ("remarks", "by_hand", "reason")
 
 
-def write_outputs(
-    book: Gradebook, out: Path, *, progress: Callable[[str], None] = lambda text: None
-) -> list[Double]:
+def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
     """Write the class list of a gradebook into a folder; return who stands on it several times.
 
     A rubric that is `anonymous` leaves out all names, and `anonymous-key.csv` says whose is what.
@@ -75,7 +74,7 @@ def write_outputs(
         write_file(own / _PAGE, page)
         write_file(own / _JSON, grade_text(grade))
     if names is not None:
-        lines.sort(key=lambda line: line.name)  # the order of the names would tell
+        lines.sort(key=lambda line: line.submission)  # the order of the names would tell
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
     doubles = doubles_of(book, authors, gradings=gradings, names=names)
@@ -125,14 +124,14 @@ def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
     heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
     rows = [
         (
-            line.name,
+            line.submission,
             " ".join(line.authors),
             line.status,
             line.points,
             line.out_of,
             line.days_late,
             line.deducted,
-            *(line.criteria[id_][1] if id_ in line.criteria else "" for id_ in ids),
+            *(line.judged[id_]["points"] if id_ in line.judged else "" for id_ in ids),
             " ".join(line.codes),
             " ".join(line.by_hand),
             on_one_line(line.reason),

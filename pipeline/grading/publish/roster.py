@@ -3,12 +3,14 @@
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
 from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.platforms import FORMS
 from pipeline.grading.publish.students import Remark, Student, not_exported, one_of
 from pipeline.output import csv_text
 from pipeline.submission.complaints import quote
@@ -22,17 +24,6 @@ _MAXIMUM = "Maximum Grade"  # Moodle's, of the assignment: its import refuses a 
 _NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
 _NAMES = ("Student", "Full name", "Name")
-# What a platform's own table has for certain, any of these; no other platform's has it.
-_OWN: Mapping[Platform, tuple[frozenset[str], ...]] = {
-    "canvas": (frozenset({"Student", "ID"}),),
-    "moodle": (
-        frozenset({"Identifier"}),
-        frozenset({"ID number"}),
-        frozenset({"Username"}),
-        frozenset({"Email address"}),
-    ),
-    "gradescope": (frozenset({"SID"}), frozenset({"Email"}), frozenset({"Submission ID"})),
-}
 _PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # of Moodle, in any language
 _TITLE = re.compile(r"(.*?)(?: \(\d+\))?")  # of Canvas, with the assignment's id behind it
 
@@ -54,8 +45,8 @@ class Roster:
             two of one name.
         """
         table = read_table(path)
-        if not any(columns <= set(table.columns) for columns in _OWN[platform]):
-            wanted = ", or ".join(" and ".join(sorted(columns)) for columns in _OWN[platform])
+        if not any(columns <= set(table.columns) for columns in FORMS[platform].own):
+            wanted = ", or ".join(" and ".join(sorted(columns)) for columns in FORMS[platform].own)
             raise ConfigError(
                 f"{path.name}: is not {platform.capitalize()}'s table; "
                 f"that has the columns {wanted}"
@@ -83,7 +74,7 @@ class Roster:
                     "the assignment's maximum on the platform and download the table again"
                 )
 
-    def filled(
+    def fill(
         self,
         students: Sequence[Student],
         columns: Mapping[str, Callable[[Student], str]],
@@ -106,7 +97,7 @@ class Roster:
             if name not in table:
                 table[name] = self.table.get(name, "")
             table.loc[self._of_all() & (table[name] == ""), name] = possible
-        index, shared = self._index()
+        index, _ = self._index
         matched = [(_row_of(student, index), student) for student in students]
         found: dict[Any, list[Student]] = {}
         for at, student in matched:
@@ -117,6 +108,24 @@ class Roster:
             for title, value in columns.items():
                 if not student.undecided:
                     table.loc[at, titles[title]] = value(student)
+        remarks = self._remarks(students, matched, found, settled)
+        return csv_text([*table.columns], table.itertuples(index=False)), remarks
+
+    def _remarks(
+        self,
+        students: Sequence[Student],
+        matched: Sequence[tuple[Any, Student]],
+        found: Mapping[Any, Sequence[Student]],
+        settled: Mapping[Any, Student],
+    ) -> list[Remark]:
+        """Return what did not fit.
+
+        Parameters
+        ----------
+        matched : the row of each student, None where there is none.
+        found, settled : by row, who is in it, and the one that counts.
+        """
+        index, shared = self._index
         # One of the authors, who are named, handed it in.
         unmatched = [student for at, student in matched if at is None and not student.uploader]
         twice = [s for s in unmatched if not shared.isdisjoint(_words(s))]
@@ -161,7 +170,7 @@ class Roster:
                     f"the authors: {', '.join(by_number)}"
                 )
             )
-        return csv_text([*table.columns], table.itertuples(index=False)), remarks
+        return remarks
 
     def _of_all(self) -> "pd.Series":
         """Return which rows are about the assignments, not about a student."""
@@ -176,6 +185,7 @@ class Roster:
                 return name
         return title
 
+    @cached_property
     def _index(self) -> tuple[dict[tuple[str, str], Any], set[Any]]:
         """Return the row of everything that says who it is about, and what several rows share."""
         import pandas as pd

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.gradings import person
 from pipeline.grading.intake.lms_names import Platform, read_owner
 from pipeline.grading.words import points_text
-from pipeline.schemas.grade import Grade
 
 # `results.json` needs a score: "optional, but required if not on each test case".
 _GRADESCOPE_BLANK = "left blank in gradescope.csv but 0 in results.json, which must have a score"

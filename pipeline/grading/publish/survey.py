@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError
 from pipeline.grading.csv_table import read_table
-from pipeline.report.numbers import NOTHING
 from pipeline.submission.complaints import quote
+from pipeline.words.numbers import NOTHING
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -5,15 +5,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.checks.recordings import POSITION_SCALE, SCALES
-from pipeline.estimation.limits import FOLLOWED
+from pipeline.estimation.chain.time_search import FOLLOWED
 from pipeline.grading import limits
-from pipeline.grading.rubric import is_damping
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.results import Analysis, Estimate, ParameterRow
-from pipeline.results_of_runs import StepEdge, StepGain
-from pipeline.stages.limits import GAIN_AND_FREQUENCY_LIMIT
+from pipeline.results import Analysis, Estimate, ParameterRow, StepEdge, StepGain
+from pipeline.stages.compare import GAIN_AND_FREQUENCY_LIMIT
 
 OFF_SCALE = "the recordings are not in the units stated, see the data"
 
@@ -80,7 +77,7 @@ class References:
 
 def off_scale(analysis: Analysis) -> set[str]:
     """Return which scales are not those stated: of the positions, of the input, of both."""
-    return {check.id.partition(".")[0] for check in analysis.checks} & {*SCALES}
+    return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
 def in_scale(
@@ -94,7 +91,7 @@ def in_scale(
     wrong = off_scale(analysis)
     if not wrong:
         return references, chain
-    factor = per_count if wrong == {POSITION_SCALE} else None
+    factor = per_count if wrong == {"position_scale"} else None
 
     def scaled(table: Mapping[str, Reference]) -> dict[str, Reference]:
         kept = {n: r for n, r in table.items() if factor or not read_name(n).is_gain}
@@ -156,9 +153,11 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
     for row in analysis.rows:
-        if row.name in analysis.fit.parameters and row.final is None and not is_damping(row.name):
+        if read_name(row.name).is_damping:
+            continue
+        if row.name in analysis.fit.parameters and row.final is None:
             return None  # the fit leaves it open
-        if row.initial is None or row.final is None or is_damping(row.name):
+        if row.initial is None or row.final is None:
             continue
         before, after = row.initial.value, row.final.value
         limit = limits.ASTRAY if read_name(row.name).is_frequency else limits.ASTRAY_GAIN
@@ -206,7 +205,7 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
         return references
 
     def factor(name: str, *, of_gains: float) -> float:
-        if is_damping(name):
+        if read_name(name).is_damping:
             return limits.BEYOND_BELIEF_DAMPING
         return of_gains if read_name(name).is_gain else limits.BEYOND_BELIEF
 
@@ -233,17 +232,17 @@ def _final(
     the points nor is followed by the records tells of no number that nothing else measures.
     """
     fitted, read_off = row.final, _readings(row.name, analysis)
-    if is_damping(row.name):
+    if read_name(row.name).is_damping:
         measured = [table[row.name] for table in tables]
     else:
         measured = list(read_off)
         if row.initial and (measured or not is_explained(analysis)):
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
-    told = fitted is not None and not (is_damping(row.name) and _undamped(analysis))
+    told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
     # No unit, sign or clock is in a damping; but dry friction adds to it, more to dwells than to
     # decays, and where those are few the fit explains them all the same.
-    if fitted and told and not is_damping(row.name) and is_explained(analysis):
+    if fitted and told and not read_name(row.name).is_damping and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
     read = row.initial.source if row.initial and not read_off else "log_decrement"
     if not measured and not (told and (is_explained(analysis) or is_followed(analysis))):

@@ -6,7 +6,7 @@ from decimal import Decimal
 from pipeline.identify.remarks import is_reversed
 from pipeline.names import read_name
 from pipeline.results import Record
-from pipeline.submission import Feedback, Reported, StateSpace
+from pipeline.submission import Reported, ReportedFeedback, ReportedStateSpace
 
 _NOTE = (
     "a positive input drives these carts towards negative x: what is reported with that sign is "
@@ -38,13 +38,13 @@ def _gains(table: Mapping[str, Decimal]) -> dict[str, Decimal]:
     return {**table, **gains} if gains and min(gains.values()) > 0 else dict(table)
 
 
-def _space(space: StateSpace | None) -> StateSpace | None:
+def _space(space: ReportedStateSpace | None) -> ReportedStateSpace | None:
     if space is None or not any(space.B) or max(space.B) > 0:
         return space
     return space.model_copy(update={"B": tuple(-b if b else b for b in space.B)})
 
 
-def _feedback(feedback: Feedback | None) -> Feedback | None:
+def _feedback(feedback: ReportedFeedback | None) -> ReportedFeedback | None:
     if feedback is None or feedback.prefilter is None or feedback.prefilter >= 0:
         return feedback
     gains = tuple(-gain for gain in feedback.gains)

@@ -1,15 +1,13 @@
 """The carts' springs, where those of the rubric leave the recordings unexplained."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from pipeline.errors import PipelineError
-from pipeline.grading import limits
 from pipeline.grading.references.reference import is_explained, is_followed
 from pipeline.results import Analysis, ChainFit
 from pipeline.submission import Submission
 from pipeline.submission.load import spring_names
+from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
 
@@ -17,7 +15,7 @@ def with_all_springs(
     submission: Submission,
     analysis: Analysis,
     *,
-    progress: Callable[[str], None] = lambda text: None,
+    progress: Progress = silent,
 ) -> tuple[Analysis, tuple[str, ...]]:
     """Return the analysis with all springs, and those that are added, where these recordings ask.
 
@@ -26,7 +24,7 @@ def with_all_springs(
     one stiffness, whatever it stands for.
     """
     fit, springs = analysis.fit, submission.system.springs
-    if analysis.carts == 1 or all(springs) or (fit is not None and is_explained(analysis)):
+    if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):
         return analysis, ()
     system = submission.system.model_copy(update={"springs": (True,) * len(springs)})
     try:
@@ -38,14 +36,16 @@ def with_all_springs(
     if other.fit is None or not (
         is_explained(other)
         or (
+            # Friction and the like remain whatever the springs: a missing one leaves many times
+            # more of χ².
             fit is not None
             and fit.method == other.fit.method
-            and fit.chi_square_per_dof > limits.SPRING_EXPLAINS * other.fit.chi_square_per_dof
+            and fit.chi_square_per_dof > 10 * other.fit.chi_square_per_dof
             and is_followed(other)
         )
     ):
         return analysis, ()
-    names = zip(spring_names(analysis.carts), springs, _there(other.fit), strict=True)
+    names = zip(spring_names(analysis.bench.n), springs, _there(other.fit), strict=True)
     return other, tuple(name for name, asked, there in names if there and not asked)
 
 
@@ -54,13 +54,7 @@ def _there(fit: ChainFit) -> list[bool]:
     wider = max(1.0, fit.chi_square_per_dof) ** 0.5
     std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))
     k = fit.chain.k
-    # One that the fit holds at none has no standard error.
-    return [
-        bool(
-            k[j]
-            > max(
-                limits.SPRING_SIGMAS * std.get(f"k_{j + 1}", np.inf), limits.SPRING_SHARE * k.max()
-            )
-        )
-        for j in range(k.size)
-    ]
+    # One that the fit holds at none has no standard error. Ten of those, and a share of the
+    # stiffest: a delay or friction is easily taken for a weak spring.
+    least = [max(10 * std.get(f"k_{j + 1}", np.inf), 0.02 * k.max()) for j in range(k.size)]
+    return [bool(stiffness > limit) for stiffness, limit in zip(k, least, strict=True)]

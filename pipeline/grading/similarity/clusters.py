@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.schemas.grade import Flag
+from pipeline.grading.grade import Flag
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 
 from pipeline.grading.gradings import Member, person
 from pipeline.grading.similarity.shared import find_shared
-from pipeline.report.numbers import count, listing
-from pipeline.report.words import clean
+from pipeline.words.numbers import count, listing
+from pipeline.words.text import clean
 
 _NAMED = 8  # submissions named of one person
 

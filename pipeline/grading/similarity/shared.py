@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.grading.grade import Flag
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.lms_names import same_number
 from pipeline.grading.similarity.likeness import (
@@ -24,8 +25,7 @@ from pipeline.grading.similarity.likeness import (
     equal_rows,
 )
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
-from pipeline.names import first_few
-from pipeline.schemas.grade import Flag
+from pipeline.words.numbers import first_few
 
 _WIDTH = 512  # samples around an anchor that are compared at first
 _BEFORE = 128  # of them before it
@@ -104,14 +104,11 @@ def find_shared(
         prints.submission if number < len(batch) else f"{prints.submission} (an earlier batch)"
         for number, prints in enumerate(everyone)
     ]
-    owners = [*everyone, *(_handed_out(packed) for packed in examples)]
-    groups: dict[str, list[_Entry]] = defaultdict(list)
-    for owner, prints in enumerate(owners):
-        once: dict[tuple[str, bytes], Print] = {}
-        for one in unpack(prints.fingerprints):  # one recording under many names is one
-            once.setdefault((one.group, one.residual.tobytes()), one)
-        for one in once.values():
-            groups[one.group].append(_Entry(owner=owner, print=one))
+    owners = [
+        *everyone,
+        *(Member(submission="", authors=(), fingerprints=packed) for packed in examples),
+    ]
+    groups = _by_group(owners)
     matches: dict[tuple[int, int], list[Likeness]] = defaultdict(list)
     for _, entries in sorted(groups.items()):
         for pair, likeness in _matches(
@@ -133,15 +130,7 @@ def find_shared(
         for one in _decisive(own, compared=compared) if pair[1] < len(everyone) else ():
             for mine, other in ((0, 1), (1, 0)):
                 if pair[mine] < len(batch):
-                    record = SharedRecord(
-                        experiment=one.experiments[mine],
-                        submission=names[pair[other]],
-                        other_experiment=one.experiments[other],
-                        sigmas=round(one.sigmas, 1),
-                        equal_rows=one.equal_rows,
-                        time=one.times[mine],
-                        other_time=one.times[other],
-                    )
+                    record = _record_of(one, mine, other, submission=names[pair[other]])
                     shared[names[pair[mine]]].append(record)
     return {
         name: tuple(sorted(found, key=lambda r: (r.submission, r.experiment, r.other_experiment)))
@@ -149,8 +138,29 @@ def find_shared(
     }
 
 
-def _handed_out(packed: bytes) -> Member:
-    return Member(submission="", authors=(), fingerprints=packed)
+def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
+    """Return the fingerprints that may be of one recording, each once an owner."""
+    groups: dict[str, list[_Entry]] = defaultdict(list)
+    for owner, prints in enumerate(owners):
+        once: dict[tuple[str, bytes], Print] = {}
+        for one in unpack(prints.fingerprints):  # one recording under many names is one
+            once.setdefault((one.group, one.residual.tobytes()), one)
+        for one in once.values():
+            groups[one.group].append(_Entry(owner=owner, print=one))
+    return groups
+
+
+def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> SharedRecord:
+    """Return a likeness as one side of it sees it."""
+    return SharedRecord(
+        experiment=one.experiments[mine],
+        submission=submission,
+        other_experiment=one.experiments[other],
+        sigmas=round(one.sigmas, 1),
+        equal_rows=one.equal_rows,
+        time=one.times[mine],
+        other_time=one.times[other],
+    )
 
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:

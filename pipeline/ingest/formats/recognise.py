@@ -1,20 +1,32 @@
-"""Recognise a data file by what is in it and read its columns."""
+"""The forms of data files: recognise one by what is in it and read its columns."""
 
 import hashlib
 from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.errors import SubmissionError, lies_in_the_file
-from pipeline.ingest.formats.mat import is_mat, read_mat
-from pipeline.ingest.formats.table import Table
+from pipeline.ingest.formats.mat import read_mat
+from pipeline.ingest.formats.mat_variables import is_mat
+from pipeline.ingest.formats.table import FileTable
 from pipeline.ingest.formats.text import read_text
 from pipeline.submission.load import outside
+
+ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")  # of data files
+FORM_TITLES = {
+    "ecp": 'ECP "Export Raw Data" text',
+    "bench_log": "bench log, tab-separated",
+    "bench_mat": "bench log, .mat",
+    "matrix": "bare matrix, .mat",
+    "variables": "vectors, .mat",
+    "csv": "table of text (CSV)",
+}
+_READERS = ((is_mat, read_mat),)  # what recognises a file, and reads it; all others are text
 
 # Files that end up in a submission by mistake, by their first bytes, and what to do instead.
 _STRANGERS = (
     (b"PK\x03\x04", "an Excel workbook or a zip archive; save the sheet as CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook; save the sheet as CSV"),
-    (b"\x89HDF", "an HDF5 (MATLAB 7.3) file; save it again with save(…, '-v7')"),
+    (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
     (b"\x1f\x8b", "a gzip archive; unpack it"),
     (b"%PDF", "a PDF document"),
     (b"\x89PNG", "a picture"),
@@ -24,7 +36,7 @@ _STRANGERS = (
 
 def read_table(
     folder: Path, name: str, *, shown: str | None = None, taken: Collection[str] = ()
-) -> tuple[Table, str]:
+) -> tuple[FileTable, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
 
     Messages call the file `shown`, by default its name; where it is missing, the files `taken`
@@ -47,11 +59,14 @@ def read_table(
     return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
 
 
-def parse_table(raw: bytes, *, source: str) -> Table:
+def parse_table(raw: bytes, *, source: str) -> FileTable:
     """Read the columns from the bytes of a data file."""
     if not raw.strip():
         raise SubmissionError(f"{source}: the file is empty")
+    for is_theirs, read in _READERS:
+        if is_theirs(raw):
+            return read(raw, source=source)
     for start, what in _STRANGERS:
         if raw.startswith(start):
             raise SubmissionError(f"{source}: {what}")
-    return read_mat(raw, source=source) if is_mat(raw) else read_text(raw, source=source)
+    return read_text(raw, source=source)

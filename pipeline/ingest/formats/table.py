@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +10,9 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 
-Form = Literal["ecp", "bench_log", "bench_mat", "matrix", "variables", "csv"]
-
-_LARGEST = 1e50  # of anything in a file, times and what is not used included
 # What a bench measures, in any unit: times, positions, inputs, ratios. Powers and products of some
 # of them, as the stages form them, neither overflow nor vanish.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
-
-ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")  # of data files
-FORM_TITLES: dict[Form, str] = {
-    "ecp": 'ECP "Export Raw Data" text',
-    "bench_log": "bench log, tab-separated",
-    "bench_mat": "bench log, .mat",
-    "matrix": "bare matrix, .mat",
-    "variables": "vectors, .mat",
-    "csv": "table of text (CSV)",
-}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,13 +40,13 @@ class Variable:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Table:
+class FileTable:
     """The columns of one file.
 
     Attributes
     ----------
     source : the file's name, for messages.
-    form : how the file is laid out.
+    form : how the file is laid out, a key of `FORM_TITLES`.
     names : (n_columns,) headings as written; numbers "1", "2", … where there are none.
     values : (n_columns, n), all finite.
     whole : (n_columns,) the column holds nothing but whole numbers, written as such.
@@ -71,7 +57,7 @@ class Table:
     """
 
     source: str
-    form: Form
+    form: str
     names: tuple[str, ...]
     values: Array
     whole: tuple[bool, ...]
@@ -124,7 +110,8 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
     ------
     SubmissionError : names the column and, by `place`, the row.
     """
-    usable = np.abs(values) < _LARGEST  # NaN compares as false
+    # Of anything in a file, times and what is not used included.
+    usable = np.abs(values) < 1e50  # NaN compares as false
     if not usable.all():
         column, row = np.argwhere(~usable)[0]
         what = "too large" if np.isfinite(values[column, row]) else "not a finite number"

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.table import Form, Table, refuse_unusable
+from pipeline.ingest.formats.table import FileTable, refuse_unusable
 
 _MAX_COLUMNS = 64
 _SNIFFED_ROWS = 40
@@ -25,7 +25,7 @@ _LONGEST_UNIT = 8  # characters: "counts", "rad/s"
 _QUOTES = " \"'"
 
 
-def read_text(raw: bytes, *, source: str) -> Table:
+def read_text(raw: bytes, *, source: str) -> FileTable:
     """Read a table of numbers from text.
 
     Raises
@@ -57,8 +57,10 @@ def _decode(raw: bytes, *, source: str) -> str:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Parsed rows: (n, width) numbers, their lines, and what shows that the file was cut."""
+    """Parsed rows of a file: (n, width) numbers, their lines, what shows that it was cut."""
 
+    source: str
+    names: Sequence[str]
     values: np.ndarray
     lines: np.ndarray
     cut: str | None
@@ -90,7 +92,7 @@ def _parse(
         raise SubmissionError(f"{source}: holds no rows of numbers")
     lines = lines[: len(values)]
     refuse_unusable(values.T, names=names, place=lambda row: f"{source} line {lines[row]}")
-    return _Rows(values=values, lines=np.array(lines), cut=cut)
+    return _Rows(source=source, names=names, values=values, lines=np.array(lines), cut=cut)
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
@@ -131,22 +133,20 @@ def _is_number(field: str) -> bool:
 def _table(
     rows: _Rows,
     *,
-    source: str,
-    form: Form,
-    names: Sequence[str],
+    form: str,
     typed: Sequence[str],
     cut: str | None,
     notes: Sequence[str] = (),
-) -> Table:
+) -> FileTable:
     values = np.ascontiguousarray(rows.values.T)
     whole = tuple(
         "." not in field and "," not in field and bool((column == np.round(column)).all())
         for column, field in zip(values, typed, strict=True)
     )
-    return Table(
-        source=source,
+    return FileTable(
+        source=rows.source,
         form=form,
-        names=tuple(names),
+        names=tuple(rows.names),
         values=values,
         whole=whole,
         lines=rows.lines,
@@ -177,7 +177,7 @@ def _checked_names(names: Sequence[str], *, source: str, line: int) -> list[str]
 # ------------------------------------------------------------------------------ ECP exports
 
 
-def _ecp(text: str, opening: re.Match[str], source: str) -> Table:
+def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
     """Read `heading [ row; row; … ]`, as the ECP program and MATLAB scripts of it write."""
     first_line = text.count("\n", 0, opening.end()) + 1
     end = text.find("]", opening.end())
@@ -215,9 +215,7 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> Table:
         notes.append(f"text after line {line} is not data and was not read")
     return _table(
         _parse(rows, lines, split=str.split, names=names, source=source),
-        source=source,
         form="ecp",
-        names=names,
         typed=typed,
         cut=cut,
         notes=notes,
@@ -264,7 +262,7 @@ class _Layout:
         return methodcaller("split", self.delimiter)  # white space around a number does no harm
 
 
-def _delimited(text: str, source: str) -> Table:
+def _delimited(text: str, source: str) -> FileTable:
     """Read a heading and rows; the delimiter and the decimal mark are found."""
     # A spreadsheet leaves rows of nothing but delimiters after its last.
     numbered = enumerate(text.split("\n"), start=1)
@@ -299,9 +297,7 @@ def _delimited(text: str, source: str) -> Table:
     )
     return _table(
         rows,
-        source=source,
         form="bench_log" if _is_bench_log(names) else "csv",
-        names=names,
         typed=typed if len(typed) == len(names) else [""] * len(names),
         cut=None,
     )

@@ -10,7 +10,6 @@ of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Confere
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -18,27 +17,23 @@ import numpy as np
 
 from pipeline.arrays import Array, ComplexArray, frozen_array
 from pipeline.errors import DataError
+from pipeline.json_files import result, written
 from pipeline.names import parameter_names
 
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
 class Chain:
-    """Masses, dampings and springs of n carts.
+    """Carts and springs; the input gain is one, so all are in input units."""
 
-    Attributes
-    ----------
-    m : (n,) masses, input unit s² per position unit; all > 0.
-    c : (n,) viscous dampings, input unit s per position unit.
-    k : (n + 1,) stiffnesses wall-1, 1-2, …, n-wall, input unit per position unit; 0 = no spring.
-        One cart on two springs: only the sum is identifiable, and `k` is (sum, 0).
-    """
-
-    m: Array
-    c: Array
-    k: Array
+    m: Array = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
+    c: Array = written("viscous dampings (n), cart 1 first, input unit s per position unit")
+    k: Array = written(
+        "stiffnesses (n + 1) wall-1, 1-2, …, n-wall, input unit per position unit; 0: no spring; "
+        "of one cart on two springs, of which only the sum can be identified, (sum, 0)"
+    )
 
     def __post_init__(self) -> None:
         m = frozen_array(self.m, name="m")

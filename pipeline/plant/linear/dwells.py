@@ -13,10 +13,6 @@ from pipeline.plant.linear.simulate import simulate_linear
 SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
 SETTLED_DWELL = 9.0  # … to a tenth of one: at a resonance it hides in the amplitude
 
-_LONGEST_WAIT = 12.0  # s; no student waits longer, however little damping there is
-_CYCLES = 6.5  # of steady state in a dwell: room to see that six do not change any more
-_SHORTEST_DWELL = 1.4  # s of it, at high frequencies
-
 
 def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> list[float]:
     """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
@@ -45,12 +41,14 @@ def settling_wait(chain: Chain, *, time_constants: float) -> float:
     slowest = float(np.min(-chain.poles.real))
     if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero but for rounding
         raise DataError("the carts never settle: a session needs damping and a spring to a wall")
-    return min(time_constants / slowest, _LONGEST_WAIT)
+    # No student waits longer, however little damping there is.
+    return min(time_constants / slowest, 12.0)
 
 
 def steady_time(hertz: float) -> float:
     """Return how long a dwell goes on once the transient is over, s."""
-    return max(_CYCLES / hertz, _SHORTEST_DWELL)
+    # Room to see that six cycles do not change any more; or seconds, at high frequencies.
+    return max(6.5 / hertz, 1.4)
 
 
 @dataclass(frozen=True, kw_only=True)

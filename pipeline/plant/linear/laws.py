@@ -11,7 +11,6 @@ from typing import NamedTuple
 from pipeline.names import MODES, NULLS, omega_names, read_name
 
 _GAINS = "a cart further from the motor is moved less by a constant input"
-_MODES = "the resonances are listed in rising order"
 _ALONE = (
     "a cart alone swings faster than all together at the first resonance, and slower than at the "
     "last"
@@ -55,7 +54,7 @@ def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
         default=0,
     )
     found = [(far, near, _GAINS) for near, far in pairwise(gains)]
-    found += [(a, b, _MODES) for a, b in pairwise(modes)]
+    found += [(a, b, "the resonances are listed in rising order") for a, b in pairwise(modes)]
     between = brackets(n) if n > 1 else []
     alone, others = [b for b in between if b.why == _ALONE], [b for b in between if b.why != _ALONE]
     found += [(b.low, b.middle, b.why) for b in alone]

@@ -4,13 +4,13 @@ The loop is that of `sampled_loop`: gains on the state predicted for the moment 
 to act, the observer's prediction, one sample of delay.
 """
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
+from pipeline.json_files import Number, result, written
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop, discretise
 
@@ -19,32 +19,29 @@ if TYPE_CHECKING:
 
 _SLOWER = 1e-2  # times the slowest pole: there the band begins
 _NEAREST, _AROUND = 1e-6, 30  # of a mode's frequency, the least distance looked at, and how many
-_PER_DECADE = 60  # frequencies of the band, to which each mode adds its own
 _ON_AXIS = 1e-2  # rad, by which a crossing of the interpolated curve may miss the true one
-_UNDAMPED = 1e-9  # from the unit circle
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class Margins:
-    """How much the loop, cut at the motor, may change before it is unstable.
-
-    Attributes
-    ----------
-    gain : factor on the loop's gain that makes it unstable, the nearest to 1 (below 1: the least
-        gain it needs); None where no factor does.
-    phase_deg : lag in degrees that makes it unstable, or lead where below zero, the nearest to 0;
-        None where none does: the loop's gain is 1 nowhere.
-    modulus : the least distance of the Nyquist curve from -1, one over the peak of the sensitivity.
-    omega_gain, omega_phase : rad/s, where `gain` and `phase_deg` are met.
+    """How much the designed loop, cut at the motor, may change before it is unstable.
 
     Reference: K. J. Astrom, R. M. Murray, Feedback Systems, 2nd ed., section 10.3.
     """
 
-    gain: float | None
-    phase_deg: float | None
-    modulus: float
-    omega_gain: float | None
-    omega_phase: float | None
+    gain: float | None = written(
+        "factor on the loop's gain, the nearest to 1 (below 1: the least gain it needs); null "
+        "where none makes it unstable"
+    )
+    phase_deg: float | None = written(
+        "of lag, or of lead where below zero, the nearest to 0; null where the loop's gain is 1 "
+        "nowhere"
+    )
+    modulus: Number = written(
+        "least distance of the Nyquist curve from -1, one over the peak of the sensitivity"
+    )
+    omega_gain: float | None = written("rad/s, where `gain` is met")
+    omega_phase: float | None = written("rad/s, where `phase_deg` is met")
 
 
 def closed_loop(
@@ -88,7 +85,7 @@ def stability_margins(
     opened, closed = np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(B, C))
     if np.abs(closed).max() >= 1:
         return None
-    if np.any((np.abs(np.abs(opened) - 1) < _UNDAMPED) & (opened.imag != 0)):
+    if np.any((np.abs(np.abs(opened) - 1) < 1e-9) & (opened.imag != 0)):
         raise DataError("margins need damped carts, found a mode without damping")
     poles = np.append(opened, closed).astype(np.complex128)
     omega = _frequencies(poles, sample_time=sample_time)
@@ -127,7 +124,8 @@ def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
     s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # the others turn nothing quickly
     slowest = np.abs(s[np.abs(s) > _NEAREST * nyquist]).min(initial=nyquist)
     lowest = min(_SLOWER * slowest, _SLOWER * nyquist)
-    count = int(_PER_DECADE * np.log10(nyquist / lowest))
+    # So many a decade, to which each mode adds its own.
+    count = int(60 * np.log10(nyquist / lowest))
     band = np.geomspace(lowest, nyquist, count, endpoint=False)
     modes = s[s.imag > 0]
     width = np.maximum(-modes.real, _NEAREST * modes.imag)[:, None]

@@ -24,7 +24,7 @@ sample_time; before the first tick e is zero, so a reference that stands at the 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -101,21 +101,48 @@ class MovingPlant(Protocol):
         ...
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class LoopSetup:
+    """How the controller and the carts are joined.
+
+    Attributes
+    ----------
+    sample_time : s, of the controller; default the mean interval of the run.
+    delay : ticks from reading to acting, 1 or 0.
+    input_limit : the effort is clipped to ± this.
+    drive : force on cart 1 per effort; other than 1 where a log has another sign or scale.
+    encoder_step : what the controller's readings are rounded to, one number or (f,).
+    rest : readings of the carts at rest without input, one number or (f,).
+    free : the carts that move; default all.
+    """
+
+    sample_time: float | None = None
+    delay: int = 1
+    input_limit: float | None = None
+    drive: float = 1.0
+    encoder_step: Array | float | None = None
+    rest: Array | float = 0.0
+    free: Sequence[int] | None = None
+
+    def read(self, x: Array) -> Array:
+        """Return what the controller sees of the positions (f,)."""
+        y, step = x + self.rest, self.encoder_step
+        if step is None:
+            return y
+        coarse = np.asarray(step) > 0
+        np.divide(y, step, out=y, where=coarse)
+        np.rint(y, out=y, where=coarse)
+        return np.multiply(y, step, out=y, where=coarse)
+
+
 def simulate_loop(
     chain: Chain,
     controller: Controller,
     *,
     t: Array,
     reference: Array | float,
-    sample_time: float | None = None,
-    delay: int = 1,
-    input_limit: float | None = None,
-    drive: float = 1.0,
-    encoder_step: Array | float | None = None,
-    rest: Array | None = None,
-    x0: Array | None = None,
-    free: Sequence[int] | None = None,
-    plant: MovingPlant | None = None,
+    setup: LoopSetup = LoopSetup(),
+    start: Array | MovingPlant | None = None,
 ) -> LoopRun:
     """Simulate the free carts under a sampled controller.
 
@@ -123,61 +150,49 @@ def simulate_loop(
     ----------
     t : (n,) s, ascending; where the run is wanted. It begins at t[0].
     reference : set point, in the units of the readings; one number or (n,) at `t`.
-    sample_time : s, of the controller; default the mean interval of `t`.
-    delay : ticks from reading to acting, 1 or 0.
-    input_limit : the effort is clipped to ± this.
-    drive : force on cart 1 per effort; other than 1 where a log has another sign or scale.
-    encoder_step : what the controller's readings are rounded to, one number or (f,).
-    rest : (f,) readings of the carts at rest without input; default 0.
-    x0 : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest.
-    plant : moves in the chain's place, from the state it is in.
+    start : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest. Or what moves
+        in the chain's place, from the state it is in.
 
     Raises
     ------
     DataError : the controller does not fit the free carts, or ticks too often for such a run.
     """
     t = np.asarray(t, dtype=np.float64)
-    free = tuple(range(1, chain.n + 1) if free is None else sorted(set(free)))
+    free = tuple(sorted(set(range(1, chain.n + 1) if setup.free is None else setup.free)))
     interval = (t[-1] - t[0]) / (t.size - 1)
-    T = interval if sample_time is None else sample_time
+    T = interval if setup.sample_time is None else setup.sample_time
     check_ticks(float(t[-1] - t[0]), T)
     # Time stamps are rounded and jitter: an instant belongs to the nearest sample.
     ticks = np.arange(int(np.floor((t[-1] - t[0]) / T + 0.5)) + 2)
     r = np.broadcast_to(np.asarray(reference, dtype=np.float64), t.shape)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, t[0] + T * ticks)
-    rest = np.zeros(len(free)) if rest is None else np.asarray(rest, dtype=np.float64)
-    if plant is not None:
-        x0 = plant.state
-    x0 = np.zeros(2 * len(free)) if x0 is None else np.asarray(x0, dtype=np.float64)
-    step = np.zeros(len(free)) if encoder_step is None else encoder_step
-    encoder = _Encoder(rest=rest, step=np.broadcast_to(np.asarray(step, np.float64), rest.shape))
-    law = _law(controller, free=free, sample_time=T, y0=encoder.read(x0[0::2]))
+    plant = None if isinstance(start, np.ndarray) else start
+    x = start if isinstance(start, np.ndarray) else np.zeros(2 * len(free))
+    x = x if plant is None else plant.state
+    law = _law(controller, free=free, sample_time=T, y0=setup.read(x[0::2]))
     phi, gamma = discretise(chain, T, free=free)
-    limit = np.inf if input_limit is None else input_limit
-
-    states, efforts = np.empty((ticks.size, x0.size)), np.empty(ticks.size)
-    x, acting = x0, 0.0
+    limit, drive = np.inf if setup.input_limit is None else setup.input_limit, setup.drive
+    states, efforts, acting = np.empty((ticks.size, x.size)), np.empty(ticks.size), 0.0
     for tick, set_point in enumerate(r[nearest].tolist()):
-        law.measure(encoder.read(x[0::2]))
-        if delay:
+        law.measure(setup.read(x[0::2]))
+        if setup.delay:
             applied = acting
             law.predict(applied)
-            acting = min(max(law.effort(set_point), -limit), limit)
+            acting = following = min(max(law.effort(set_point), -limit), limit)
         else:
-            applied = min(max(law.effort(set_point), -limit), limit)
+            applied = following = min(max(law.effort(set_point), -limit), limit)
             law.predict(applied)
         states[tick], efforts[tick] = x, applied
         if plant is None:
             x = phi @ x + gamma * (drive * applied)
         else:
-            following = acting if delay else applied
             plant.step(drive * applied, following=drive * following, interval=T)
             x = plant.state
 
     elapsed = (t - t[0]) / T
     x = _hermite(elapsed, states[:, 0::2].T, T * states[:, 1::2].T)
     held = np.floor(elapsed + 0.5 * min(1.0, interval / T)).astype(int)
-    return LoopRun(t=t, x=x + rest[:, None], u=efforts[held])
+    return LoopRun(t=t, x=x + np.reshape(setup.rest, (-1, 1)), u=efforts[held])
 
 
 def check_ticks(duration: float, sample_time: float) -> None:
@@ -250,26 +265,6 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
 
 
 # ------------------------------------------------------------------- inside
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Encoder:
-    rest: Array  # (f,)
-    step: Array  # (f,); 0 where none is seen
-    rounds: bool = field(init=False)  # told once, not at every tick
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "rounds", bool(self.step.any()))
-
-    def read(self, x: Array) -> Array:
-        """Return what the controller sees of the positions (f,)."""
-        y = x + self.rest
-        if not self.rounds:
-            return y
-        coarse = self.step > 0
-        np.divide(y, self.step, out=y, where=coarse)
-        np.rint(y, out=y, where=coarse)
-        return np.multiply(y, self.step, out=y, where=coarse)
 
 
 class _Law(Protocol):

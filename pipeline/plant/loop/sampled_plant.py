@@ -10,8 +10,6 @@ from pipeline.plant.loop.robustness import stays_stable
 from pipeline.plant.loop.sampled_loop import StateFeedback, discretise
 
 RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
-_SAMPLE_TIME = 0.00884  # s; the laboratory's controller
-_SAMPLES_TO_SETTLE = 25  # at least
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,9 +32,8 @@ class SampledPlant:
         speeds = np.maximum(np.abs(chain.poles), 4 / settling)
         rate = float(np.exp(np.log(speeds).mean()))
         if sample_time is None:
-            sample_time = min(
-                _SAMPLE_TIME, RADIANS_PER_SAMPLE / speeds.max(), settling / _SAMPLES_TO_SETTLE
-            )
+            # That of the laboratory's controller; 25 samples to settle.
+            sample_time = min(0.00884, RADIANS_PER_SAMPLE / speeds.max(), settling / 25)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
         phi, gamma = discretise(chain, sample_time)

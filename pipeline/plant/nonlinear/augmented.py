@@ -17,15 +17,11 @@ from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.plant.nonlinear.simulator import kernel
 from pipeline.plant.nonlinear.simulator.contacts import guard, switch
 from pipeline.plant.nonlinear.simulator.laws import arriving, reach_of, settling
-from pipeline.plant.nonlinear.simulator.sensitivity import make_sensitivities
+from pipeline.plant.nonlinear.simulator.sensitivity import make_lanes
+from pipeline.plant.nonlinear.simulator.state import Push
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Spring, Tables
 
-_REFINE = 4.0  # divides the kernel's step: this is what others are judged by
-_LONGEST_STEP = 5e-4  # s, of the stepped bench
-_DAMPED_REACH = 1.0  # c h / m: a light hidden mass may be damped faster than it swings
-_TO_REST = 40.0  # periods of the slowest motion, heavily damped: nothing is left of the start
-_IN_HAND = 1e-30  # inverse mass of a carried cart: no force moves it, yet its friction is felt
 _RUN_AWAY = "with these effects the carts run away: a spring softens too much, or a force is huge"
 
 
@@ -56,7 +52,8 @@ def simulate_augmented(
     n = model.chain.n
     free = _all(n) if free is None else free
     x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
-    return _simulate(model.tables(), t, u, free=free, x0=x0, refine=_REFINE)
+    # In smaller steps than usual: this is what others are judged by.
+    return _simulate(model.tables(), t, u, free=free, x0=x0, refine=4.0)
 
 
 def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) -> Array:
@@ -65,9 +62,9 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     They are let go at zero with their dampings so large that they creep to their rest. Carts that
     no spring ties to a wall rest anywhere: zero.
     """
-    cart, spring, drive = model.tables()
-    n = model.chain.n
-    pulled = np.any(cart[:, Cart.FORCE_OFFSET_FORCE]) or drive[Drive.COGGING_FORCE] != 0.0
+    tables, n = model.tables(), model.chain.n
+    cart = tables.cart
+    pulled = np.any(cart[:, Cart.FORCE_OFFSET_FORCE]) or tables.drive[Drive.COGGING_FORCE] != 0.0
     if not (pulled and model.chain.is_tied):
         return np.zeros(n)
     cart[:, DRY] = 0.0
@@ -75,32 +72,18 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     stiffness, m = model.chain.stiffness, model.chain.m
     cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
     slowest = np.sqrt(np.linalg.eigvals(stiffness / m[:, None]).real.min())
-    t = np.array([0.0, _TO_REST * 2 * np.pi / slowest])
+    # After 40 periods of the slowest motion, heavily damped, nothing is left of the start.
+    t = np.array([0.0, 40.0 * 2 * np.pi / slowest])
     free = _all(n) if free is None else free
-    tables, x0 = (cart, spring, drive), np.zeros(n)
-    return _simulate(tables, t, np.zeros(2), free=free, x0=x0, refine=1.0)[:, -1]
+    return _simulate(tables, t, np.zeros(2), free=free, x0=np.zeros(n), refine=1.0)[:, -1]
 
 
 def _simulate(
     tables: Tables, t: Array, u: Array, *, free: Sequence[int], x0: Array, refine: float
 ) -> Array:
-    n = x0.size
-    t = np.ascontiguousarray(t, dtype=np.float64)
-    cart, spring, drive = tables
-    y = kernel.simulate_batch(
-        cart[None],
-        spring[None],
-        drive[None],
-        x0[None, None],
-        np.zeros((1, 1, n)),
-        np.ones((1, n)),
-        np.isin(_all(n), free),
-        t,
-        t,
-        np.ascontiguousarray(u, dtype=np.float64),
-        np.array([0, t.size]),
-        refine,
-    )[0]
+    run = kernel.describe_run(t, u, free=np.isin(_all(x0.size), free))._replace(refine=refine)
+    start = kernel.StartState(x0[None], np.zeros((1, x0.size)), np.ones(x0.size))
+    (y,), _ = kernel.simulate([(tables, start)], run)
     if not np.all(np.isfinite(y)):
         raise DataError(_RUN_AWAY)
     return y
@@ -130,19 +113,27 @@ class SteppedBench:
         n = model.chain.n
         free = _all(n) if free is None else sorted(set(free))
         x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
-        self._cart, self._spring, self._drive = model.tables()
+        self._tables = model.tables()
         self._n, self._rows = n, [cart - 1 for cart in free]
         self._free = np.isin(_all(n), free)
-        bodies = kernel.assemble(self._cart, self._spring, self._drive, self._free)
-        self._N, self._motor, parents, self._state, self._K, self._C = bodies[:6]
-        self._switches, self._active = bodies.switches, bodies.active
+        self._bodies = bodies = kernel.assemble(self._tables, self._free)
+        self._state = bodies.s
         self._inverse_mass = self._state[kernel.INV].copy()
         self._state[kernel.X, :n] = np.where(self._free, x0, 0.0)
-        for i in range(n, self._N):
-            parent = 0 if i == self._motor else parents[i]
+        for i in range(n, bodies.N):
+            parent = 0 if i == bodies.motor else bodies.parent[i]
             self._state[kernel.X, i] = self._state[kernel.X, parent]
-        self._no_sensitivities = make_sensitivities(kernel.NO_LANES, self._N)
-        self._step, self._contact_step = self._step_lengths()
+        self._no_lanes = make_lanes(kernel.NO_LANES, bodies.N)
+        self._step, contact_step = self._step_lengths()
+        self._push = Push(
+            u=0.0,
+            on=0.0,
+            h=self._step,
+            scatter=np.ones(n),
+            dry=bool(np.any(self._tables.cart[:, DRY])),
+            smooth=reach_of(*self._tables)[1],
+            contact_step=contact_step,
+        )
         self._close_contacts()
         self._bend_presliding()
         self._now = 0.0
@@ -154,19 +145,18 @@ class SteppedBench:
     @property
     def readings(self) -> Array:
         """What the sensors of all carts read, (n_carts,)."""
-        return self._cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[kernel.X, : self._n]
+        return self._tables.cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[kernel.X, : self._n]
 
     @property
     def state(self) -> Array:
         """State of the free carts as sensors would read it: (x1, v1, x2, v2, …), (2f,)."""
-        return (self._cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[: kernel.V + 1, : self._n])[
-            :, self._rows
-        ].T.ravel()
+        gains = self._tables.cart[:, Cart.SENSOR_GAIN_GAIN]
+        return (gains * self._state[: kernel.V + 1, : self._n])[:, self._rows].T.ravel()
 
     @property
     def shortest_step(self) -> float:
         """The longest substep that it may take where it is stiffest, s."""
-        return min(self._step, self._contact_step)
+        return min(self._step, self._push.contact_step)
 
     # ------------------------------------------------------------------ what moves it
 
@@ -179,18 +169,19 @@ class SteppedBench:
         ------
         DataError : the carts run away, or the drive leads by more than the interval.
         """
-        if -self._drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
+        if -self._tables.drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
             raise DataError("in a closed loop the input cannot lead its log by over one sample")
-        self._inputs.append((self._now, arriving(self._drive, u)))
-        upcoming = (self._now + interval, arriving(self._drive, following))
+        self._inputs.append((self._now, arriving(self._tables.drive, u)))
+        upcoming = (self._now + interval, arriving(self._tables.drive, following))
         on = 1.0 if u != 0.0 else 0.0
         count = max(1, int(np.ceil(interval / self._step - 1e-9)))
         h = interval / count
         for sub in range(count):
             start = self._now + sub * h
-            self._advance(self._force(start, start + h, upcoming), on=on, h=h)
+            push = self._push._replace(u=self._force(start, start + h, upcoming), on=on, h=h)
+            advance(self._tables, self._bodies, push, self._no_lanes)
         self._now += interval
-        begin = self._now - self._drive[Drive.INPUT_DELAY_DELAY]
+        begin = self._now - self._tables.drive[Drive.INPUT_DELAY_DELAY]
         while len(self._inputs) > 1 and self._inputs[1][0] <= begin:
             self._inputs.popleft()
         if not np.all(np.abs(self._state[kernel.X]) < kernel._BLOWN_UP):
@@ -198,7 +189,8 @@ class SteppedBench:
 
     def carry(self, cart: int, *, to: float, interval: float) -> None:
         """Move one cart by hand to a position in `interval` s, the other free carts held."""
-        self._state[kernel.INV, self._rows] = _IN_HAND
+        # No force moves a carried cart, yet its friction is felt.
+        self._state[kernel.INV, self._rows] = 1e-30
         self._state[kernel.V, self._rows] = 0.0
         self._state[kernel.V, cart - 1] = (to - self._state[kernel.X, cart - 1]) / interval
         self.step(0.0, following=0.0, interval=interval)
@@ -216,26 +208,17 @@ class SteppedBench:
 
     # ------------------------------------------------------------------ inside
 
-    def _advance(self, force: float, *, on: float, h: float) -> None:
-        tables = self._cart, self._spring, self._drive
-        bodies = self._n, self._N, self._motor, self._state, self._K, self._C
-        dry = bool(np.any(self._cart[:, DRY]))
-        _, smooth = reach_of(*tables)
-        switches = self._switches, self._active, self._contact_step
-        step = np.ones(self._n), force, on, h, dry, smooth
-        advance(*tables, *bodies, *step, *switches, *self._no_sensitivities)
-
     def _force(self, start: float, end: float, upcoming: tuple[float, float]) -> float:
         """Return the mean of the delayed and lagged input from start to end, exactly."""
         if self._lagged == 0.0 and upcoming[1] == 0.0 and not any(u for _, u in self._inputs):
             return 0.0
-        delay = float(self._drive[Drive.INPUT_DELAY_DELAY])
+        delay = float(self._tables.drive[Drive.INPUT_DELAY_DELAY])
         inputs = [*self._inputs, upcoming, (np.inf, 0.0)]
         mean = 0.0
         for (since, value), (until, _) in pairwise(inputs):
             overlap = min(end - delay, until) - max(start - delay, since)
             mean += value * max(overlap, 0.0) / (end - start)
-        lag = float(self._drive[Drive.ACTUATOR_LAG_TIME_CONSTANT])
+        lag = float(self._tables.drive[Drive.ACTUATOR_LAG_TIME_CONSTANT])
         if lag > 0.0:
             decay = float(np.exp(-(end - start) / lag))
             target, off = mean, self._lagged - mean
@@ -247,36 +230,36 @@ class SteppedBench:
         """Return the forces on all bodies but friction and the drive, as if they stood still."""
         s = self._state
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
-        driven = max(self._motor, 0)
-        _, smooth = reach_of(self._cart, self._spring, self._drive)
-        smooth_forces(self._cart, self._spring, self._drive, driven, self._n, s, 0.0, 0.0, smooth)
-        return s[kernel.FORCE] - self._K @ s[kernel.X]
+        smooth_forces(self._tables, self._bodies, 0.0, 0.0, self._push.smooth)
+        return s[kernel.FORCE] - self._bodies.K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
         """Put the contacts that are closed from the start into the matrices."""
-        kinds = (self._cart, self._spring, self._drive, self._n, self._motor, self._state)
-        for e, which in enumerate(self._switches):
-            if guard(which, False, *kinds, 0.0) > 0.0:
-                self._active[e] = True
-                switch(which, 1.0, *kinds, self._K, self._C)
+        bodies = self._bodies
+        for e, which in enumerate(bodies.switches):
+            if guard(which, False, self._tables, bodies.s, 0.0) > 0.0:
+                bodies.active[e] = True
+                switch(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
 
     def _bend_presliding(self) -> None:
         """Bend the presliding friction as far as it holds what acts on the carts at rest."""
         net = self._static_forces()
-        most = np.array([settling(self._cart, i, 0.0)[0] for i in range(self._n)])
+        most = np.array([settling(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
         for i in np.flatnonzero(most):
             self._state[kernel.Z, i] = np.clip(net[i] / most[i], -1.0, 1.0)
 
     def _step_lengths(self) -> tuple[float, float]:
         """Return the longest substep, and the longest inside a contact, s."""
-        inverse, N = self._inverse_mass[: self._N], self._N
-        change = 1.0 + max(float(self._spring[:, Spring.SLACK_SPRING_STIFFNESS_CHANGE].max()), 0.0)
-        fastest = float(np.max(np.abs(self._K[:N, :N]).sum(1) * inverse)) * change
-        damped = float(np.max(np.abs(self._C[:N, :N]).sum(1) * inverse))
-        step = min(_LONGEST_STEP, kernel._SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
-        step = min(step, _DAMPED_REACH / max(damped, 1e-12))
-        contact = float(np.max(self._cart[:, Cart.END_STOP_STIFFNESS] * inverse[: self._n]))
-        if self._motor >= 0:
-            both = float(inverse[0] + inverse[self._motor])
-            contact = max(contact, self._drive[Drive.BACKLASH_CONTACT_STIFFNESS] * both)
+        bodies, tables = self._bodies, self._tables
+        inverse, N = self._inverse_mass[: bodies.N], bodies.N
+        change = 1.0 + max(float(tables.spring[:, Spring.SLACK_SPRING_STIFFNESS_CHANGE].max()), 0.0)
+        fastest = float(np.max(np.abs(bodies.K[:N, :N]).sum(1) * inverse)) * change
+        damped = float(np.max(np.abs(bodies.C[:N, :N]).sum(1) * inverse))
+        step = min(5e-4, kernel._SERIES_REACH / np.sqrt(max(fastest, 1e-12)))
+        # A light hidden mass may be damped faster than it swings.
+        step = min(step, 1.0 / max(damped, 1e-12))
+        contact = float(np.max(tables.cart[:, Cart.END_STOP_STIFFNESS] * inverse[: self._n]))
+        if bodies.motor >= 0:
+            both = float(inverse[0] + inverse[bodies.motor])
+            contact = max(contact, tables.drive[Drive.BACKLASH_CONTACT_STIFFNESS] * both)
         return step, kernel._CONTACT_REACH / np.sqrt(contact) if contact > 0.0 else step

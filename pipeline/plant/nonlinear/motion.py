@@ -22,15 +22,21 @@ from scipy.special import factorial
 
 from pipeline.arrays import Array
 from pipeline.errors import DataError
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, Term
-from pipeline.plant.nonlinear.effects.law import Built, Contact, Force, Friction, Hysteresis, Input
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.effects.law import (
+    BuiltLaw,
+    ContactLaw,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
+)
 
 if TYPE_CHECKING:
     import control
 
 STOP_TIME = 1e-4  # s, the default of the parameter `stop`
 _PADE_ORDER = 4
-_LIGHTEST = 0.02  # of cart 1's mass: what a play leaves it without the motor's
 
 _FUNCTIONS: dict[str, Any] = {
     "__builtins__": {},
@@ -57,13 +63,13 @@ class _Expression:
         return float(eval(self.code, _FUNCTIONS, {**self.values, **quantities}))
 
 
-def _expression(text: str, term: Term, **more: float) -> _Expression:
+def _expression(text: str, term: EffectTerm, **more: float) -> _Expression:
     symbols = [p.symbol for p in term.effect.parameters]
     values = dict(zip(symbols, term.values, strict=True))
     return _Expression(compile(text, "<law>", "eval"), {**values, **more})
 
 
-class Motion:
+class EquationsOfMotion:
     """The state and its rate of change.
 
     Attributes
@@ -87,7 +93,7 @@ class Motion:
         self._forces = [
             (term, _expression(term.effect.law.force, term, **self._spring(term)))
             for term in terms
-            if isinstance(term.effect.law, Force)
+            if isinstance(term.effect.law, ForceLaw)
         ]
         self._contacts = [
             (
@@ -97,38 +103,38 @@ class Motion:
                 term.effect.law.pulls,
             )
             for term in terms
-            if isinstance(term.effect.law, Contact)
+            if isinstance(term.effect.law, ContactLaw)
         ]
         self._frictions = [
             (term.place - 1, _expression(term.effect.law.size, term))
             for term in terms
-            if isinstance(term.effect.law, Friction)
+            if isinstance(term.effect.law, FrictionLaw)
         ]
         # What goes into the drive passes the dead zone first.
-        inputs = [term for term in terms if isinstance(term.effect.law, Input)]
+        inputs = [term for term in terms if isinstance(term.effect.law, InputLaw)]
         inputs.sort(key=lambda term: term.effect.key)
         self._inputs = [
             _expression(term.effect.law.arrives, term)
             for term in inputs
-            if isinstance(term.effect.law, Input)
+            if isinstance(term.effect.law, InputLaw)
         ]
-        self._built: dict[str, list[tuple[Term, int]]] = {}
+        self._built: dict[str, list[tuple[EffectTerm, int]]] = {}
         self._delay: tuple[Array, Array, Array, float] | None = None
         for term in terms:
-            if isinstance(term.effect.law, Built):
+            if isinstance(term.effect.law, BuiltLaw):
                 self._add(term, term.effect.law.kind)
         self._bristles = [
             (term.place - 1, _expression(term.effect.law.force, term),
              _expression(term.effect.law.rate, term), len(self.states) + q)
-            for q, term in enumerate(t for t in terms if isinstance(t.effect.law, Hysteresis))
-            if isinstance(term.effect.law, Hysteresis)
+            for q, term in enumerate(t for t in terms if isinstance(t.effect.law, HysteresisLaw))
+            if isinstance(term.effect.law, HysteresisLaw)
         ]  # fmt: skip
         self.states += [f"z{i + 1}" for i, *_ in self._bristles]
 
-    def _spring(self, term: Term) -> dict[str, float]:
+    def _spring(self, term: EffectTerm) -> dict[str, float]:
         return {"k": float(self._k[term.place - 1])} if term.effect.place == "spring" else {}
 
-    def _add(self, term: Term, kind: str) -> None:
+    def _add(self, term: EffectTerm, kind: str) -> None:
         i, own = term.place, []
         match kind:
             case "reading":
@@ -137,7 +143,8 @@ class Motion:
                 own = [f"x{i}_hidden", f"v{i}_hidden"]
             case "play":
                 own = ["x_motor", "v_motor"]
-                self._m[0] = max(self._m[0] - term.values[1], _LIGHTEST * self._m[0])
+                # Without the motor's mass a play leaves cart 1 a fiftieth, at the least.
+                self._m[0] = max(self._m[0] - term.values[1], 0.02 * self._m[0])
             case "lag":
                 own = ["u_lag"]
             case "delay":
@@ -185,7 +192,7 @@ class Motion:
             elif term.effect.place == "cart":
                 i = term.place - 1
                 force[i] += law(x=x[i], v=v[i], u=u)
-            elif isinstance(term.effect.law, Force) and term.effect.law.on_motor:
+            elif isinstance(term.effect.law, ForceLaw) and term.effect.law.on_motor:
                 push += law(x=driven, v=state[play[0][1] + 1] if play else v[0], u=u)
             else:
                 force[0] += law(x=x[0], v=v[0], u=u, on=float(command != 0.0))
@@ -233,7 +240,13 @@ class Motion:
         return u
 
     def _across(
-        self, play: tuple[Term, int], state: Array, push: float, out: Array, x: float, v: float
+        self,
+        play: tuple[EffectTerm, int],
+        state: Array,
+        push: float,
+        out: Array,
+        x: float,
+        v: float,
     ) -> float:
         """Return what reaches cart 1 across the play; fill the motor's rates."""
         (gap, mass, stiffness, damping), at = play[0].values, play[1]

@@ -5,6 +5,7 @@ An effect fills columns of one row; the neutral values of all columns are the li
 
 from enum import IntEnum
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,7 +17,13 @@ __all__ = ["DRY", "TABLES", "Cart", "Drive", "Spring", "Tables", "linear_tables"
 
 TABLES: dict[str, type[IntEnum]] = {"cart": Cart, "spring": Spring, "input": Drive}
 
-Tables = tuple[Array, Array, Array]
+
+class Tables(NamedTuple):
+    """The columns of the effects: cart (n, .), spring (n + 1, .) and drive (.,)."""
+
+    cart: Array
+    spring: Array
+    drive: Array
 
 
 @cache
@@ -27,11 +34,9 @@ def _neutral(of: type[IntEnum]) -> Array:
 
 
 def linear_tables(chain: Chain) -> Tables:
-    """Return cart (n, .), spring (n + 1, .) and drive (.,) tables of a chain without effects."""
-    cart, spring = (
-        np.tile(_neutral(Cart), (chain.n, 1)),
-        np.tile(_neutral(Spring), (chain.n + 1, 1)),
-    )
+    """Return the tables of a chain without effects."""
+    cart = np.tile(_neutral(Cart), (chain.n, 1))
+    spring = np.tile(_neutral(Spring), (chain.n + 1, 1))
     cart[:, Cart.MASS], cart[:, Cart.DAMPING] = chain.m, chain.c
     spring[:, Spring.STIFFNESS] = chain.k
-    return cart, spring, _neutral(Drive).copy()
+    return Tables(cart, spring, _neutral(Drive).copy())

@@ -1,96 +1,89 @@
-"""What changed between two drafts: an earlier `results.json` and the analysis of now."""
+"""What changed between two drafts: an earlier `results.json` and the analysis of now.
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+Told are the numbers that moved and the checks that fail now: what people look at.
+"""
+
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from math import hypot
 from pathlib import Path
+from typing import Any
 
 from pydantic import ValidationError
 
 from pipeline.errors import ConfigError
-from pipeline.report import limits
-from pipeline.report.document import Block, Cell, Span, bullet_list, cell, paragraph
-from pipeline.report.numbers import NOTHING, count, percent, significant, unit_text, with_error
-from pipeline.report.sections.housekeeping import OUTCOMES, TONES
+from pipeline.json_files import file_model, plain
+from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.sections.page import Page
-from pipeline.report.words import capital, clean, name_span, rich
 from pipeline.results import Analysis
-from pipeline.results_json import results_dict
-from pipeline.schemas.base import plain_json
-from pipeline.schemas.results import Check, Results
-from pipeline.submission.complaints import refusal
+from pipeline.set_up import Bench, Units
+from pipeline.submission.complaints import first_refusal
+from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text, with_error
+from pipeline.words.phrases import phrases
+from pipeline.words.text import capital, clean, name_span, rich
 
+_WORDS = phrases("report")
 _MOST_BYTES = 20_000_000  # of a results.json; real ones have a few ten thousand
-_SAME = 1e-8  # relative: two processors agree to this on the ten digits of the file
-_ESTIMATES = ("final", "initial")
+Draft = Mapping[str, Any]  # a whole results.json
+
+
+@dataclass(frozen=True, kw_only=True)
+class DraftNumber:
+    """A number of one draft, with its standard error where it has one."""
+
+    value: float
+    std: float | None = None
+    unit: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """A number before and now, with its standard error where it has one."""
+    """A number before and now; None where it is not there."""
 
     what: str
     name: str
-    unit: str
-    before: float | None
-    after: float | None
-    before_std: float | None = None
-    after_std: float | None = None
+    before: DraftNumber | None
+    after: DraftNumber | None
 
     @property
     def percent(self) -> float | None:
         """The change in percent of the value before."""
-        if self.before is None or self.after is None or self.before == 0:
+        if self.before is None or self.after is None or self.before.value == 0:
             return None
-        return 100 * (self.after - self.before) / abs(self.before)
+        return 100 * (self.after.value - self.before.value) / abs(self.before.value)
 
     @property
     def sigmas(self) -> float | None:
         """The change in combined standard errors."""
-        if self.before is None or self.after is None:
+        old, new = self.before, self.after
+        if old is None or new is None or old.std is None or new.std is None:
             return None
-        if self.before_std is None or self.after_std is None:
-            return None
-        combined = hypot(self.before_std, self.after_std)
-        return (self.after - self.before) / combined if combined > 0 else None
+        combined = hypot(old.std, new.std)
+        return (new.value - old.value) / combined if combined > 0 else None
 
     @property
     def differs(self) -> bool:
         """Whether it is another number, or one of the two is not there."""
         if self.before is None or self.after is None:
             return self.before is not self.after
-        return abs(self.after - self.before) > _SAME * max(abs(self.before), abs(self.after))
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckChange:
-    """A check whose outcome changed; "" where it is not there."""
-
-    id: str
-    before: str
-    after: str
-    message: str
+        old, new = self.before.value, self.after.value
+        # Two processors agree to this on the ten digits of the file.
+        return abs(new - old) > 1e-8 * max(abs(old), abs(new))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DraftChanges:
-    """All that differs between two drafts of one report."""
+    """The numbers that moved, and the messages of the checks that fail now and did not, by id."""
 
     numbers: tuple[Change, ...]
-    checks: tuple[CheckChange, ...]
-    files: Mapping[str, str]  # name: "new", "gone" or "changed"
-    new_warnings: tuple[str, ...]
-    gone_warnings: tuple[str, ...]
-    newly_skipped: tuple[str, ...]
-    no_longer_skipped: tuple[str, ...]
-    versions: tuple[str, str]
+    failed: dict[str, str]
 
 
 # ------------------------------------------------------------------------ comparing
 
 
-def read_results(path: Path) -> Results:
-    """Read an earlier `results.json`.
+def read_results(path: Path) -> Draft:
+    """Return what an earlier `results.json` holds.
 
     Raises
     ------
@@ -99,120 +92,79 @@ def read_results(path: Path) -> Results:
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise ConfigError(f"{path}: too large for a results.json")
-        return Results.model_validate_json(path.read_bytes())
+        read = file_model(Analysis).model_validate_json(path.read_bytes())
+        return read.model_dump(by_alias=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        what = f"{where}: {refusal(first)}" if where else refusal(first)
+        what = first_refusal(error)
         raise ConfigError(f"{path}: no results.json of cartlab ({what})") from None
 
 
-def check_comparable(before: Results, *, carts: int, position_unit: str, input_unit: str) -> None:
+def check_comparable(before: Draft, *, bench: Bench) -> None:
     """Refuse what has no number in common with an earlier draft.
 
     Raises
     ------
     ConfigError : the earlier draft is of another number of carts or in other units.
     """
-    then, units = before.submission, before.submission.units
-    if (then.carts, units.position, units.input) != (carts, position_unit, input_unit):
+    then, units = before["submission"], Units(**before["submission"]["units"])
+    if (then["carts"], units) != (bench.n, bench.units):
         raise ConfigError(
-            f"the earlier draft is of {count(then.carts, 'cart')} in {units.position} and "
-            f"{units.input}, this one of {carts} in {position_unit} and {input_unit}: they cannot "
-            "be compared"
+            f"the earlier draft is of {count(then['carts'], 'cart')} in {units.position} and "
+            f"{units.input}, this one of {bench.n} in {bench.units.position} and "
+            f"{bench.units.input}: they cannot be compared"
         )
 
 
-def compare_drafts(before: Results, analysis: Analysis) -> DraftChanges:
+def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
     """Return what changed from an earlier draft to an analysis.
 
     Raises
     ------
     ConfigError : see `check_comparable`.
     """
-    check_comparable(
-        before,
-        carts=analysis.carts,
-        position_unit=analysis.position_unit,
-        input_unit=analysis.input_unit,
+    check_comparable(before, bench=analysis.bench)
+    after = plain(analysis)
+    then, now = ({(what, name): n for what, name, n in _numbers(r)} for r in (before, after))
+    changes = (
+        Change(what=what, name=name, before=then.get((what, name)), after=now.get((what, name)))
+        for what, name in {**now, **then}
     )
-    after = Results.model_validate(plain_json(results_dict(analysis)))
-    warned, warns = before.warnings, after.warnings
-    skipped, skips = ([skip.stage for skip in draft.skipped] for draft in (before, after))
-    changes = (*_estimates(before, after), *_feedback(before, after), *_hardware(before, after))
+    failed_then = {check["id"] for check in before["checks"] if check["outcome"] == "fail"}
     return DraftChanges(
         numbers=tuple(change for change in changes if change.differs),
-        checks=tuple(_checks(before.checks, after.checks)),
-        files=_files(before.provenance.files, after.provenance.files),
-        new_warnings=_only(warns, warned),
-        gone_warnings=_only(warned, warns),
-        newly_skipped=_only(skips, skipped),
-        no_longer_skipped=_only(skipped, skips),
-        versions=(before.provenance.version, after.provenance.version),
+        failed={
+            check["id"]: check["message"]
+            for check in after["checks"]
+            if check["outcome"] == "fail" and check["id"] not in failed_then
+        },
     )
 
 
-def _only(items: Iterable[str], others: Sequence[str]) -> tuple[str, ...]:
-    return tuple(item for item in items if item not in others)
-
-
-def _estimates(before: Results, after: Results) -> Iterator[Change]:
-    then, now = ({row.name: row for row in draft.parameters} for draft in (before, after))
-    for which in _ESTIMATES:
-        for name, row in {**now, **then, **now}.items():
-            old, new = then.get(name), now.get(name)
-            yield Change(
-                what=which,
-                name=name,
-                unit=row.unit,
-                before=getattr(old, which, None),
-                after=getattr(new, which, None),
-                before_std=getattr(old, f"{which}_std", None),
-                after_std=getattr(new, f"{which}_std", None),
-            )
-
-
-def _feedback(before: Results, after: Results) -> Iterator[Change]:
-    position, drive = after.submission.units.position, after.submission.units.input
-    units = {
-        "prefilter": f"{drive}/{position}",
+def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
+    """Yield what a number is about, its name and the number: estimates, feedback, hardware."""
+    for which in ("final", "initial"):
+        for row in draft["parameters"]:
+            value, std = row.get(which), row.get(f"{which}_std")
+            if value is not None:
+                yield which, row["name"], DraftNumber(value=value, std=std, unit=row["unit"])
+    units = Units(**draft["submission"]["units"])
+    quantities = {
+        "prefilter": units.stiffness,
         "overshoot_percent": "%",
         "settling_time": "s",
-        "peak_input": drive,
+        "peak_input": units.input,
     }
-    for key, unit in units.items():
-        old, new = (getattr(draft.feedback, key, None) for draft in (before, after))
-        name = key.removesuffix("_percent").replace("_", " ")
-        yield Change(what="feedback", name=name, unit=unit, before=old, after=new)
-
-
-def _hardware(before: Results, after: Results) -> Iterator[Change]:
-    then, now = (
-        {f"{h.experiment}, cart {h.cart}": h.nrmse and 100 * h.nrmse for h in draft.hardware}
-        for draft in (before, after)
-    )
-    for run in {**now, **then}:
-        name = f"difference in {run}".replace("_", " ")
-        yield Change(what="hardware", name=name, unit="%", before=then.get(run), after=now.get(run))
-
-
-def _checks(before: Iterable[Check], after: Iterable[Check]) -> Iterator[CheckChange]:
-    then, now = ({check.id: check for check in checks} for checks in (before, after))
-    for id_, check in {**now, **then, **now}.items():
-        was, is_ = (checks[id_].outcome if id_ in checks else "" for checks in (then, now))
-        # A check that came or went with its run, and passes, is no news.
-        if was != is_ and {was, is_} != {"", "pass"}:
-            yield CheckChange(id=id_, before=was, after=is_, message=check.message)
-
-
-def _files(before: Mapping[str, str], after: Mapping[str, str]) -> dict[str, str]:
-    return {
-        name: "new" if name not in before else "gone" if name not in after else "changed"
-        for name in sorted({*before, *after})
-        if before.get(name) != after.get(name)
-    }
+    for key, unit in quantities.items():
+        value = (draft["feedback"] or {}).get(key)
+        if value is not None:
+            name = key.removesuffix("_percent").replace("_", " ")
+            yield "feedback", name, DraftNumber(value=value, unit=unit)
+    for one in draft["hardware"]:
+        if one["nrmse"] is not None:
+            name = f"difference in {one['experiment']}, cart {one['cart']}".replace("_", " ")
+            yield "hardware", name, DraftNumber(value=100 * one["nrmse"], unit="%")
 
 
 # -------------------------------------------------------------------------- telling
@@ -221,93 +173,51 @@ def _files(before: Mapping[str, str], after: Mapping[str, str]) -> dict[str, str
 def changes_line(changes: DraftChanges) -> str:
     """Return what changed in one line, for the terminal."""
     parts = []
-    for which in _ESTIMATES:
+    for which in ("final", "initial"):
         moved = [c for c in changes.numbers if c.what == which and c.percent is not None]
         if moved:
             worst = max(moved, key=lambda change: abs(change.percent or 0.0))
-            sigmas = "" if worst.sigmas is None else f", {_sigmas(worst.sigmas)}"
-            parts.append(
-                f"{count(len(moved), f'{which} estimate')} moved, {worst.name} most "
-                f"({percent(worst.percent, signed=True)}{sigmas})"
-            )
-    counted = (
-        ("check", " now failed", [c for c in changes.checks if c.after == "fail"]),
-        ("check", " no longer failed", [c for c in changes.checks if c.before == "fail"]),
-        ("file", " changed", changes.files),
-        ("new warning", "", changes.new_warnings),
-        ("warning", " gone", changes.gone_warnings),
-    )
-    parts += [f"{count(len(found), noun)}{verb}" for noun, verb, found in counted if found]
+            estimates = count(len(moved), f"{which} estimate")
+            parts.append(f"{estimates} moved, {worst.name} most ({_moved(worst, between=', ')})")
+    if changes.failed:
+        parts.append(f"{count(len(changes.failed), 'check')} now failed")
+    if changes.numbers and not parts:
+        parts.append(f"{count(len(changes.numbers), 'number')} moved")
     return "since the earlier draft: " + ("; ".join(parts) or "nothing changed")
 
 
 def change_blocks(page: Page, changes: DraftChanges | None) -> list[Block]:
-    """Return what changed since the earlier draft, as tables and lists."""
+    """Return what changed since the earlier draft."""
     if changes is None:
         return []
-    line = changes_line(changes)
-    blocks: list[Block] = [paragraph(rich(capital(line) + "."))]
-    if changes.versions[0] != changes.versions[1]:
-        blocks.append(
-            paragraph(
-                f"The earlier draft was made by cartlab {clean(changes.versions[0])}, this one by "
-                f"{changes.versions[1]}: the program may account for some of it."
-            )
-        )
+    blocks: list[Block] = [paragraph(rich(capital(changes_line(changes)) + "."))]
     if changes.numbers:
-        caption = (
-            "Numbers that moved. The change in brackets is in combined standard errors (σ); "
-            "below one it is chance."
-        )
-        head = ("Quantity", "Kind", "Unit", "Earlier draft", "This draft", "Change")
-        blocks.append(page.table(caption, head, map(_number_row, changes.numbers), "lllrrr"))
-    if changes.checks:
-        head = ("Check", "Earlier draft", "This draft", "What was found")
-        rows = [
-            [
-                cell(Span(clean(check.id), "code")),
-                *(
-                    cell(OUTCOMES.get(outcome, "not there"), TONES.get(outcome, "quiet"))
-                    for outcome in (check.before, check.after)
-                ),
-                cell(rich(clean(check.message))),
-            ]
-            for check in changes.checks
-        ]
-        blocks.append(page.table("Checks that came out differently.", head, rows, "llll"))
-    lists = (
-        ("Data files", [f"{name}: {what}" for name, what in changes.files.items()]),
-        ("New warnings", changes.new_warnings),
-        ("Warnings that are gone", changes.gone_warnings),
-        ("Skipped now", changes.newly_skipped),
-        ("No longer skipped", changes.no_longer_skipped),
-    )
-    for title, items in lists:
-        if items:
-            blocks.append(paragraph(Span(f"{title}:", "strong")))
-            blocks.append(bullet_list(rich(clean(item)) for item in items))
+        rows = map(_number_row, changes.numbers)
+        blocks.append(page.table(_WORDS, "moved_table", rows, "lllrrr"))
+    if changes.failed:
+        messages = bullet_list(rich(clean(message)) for message in changes.failed.values())
+        blocks += [paragraph(_WORDS.spans("newly_failed")), messages]
     return blocks
 
 
 def _number_row(change: Change) -> list[Cell]:
-    moved, sigmas = percent(change.percent, signed=True), change.sigmas
-    if sigmas is not None:
-        moved += f" ({_sigmas(sigmas)})"
-    is_chance = sigmas is not None and abs(sigmas) < limits.CHANCE
-    name = name_span(change.name) if change.what in _ESTIMATES else rich(clean(change.name))
+    sigmas, known = change.sigmas, change.after or change.before
+    drafts = (change.before, change.after)
+    is_estimate = change.what in ("final", "initial")
     return [
-        cell(name),
+        cell(name_span(change.name) if is_estimate else rich(clean(change.name))),
         cell(change.what, "quiet"),
-        cell(unit_text(clean(change.unit)) or "1"),
-        cell(_value(change.before, change.before_std)),
-        cell(_value(change.after, change.after_std)),
-        cell(moved, "quiet" if is_chance else ""),
+        cell(unit_text(clean(known.unit if known else "")) or "1"),
+        *(cell(with_error(n.value, n.std) if n else NOTHING) for n in drafts),
+        # A number that moved by less than one standard error did not move.
+        cell(_moved(change), "quiet" if sigmas is not None and abs(sigmas) < 1.0 else ""),
     ]
 
 
-def _sigmas(sigmas: float) -> str:
-    return f"{significant(abs(sigmas), digits=2)} σ"
-
-
-def _value(value: float | None, std: float | None) -> str:
-    return NOTHING if value is None else with_error(value, std)
+def _moved(change: Change, *, between: str = " (") -> str:
+    """Return "+2.0 % (1.4 σ)", or without brackets."""
+    text = percent(change.percent, signed=True)
+    if change.sigmas is None:
+        return text
+    end = ")" if between == " (" else ""
+    return f"{text}{between}{significant(abs(change.sigmas), digits=2)} σ{end}"

@@ -4,14 +4,7 @@ from collections.abc import Callable, Sequence
 
 from pipeline import __version__
 from pipeline.gap.types import Gap
-from pipeline.report.document import (
-    Block,
-    Document,
-    Heading,
-    Paragraph,
-    paragraph,
-    spans,
-)
+from pipeline.report.document import Block, Document, Heading, Paragraph, paragraph
 from pipeline.report.draft.changes import DraftChanges, change_blocks
 from pipeline.report.equations.model import (
     equations_of_motion,
@@ -21,8 +14,7 @@ from pipeline.report.equations.model import (
     symbolic_transfer_functions,
 )
 from pipeline.report.gap.section import augmented_hardware_blocks, gap_blocks, gap_in_short
-from pipeline.report.numbers import count
-from pipeline.report.phrases import phrases
+from pipeline.report.render.builder import Part
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
     check_blocks,
@@ -37,11 +29,15 @@ from pipeline.report.sections.measurements import (
     step_blocks,
 )
 from pipeline.report.sections.notes import discussion_blocks
-from pipeline.report.sections.page import Page, Part, remarks
-from pipeline.report.sections.parameters import fitted_chain_table, parameter_blocks
+from pipeline.report.sections.page import Page, remarks
+from pipeline.report.sections.parameters import chain_table, parameter_blocks
 from pipeline.report.sections.questions import Asked, ask, open_questions, placed, split_notes
 from pipeline.report.sections.summary import summary
 from pipeline.results import Analysis
+from pipeline.words.numbers import count
+from pipeline.words.phrases import phrases
+from pipeline.words.progress import Progress, silent
+from pipeline.words.spans import spans
 
 _WORDS = phrases("report")
 
@@ -53,7 +49,7 @@ def build_document(
     worked: Sequence[Part] = (),
     answer: Callable[[Asked], Paragraph] | None = None,
     changes: DraftChanges | None = None,
-    progress: Callable[[str], None] | None,
+    progress: Progress = silent,
 ) -> Document:
     """Return the report of an analysis; sections that have nothing to show are left out.
 
@@ -61,7 +57,7 @@ def build_document(
     stand in the place of the one on the model; `changes` is what an earlier draft had otherwise.
     `answer` gives the model answer to a question: then the students' notes are left out.
     """
-    page = Page.of(analysis)
+    page = Page(analysis)
     asked = ask(analysis)
     notes = "" if answer else analysis.discussion or ""
     written, rest = split_notes(discussion_blocks(notes), asked)
@@ -93,7 +89,7 @@ def build_document(
     sections = page.sections(parts, doing="report", progress=progress)
     return page.document(
         placed(sections, asked, answers),
-        about=f"Identification and control of {count(analysis.carts, 'cart')}",
+        about=f"Identification and control of {count(analysis.bench.n, 'cart')}",
     )
 
 
@@ -104,15 +100,15 @@ def _model(page: Page) -> list[Block]:
     analysis = page.analysis
     blocks: list[Block] = [
         paragraph(_WORDS.text("model", drive=page.drive, position=page.position)),
-        equations_of_motion(analysis.springs),
+        equations_of_motion(analysis.bench.springs),
         Heading(spans("State space")),
-        symbolic_state_space(analysis.springs),
+        symbolic_state_space(analysis.bench.springs),
     ]
     chain = analysis.chain
     if chain:
         blocks += [paragraph(_WORDS.text("state_numbers"))]
         blocks += numeric_state_space(chain)
-    symbolic = symbolic_transfer_functions(analysis.springs)
+    symbolic = symbolic_transfer_functions(analysis.bench.springs)
     if symbolic or chain:
         blocks.append(Heading(spans("Transfer functions")))
     if symbolic:
@@ -120,7 +116,7 @@ def _model(page: Page) -> list[Block]:
     if chain:
         blocks += [paragraph("With the identified numbers:"), numeric_transfer_functions(chain)]
     if analysis.fit:
-        blocks.append(fitted_chain_table(page, analysis.fit))
+        blocks.append(chain_table(page, analysis.fit.chain, std=analysis.fit.std))
     return blocks
 
 

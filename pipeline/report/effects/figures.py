@@ -10,25 +10,22 @@ from matplotlib.figure import Figure
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
-from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, Term
-from pipeline.report.effects.words import INPUT, POSITION
-from pipeline.report.figures.style import MODEL, QUIET, SECOND, legend_above, panels, position_label
-from pipeline.report.numbers import subscript
+from pipeline.plant.nonlinear.effects import AugmentedChain, Effect, EffectTerm
+from pipeline.report.effects.catalogue import INPUT, POSITION
+from pipeline.report.figures.style import (
+    MODEL,
+    QUIET,
+    SECOND,
+    SECOND_LINE,
+    legend_above,
+    panels,
+    position_label,
+)
+from pipeline.words.numbers import subscript
 
 _RATE = 1000.0  # Hz: differences of the positions are then velocities and accelerations
 _DURATION = 4.0  # s
 _STEP = (0.1, 2.1)  # s, on and off
-_RELEASE = 1.4  # of the travel
-_HEIGHT = 1.75  # inches
-_LABEL = -0.2  # of the right panel's width, where its title has room
-_EDGE = (-0.02, 0.08)  # s about an edge of the input
-_RING_OUT = 12.0  # s: nothing is left of a pulse
-_PULSE = 20  # samples, short against every period
-_MOST_POINTS = 500
-_HARD_TO_SEE = 0.1  # of the motion: a smaller difference is shown over a shorter time …
-_WINDOW = 0.5  # s on each side of where it is largest
-_ROOM = 1.08
-_SIZE = 0.95  # of the input that holds a cart at its travel
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,57 +52,40 @@ class _Run:
         return force
 
 
-def effect_figure(term: Term, chain: Chain) -> Figure:
+def effect_figure(term: EffectTerm, chain: Chain) -> Figure:
     """Return the fingerprint of an effect on a bench, and the run that shows it best in time."""
     cart = _cart(term, chain)
     runs = _runs(term, chain, cart=cart)
     shown = max(runs, key=lambda run: _difference(run, cart))
-    figure, (left, right) = panels(_HEIGHT, columns=2, share_x=False)
+    figure, (left, right) = panels(1.75, columns=2, share_x=False)
     _fingerprint(left, term, chain, shown, cart=cart)
     seen = _window(shown, cart)
-    t, without, with_it = (
-        shown.t[seen],
-        shown.without[cart - 1, seen],
-        shown.with_it[cart - 1, seen],
-    )
-    right.plot(t, without, color=SECOND, ls="--", lw=1.0, label="without")
-    right.plot(t, with_it, color=MODEL, lw=1.1, label="with it")
+    t = shown.t[seen]
+    right.plot(t, shown.without[cart - 1, seen], label="without", **SECOND_LINE)
+    right.plot(t, shown.with_it[cart - 1, seen], color=MODEL, lw=1.1, label="with it")
     right.set_ylabel(position_label(cart, POSITION))
-    right.yaxis.set_label_coords(_LABEL, 0.5)
+    right.yaxis.set_label_coords(-0.2, 0.5)
     right.set_xlabel(f"{shown.name}: time [s]")
     legend_above(right)
     return figure
 
 
-def fingerprint_words(effect: Effect) -> str:
-    """Say what the fingerprint shows."""
-    if _scales_readings(effect):
-        return "what the sensor reads, against where the cart is (dashed: the same)"
-    return {
-        "velocity": "the force that the linear chain does not account for, against velocity",
-        "position": "the force that the linear chain does not account for, against position",
-        "stretch": "the force that the linear chain does not account for, against the stretch",
-        "input": "the force that arrives on cart 1, against the input (dashed: all of it)",
-        "time": "the force on cart 1 about an edge of the input (dashed)",
-        "frequency": "how far the cart moves per input, without (dashed) and with the effect",
-    }[effect.axis]
-
-
-def _scales_readings(effect: Effect) -> bool:
+def scales_readings(effect: Effect) -> bool:
+    """Tell whether an effect changes what the sensor reads, not how the cart moves."""
     return any(p.neutral == 1.0 for p in effect.parameters)
 
 
 def _window(run: _Run, cart: int) -> slice:
-    """Return the samples to show: all, or those about the largest of small differences."""
-    if _difference(run, cart) > _HARD_TO_SEE:
+    """Return the samples to show: all, or half a second about the largest of small differences."""
+    if _difference(run, cart) > 0.1:
         return slice(None)
     largest = int(np.argmax(np.abs(run.with_it[cart - 1] - run.without[cart - 1])))
-    half = round(_WINDOW * _RATE)
+    half = round(0.5 * _RATE)
     first = min(max(largest - half, 0), run.t.size - 2 * half)
     return slice(first, first + 2 * half)
 
 
-def _cart(term: Term, chain: Chain) -> int:
+def _cart(term: EffectTerm, chain: Chain) -> int:
     """Return the cart to look at: that of the effect, the right one of a spring, the driven one."""
     return min(max(term.place, 1), chain.n)
 
@@ -115,10 +95,11 @@ def _difference(run: _Run, cart: int) -> float:
     return float(np.std(apart) / np.std(run.without[cart - 1]))
 
 
-def _runs(term: Term, chain: Chain, *, cart: int) -> list[_Run]:
+def _runs(term: EffectTerm, chain: Chain, *, cart: int) -> list[_Run]:
     """Return a step on and off and, for what is not in the drive, a decay of that cart alone."""
     t = np.arange(0.0, _DURATION, 1 / _RATE)
-    size = _SIZE / float(np.max(np.abs(chain.static_gains())))
+    # Just less than the input that holds a cart at its travel.
+    size = 0.95 / float(np.max(np.abs(chain.static_gains())))
     everyone = tuple(range(1, chain.n + 1))
     # To the side on which the effect acts, where it has one.
     side = next(
@@ -126,32 +107,31 @@ def _runs(term: Term, chain: Chain, *, cart: int) -> list[_Run]:
         1.0,
     )
     on = (t >= _STEP[0]) & (t < _STEP[1])
-    runs = [_run("step", term, chain, t, np.where(on, side * size, 0.0), free=everyone)]
+    model = AugmentedChain(chain=chain, terms=(term,))
+    runs = [_run("step", model, t, np.where(on, side * size, 0.0), free=everyone)]
     if term.effect.place != "input":
         start = np.zeros(chain.n)
-        start[cart - 1] = _RELEASE
-        runs.append(_run("decay", term, chain, t, np.zeros_like(t), free=(cart,), x0=start))
+        start[cart - 1] = 1.4  # times the travel
+        runs.append(_run("decay", model, t, np.zeros_like(t), free=(cart,), x0=start))
     return runs
 
 
 def _run(
     name: str,
-    term: Term,
-    chain: Chain,
+    model: AugmentedChain,
     t: Array,
     u: Array,
     *,
     free: tuple[int, ...],
     x0: Array | None = None,
 ) -> _Run:
-    model = AugmentedChain(chain=chain, terms=(term,))
     at_rest = rest_positions(model, free=free) if x0 is None else x0
     return _Run(
         name=name,
         t=t,
         u=u,
         free=free,
-        without=simulate_augmented(AugmentedChain(chain=chain), t, u, free=free, x0=x0),
+        without=simulate_augmented(AugmentedChain(chain=model.chain), t, u, free=free, x0=x0),
         with_it=simulate_augmented(model, t, u, free=free, x0=at_rest),
     )
 
@@ -159,7 +139,7 @@ def _run(
 # ------------------------------------------------------------------ the fingerprint
 
 
-def _fingerprint(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
+def _fingerprint(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
     draw: dict[str, Callable[..., None]] = {
         "velocity": _against_motion,
         "position": _against_motion,
@@ -168,13 +148,13 @@ def _fingerprint(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) ->
         "time": _about_an_edge,
         "frequency": _over_frequency,
     }
-    if _scales_readings(term.effect):
+    if scales_readings(term.effect):
         _against_truth(ax, run, cart=cart)
     else:
         draw[term.effect.axis](ax, term, chain, run, cart=cart)
 
 
-def _against_motion(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
+def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
     """Plot the force that the linear chain leaves against what it depends on."""
     motion = run.rate() if term.effect.axis == "velocity" else run.with_it
     force, seen, word = run.residual_force(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
@@ -196,35 +176,36 @@ def _against_motion(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int)
     ax.set_ylabel(f"extra force [{INPUT}]")
 
 
-def _against_input(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
+def _against_input(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
     """Plot the force that arrives on cart 1 against the input, slow enough to see the law."""
     size = float(np.max(np.abs(run.u)))
     u = size * np.sin(2 * np.pi * run.t / _DURATION)
-    slow = _run("ramp", term, chain, run.t, u, free=run.free)
-    ax.plot([-size, size], [-size, size], color=SECOND, ls="--", lw=1.0)
+    slow = _run("ramp", AugmentedChain(chain=chain, terms=(term,)), run.t, u, free=run.free)
+    ax.plot([-size, size], [-size, size], **SECOND_LINE)
     _cloud(ax, u[3:-3], (slow.residual_force(chain)[0] + u)[3:-3])
     ax.set_xlabel(f"input [{INPUT}]")
     ax.set_ylabel(f"force that arrives [{INPUT}]")
 
 
-def _about_an_edge(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
+def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
     """Plot the force that arrives on cart 1 about an edge of the input."""
-    near = (run.t > _STEP[1] + _EDGE[0]) & (run.t < _STEP[1] + _EDGE[1])
+    near = (run.t > _STEP[1] - 0.02) & (run.t < _STEP[1] + 0.08)
     milliseconds = 1e3 * (run.t[near] - _STEP[1])
     arriving = run.residual_force(chain)[0] + run.u
-    ax.plot(milliseconds, run.u[near], color=SECOND, ls="--", lw=1.0, drawstyle="steps-post")
+    ax.plot(milliseconds, run.u[near], drawstyle="steps-post", **SECOND_LINE)
     ax.plot(milliseconds, arriving[near], color=MODEL, lw=1.1)
     ax.set_xlabel("time about the step off [ms]")
     ax.set_ylabel(f"force on cart 1 [{INPUT}]")
 
 
-def _over_frequency(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int) -> None:
+def _over_frequency(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
     """Plot how much the cart moves per input over frequency, from its answer to a short pulse."""
-    t = np.arange(0.0, _RING_OUT, 1 / _RATE)
+    t = np.arange(0.0, 12.0, 1 / _RATE)  # until nothing is left of the pulse
     padded = 2 * t.size
-    samples = np.arange(t.size)
-    u = np.where((samples >= _PULSE) & (samples < 2 * _PULSE), 1.0, 0.0)
-    pulse = _run("pulse", term, chain, t, u, free=tuple(range(1, chain.n + 1)))
+    u = np.zeros(t.size)
+    u[20:40] = 1.0  # short against every period
+    model = AugmentedChain(chain=chain, terms=(term,))
+    pulse = _run("pulse", model, t, u, free=tuple(range(1, chain.n + 1)))
     hertz, omega = np.fft.rfftfreq(padded, 1 / _RATE), np.abs(chain.poles) / (2 * np.pi)
     band = (hertz > 0.3 * omega.min()) & (hertz < 2.5 * omega.max())
     for y, colour, style in ((pulse.without, SECOND, "--"), (pulse.with_it, MODEL, "-")):
@@ -239,7 +220,7 @@ def _over_frequency(ax: Axes, term: Term, chain: Chain, run: _Run, *, cart: int)
 def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
     """Plot what the sensor reads against where the cart is."""
     reach = np.array([run.without[cart - 1].min(), run.without[cart - 1].max()])
-    ax.plot(reach, reach, color=SECOND, ls="--", lw=1.0)
+    ax.plot(reach, reach, **SECOND_LINE)
     _cloud(ax, run.without[cart - 1], run.with_it[cart - 1])
     ax.set_xlabel(f"position of cart {cart} [{POSITION}]")
     ax.set_ylabel(f"reading [{POSITION}]")
@@ -247,10 +228,10 @@ def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
 
 def _cloud(ax: Axes, x: Array, y: Array) -> None:
     """Plot points; the limits leave out the spikes that differences make at a jump."""
-    shown = np.linspace(0, x.size - 1, min(x.size, _MOST_POINTS)).astype(int)
+    shown = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.plot(x[shown], y[shown], ".", color=MODEL, ms=2.6, mew=0)
     low, high = np.quantile(y, [0.002, 0.998])
     low, high = min(low, 0.0), max(high, 0.0)
-    middle, half = (low + high) / 2, _ROOM * (high - low) / 2
+    middle, half = (low + high) / 2, 1.08 * (high - low) / 2
     if half > 0:
         ax.set_ylim(middle - half, middle + half)

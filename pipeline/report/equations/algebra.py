@@ -10,7 +10,8 @@ import ast
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
-from pipeline.report.math.tree import (
+from pipeline.names import read_name
+from pipeline.words.math import (
     GREEK,
     Math,
     Term,
@@ -23,7 +24,7 @@ from pipeline.report.math.tree import (
     row,
     sub,
 )
-from pipeline.report.numbers import significant
+from pipeline.words.numbers import significant
 
 DIGITS = 5  # shown; all are carried
 _IN_S = ("Delta", "N", "R", "P", "X", "U")  # names that stand for functions of s
@@ -107,7 +108,8 @@ def value_term(value: float) -> Term:
 
 def name_term(name: str) -> Term:
     """Return a name as it is written by hand."""
-    base, _, index = name.partition("_")
+    read = read_name(name)
+    base, index = read.symbol, read.suffix
     match base:
         case "w":
             return power(sub("ω", index), "2")

@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 
-from pipeline.plant.nonlinear.effects.base import Term as EffectTerm
+from pipeline.plant.nonlinear.effects.base import EffectTerm
 from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
-from pipeline.report.math.tex import from_tex
-from pipeline.report.math.tree import Term, row, sub
+from pipeline.words.math import Term, row, sub
 
-_LINEAR_PART = "k d + "  # of the springs' laws; the chain has it already
-_ACTS = "f = "
-_BECOMES = r"\to"
+_LINEAR_PART = ("k", "d", "+")  # of the springs' laws; the chain has it already
+_ACTS = ("f", "=")
 
 
 def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) -> Formula:
@@ -19,7 +17,7 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
     forces: list[list[Term]] = [[] for _ in range(n)]
     forces[0] = [_input(terms)]
     for letter, term in zip(_letters(terms), terms, strict=True):
-        if not term.effect.equation.startswith(_ACTS):
+        if term.effect.formula.parts[:2] != _ACTS:
             continue
         f = sub("f", letter)
         if "spring" in term.where:
@@ -35,17 +33,17 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
 
 def law(terms: Sequence[EffectTerm], index: int) -> Formula:
     """Return the law of one effect, under the letter it has in the equations of motion."""
-    equation, letter = terms[index].effect.equation, _letters(terms)[index]
-    if equation.startswith(_ACTS):
-        force = equation.removeprefix(_ACTS)
-        if terms[index].effect.place == "spring":
-            force = force.removeprefix(_LINEAR_PART)
-        return formula(row(sub("f", letter), "=", *from_tex(force).parts))
-    if _BECOMES in equation:
-        left, right = equation.split(_BECOMES, 1)
-        parts = from_tex(left).parts
-        return formula(row(sub(parts[0], letter), *parts[1:], "=", *from_tex(right).parts))
-    return formula(from_tex(equation))
+    effect, letter = terms[index].effect, _letters(terms)[index]
+    parts = effect.formula.parts
+    if parts[:2] == _ACTS:
+        force = parts[2:]
+        if effect.place == "spring" and force[:3] == _LINEAR_PART:
+            force = force[3:]
+        return formula(row(sub("f", letter), "=", *force))
+    if "→" in parts:
+        at = parts.index("→")
+        return formula(row(sub(parts[0], letter), *parts[1:at], "=", *parts[at + 1 :]))
+    return formula(effect.formula)
 
 
 def _letters(terms: Sequence[EffectTerm]) -> str:
@@ -55,7 +53,7 @@ def _letters(terms: Sequence[EffectTerm]) -> str:
 def _input(terms: Sequence[EffectTerm]) -> Term:
     """Return the symbol of what drives cart 1: u, or what the drive makes of it."""
     for letter, term in reversed(list(zip(_letters(terms), terms, strict=True))):
-        if _BECOMES in term.effect.equation:
+        if "→" in term.effect.formula.parts:
             return sub("u", letter)
     return "u"
 

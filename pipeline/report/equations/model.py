@@ -12,7 +12,7 @@ from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.report.document import Formula
 from pipeline.report.equations.algebra import shown
 from pipeline.report.equations.derivation import neighbours, of_cart, springs_at
-from pipeline.report.math.tree import (
+from pipeline.words.math import (
     Math,
     Term,
     dot,
@@ -28,7 +28,7 @@ from pipeline.report.math.tree import (
     to_text,
     total,
 )
-from pipeline.report.numbers import significant
+from pipeline.words.numbers import significant
 
 _DIGITS = 4
 _ALL_DIGITS = 10  # as in results.json

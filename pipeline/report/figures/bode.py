@@ -12,8 +12,7 @@ from pipeline.arrays import Array
 from pipeline.names import mode_suffixes
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.style import (
-    CART_COLOURS,
-    CART_LINES,
+    CARTS,
     MEASURED,
     MODEL,
     QUIET,
@@ -23,42 +22,31 @@ from pipeline.report.figures.style import (
     plot_line,
 )
 from pipeline.report.figures.svg import tell
-from pipeline.report.numbers import subscript
 from pipeline.results import FrequencyResponse
+from pipeline.set_up import Units
+from pipeline.words.numbers import subscript
 
-_LINE_POINTS = 300
-_MARGIN = 0.08  # of the phase's span, above and below
-_SQUARE = 90.0  # degrees: phases are read against right angles
-_MOST_SQUARES = 5  # labels of more would touch: every second one is drawn
 _DB_PER_NEPER = 20 / np.log(10)
-_HIGHEST_PEAK = 100.0  # times the largest measured magnitude; without damping a peak has no end
-_WIDEST_BAR = 0.9  # of the magnitude: an error bar in decibels cannot reach down to zero
 
 
-def bode_figure(
-    response: FrequencyResponse, *, chain: Chain | None, position_unit: str, input_unit: str
-) -> Figure:
+def bode_figure(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
     """Return magnitude, phase (where measured) and what the fit leaves, one below the other.
 
     Zero magnitudes, which a logarithm cannot show, are left out.
     """
-    figure = bode_panels(response, chain=chain, position_unit=position_unit, input_unit=input_unit)
+    figure = bode_panels(response, chain=chain, units=units)
     legend_above(figure.axes[0])
     return figure
 
 
-def bode_panels(
-    response: FrequencyResponse, *, chain: Chain | None, position_unit: str, input_unit: str
-) -> Figure:
+def bode_panels(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
     """Return the figure without its legend, for who draws more into it."""
     response = _positive(response)
     has_phase = response.phase is not None
     heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
     figure, axes = panels(*heights)
     log_frequency_axis(axes[0], response.omega)
-    plot_magnitude(
-        axes[0], response, chain=chain, position_unit=position_unit, input_unit=input_unit
-    )
+    plot_magnitude(axes[0], response, chain=chain, units=units)
     if has_phase:
         plot_phase(axes[1], response, chain=chain)
     if chain:
@@ -71,8 +59,7 @@ def overview_figure(
     responses: Sequence[FrequencyResponse],
     *,
     chain: Chain | None,
-    position_unit: str,
-    input_unit: str,
+    units: Units,
 ) -> Figure:
     """Return the magnitudes of all carts in one panel: measured as points, the fit as lines."""
     responses = [_positive(response) for response in responses]
@@ -80,18 +67,19 @@ def overview_figure(
     every = np.concatenate([response.omega for response in responses])
     log_frequency_axis(ax, every)
     for response in responses:
-        style, name = (response.cart - 1) % len(CART_LINES), f"cart {response.cart}"
-        colour, ls = CART_COLOURS[style], CART_LINES[style]
+        name = f"cart {response.cart}"
+        colour, ls, *_ = CARTS[(response.cart - 1) % len(CARTS)]
         decibel = _decibel(response.magnitude)
         (points,) = ax.plot(response.omega, decibel, "D", ms=3.2, mew=0.8, mfc="white", mec=colour)
         tell(points, response.omega, decibel, name=f"{name}, measured")
         if chain:
             omega, line = _fitted(response, chain)
-            plot_line(ax, omega, line, name=f"{name}, fit", color=colour, ls=ls, in_legend=False)
+            look = {"color": colour, "ls": ls}
+            plot_line(ax, omega, line, look, name=f"{name}, fit", in_legend=False)
         ax.plot([], [], "D", ls=ls if chain else "", ms=3.2, mfc="white", color=colour, label=name)
     if chain:
         _mark_modes(ax, every, chain)
-    ax.set_ylabel(f"|X/U| [dB re 1 {position_unit}/{input_unit}]")
+    ax.set_ylabel(f"|X/U| [dB re 1 {units.gain}]")
     ax.set_xlabel("ω [rad/s]")
     legend_above(ax)
     return figure
@@ -102,11 +90,11 @@ def plot_magnitude(
     response: FrequencyResponse,
     *,
     chain: Chain | None,
-    position_unit: str,
-    input_unit: str,
+    units: Units,
 ) -> None:
     """Plot the magnitude in dB: diamonds with error bars, the fit as a line."""
-    relative = np.clip(response.magnitude_std / response.magnitude, 0.0, _WIDEST_BAR)
+    # An error bar in decibels cannot reach down to zero.
+    relative = np.clip(response.magnitude_std / response.magnitude, 0.0, 0.9)
     _points(
         ax,
         response.omega,
@@ -117,7 +105,7 @@ def plot_magnitude(
     if chain:
         ax.plot(*_fitted(response, chain), color=MODEL, label="fit")
         _mark_modes(ax, response.omega, chain)
-    ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {position_unit}/{input_unit}]")
+    ax.set_ylabel(f"|X{subscript(response.cart)}/U| [dB re 1 {units.gain}]")
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
@@ -137,11 +125,13 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
     )
     _points(ax, response.omega, np.degrees(phase), error)
     low, high = ax.dataLim.intervaly
-    margin = _MARGIN * max(high - low, _SQUARE)
+    margin = 0.08 * max(high - low, 90.0)
     bottom, top = ax.set_ylim(low - margin, high + margin)
-    labels = top // _SQUARE + -bottom // _SQUARE + 1
-    step = 0.5 if high - low <= _SQUARE else 1.0 if labels <= _MOST_SQUARES else 2.0
-    ax.yaxis.set_major_locator(MultipleLocator(step * _SQUARE))
+    # Phases are read against right angles; labels of more than five would touch.
+    labels = top // 90.0 + -bottom // 90.0 + 1
+    ax.yaxis.set_major_locator(
+        MultipleLocator(45.0 if high - low <= 90.0 else 90.0 if labels <= 5 else 180.0)
+    )
     ax.set_ylabel("phase [°]")
 
 
@@ -186,7 +176,7 @@ def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:
     """Return frequencies and the chain's magnitudes there in decibels."""
     omega = _dense(response.omega, chain)
     magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
-    highest = float(response.magnitude.max()) * _HIGHEST_PEAK
+    highest = 100.0 * float(response.magnitude.max())  # without damping a peak has no end
     return omega, _decibel(np.minimum(magnitude, highest))
 
 
@@ -194,7 +184,7 @@ def _dense(omega: Array, chain: Chain) -> Array:
     """Return a fine grid that also meets every resonance, so that sharp peaks are not cut."""
     low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
     modes = np.abs(chain.poles)
-    grid = np.geomspace(low, high, _LINE_POINTS)
+    grid = np.geomspace(low, high, 300)
     return np.unique(np.concatenate([grid, modes[(modes > low) & (modes < high)]]))
 
 

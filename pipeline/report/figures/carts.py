@@ -6,15 +6,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, Rectangle
 
 from pipeline.report.figures.style import MEASURED, MODEL, QUIET, WIDTH
-from pipeline.report.numbers import subscript
+from pipeline.words.numbers import subscript
 
 # Inches:
 _CART = 0.54  # width and height of a cart
-_REACH = 0.68  # length of an arrow
 _GAP = 0.05  # between an arrow and what it is called
-_ABOVE = 0.08  # from a cart to the arrow of its position
 _ROW = 0.9  # height of the figure for a cart
-_HEAD = 8.0  # size of an arrow's head, points
 
 
 def free_body_figure(springs: Sequence[bool]) -> Figure:
@@ -43,16 +40,17 @@ def _draw_cart(figure: Figure, i: int, springs: Sequence[bool], *, y: float) -> 
     )
     figure.add_artist(cart)
     _write(figure, middle, y, f"m{'' if n == 1 else subscript(i)}", "center")
-    top = y + half + _ABOVE
+    top = y + half + 0.08
     _arrow(figure, (middle - half / 2, top), half, colour=QUIET)
     _write(figure, middle + half / 2 + _GAP, top, _x(i), "left", colour=QUIET)
+    reach = 0.68  # length of an arrow
     for sign, forces in ((-1, _left_forces(i, springs)), (1, _right_forces(i, springs))):
         for k, label in enumerate(forces):
             level = y + (0.5 - (k + 0.5) / len(forces)) * _CART
             start = middle + sign * half
-            _arrow(figure, (start, level), sign * _REACH, colour=MODEL)
+            _arrow(figure, (start, level), sign * reach, colour=MODEL)
             side = "left" if sign > 0 else "right"
-            _write(figure, start + sign * (_REACH + _GAP), level, label, side)
+            _write(figure, start + sign * (reach + _GAP), level, label, side)
 
 
 def _left_forces(i: int, springs: Sequence[bool]) -> list[str]:
@@ -89,7 +87,7 @@ def _arrow(figure: Figure, start: tuple[float, float], length: float, *, colour:
         start,
         (start[0] + length, start[1]),
         arrowstyle="-|>",
-        mutation_scale=_HEAD,
+        mutation_scale=8.0,
         color=colour,
         lw=1.2,
         shrinkA=0,

@@ -7,34 +7,30 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
-from pipeline.gap.types import FoundEffect, Proposal, RecordGap, Residual, Trace
+from pipeline.gap.types import FoundEffect, Prediction, RecordGap, Residual, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce
 from pipeline.report.figures.style import (
     MEASURED,
     MODEL,
     QUIET,
     SECOND,
+    SECOND_LINE,
     SHADE,
     legend_above,
+    name_rows,
     panels,
     plot_measured,
     plot_model,
+    plot_points,
     plot_residuals,
     plot_second,
     position_label,
+    shorten,
 )
-from pipeline.report.numbers import subscript
-from pipeline.report.words import clean
+from pipeline.words.numbers import subscript
+from pipeline.words.text import clean
 
 ADDED = "with the effects"  # what the model with more than masses, dampings and springs is called
-_ROW = 0.19  # inches, of one run in the overview
-_LONGEST_NAME = 30
-_MOST_POINTS = 500  # of a cloud
-_EDGE = (0.15, 0.5)  # s shown before and after an edge of the input
-_SPECTRUM = 600  # frequencies, evenly spaced
-_BEYOND = 1.5  # times the frequency below which nearly all of the motion is
-_NEARLY_ALL = 0.995
-_ROOM = 1.06
 
 
 # ---------------------------------------------------------------------- in time
@@ -60,7 +56,7 @@ def before_after_figure(
     plot_measured(above, trace.t, trace.measured)
     for t, y in touched:
         above.axvspan(float(t[0]), float(t[-1]), color=SHADE, lw=0)
-        plot_measured(above, t, y, in_legend=False)
+        plot_points(above, t, y)
     (name, model), *others = models.items()
     for other, y in others:
         plot_second(above, trace.t, y, label=other)
@@ -74,16 +70,18 @@ def before_after_figure(
     return figure
 
 
-def predicted_figure(proposal: Proposal, *, names: tuple[str, str], position_unit: str) -> Figure:
+def predicted_figure(
+    prediction: Prediction, *, names: tuple[str, str], position_unit: str
+) -> Figure:
     """Return what a pair of explanations predicts of a recording, and how far they differ."""
     figure, (above, below) = panels(1.5, 1.0)
-    first, second = proposal.predicted[list(proposal.pair)]
+    first, second = prediction.positions[list(prediction.pair)]
     one, other = names
-    plot_model(above, proposal.t, first, label=one)
-    plot_second(above, proposal.t, second, label=other)
-    above.set_ylabel(position_label(proposal.cart, position_unit))
+    plot_model(above, prediction.t, first, label=one)
+    plot_second(above, prediction.t, second, label=other)
+    above.set_ylabel(position_label(prediction.cart, position_unit))
     legend_above(above)
-    plot_residuals(below, proposal.t, {"difference": second - first})
+    plot_residuals(below, prediction.t, {"difference": second - first})
     below.set_ylabel(f"difference [{position_unit}]")
     below.set_xlabel("time [s]")
     return figure
@@ -97,14 +95,10 @@ def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure
 
     `added` as in `before_after_figure`.
     """
-    figure, (ax,) = panels(_ROW * len(rows) + 0.1)
+    figure, (ax,) = panels(0.19 * len(rows) + 0.1)
     plot_by_record(ax, rows, added=added)
     legend_above(ax)
     ax.set_xlabel("error, share of the motion [%]")
-    # The names stand where the numbers of the axis would.
-    box = ax.get_position()
-    ax.set_position((0.36, box.y0, box.x1 - 0.36, box.height))
-    ax.xaxis.set_label_coords(0.5, -0.31 / (_ROW * len(rows) + 0.1))
     return figure
 
 
@@ -124,14 +118,9 @@ def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -
     every = np.concatenate([before, after, noise])
     every = every[every > 0]
     ax.set_xlim(every.min() / 1.4, every.max() * 1.4)
-    ax.set_ylim(y[-1] - 0.7, 0.7)
-    ax.yaxis.set_visible(False)
-    for at, row in zip(y, rows, strict=True):
-        name = clean(row.experiment)
-        short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
-        text = f"{short}, x{subscript(row.cart)}"
-        ax.text(-0.02, at, text, transform=ax.get_yaxis_transform(), fontsize=7.5, ha="right",
-                va="center", color=MEASURED if row.held_out else QUIET)  # fmt: skip
+    names = [f"{shorten(clean(row.experiment), most=30)}, x{subscript(row.cart)}" for row in rows]
+    colours = [MEASURED if row.held_out else QUIET for row in rows]
+    name_rows(ax, list(zip(names, colours, strict=True)))
 
 
 # ------------------------------------------------------------------- the force
@@ -184,7 +173,7 @@ def force_figure(
     plot_force(ax, shown, added=added)
     if axis == "input":
         reach = np.max(np.abs(np.concatenate([x for x, _, _ in shown])))
-        ax.plot([-reach, reach], [-reach, reach], color=SECOND, ls="--", lw=1.0, label="linear")
+        ax.plot([-reach, reach], [-reach, reach], label="linear", **SECOND_LINE)
     ax.set_xlabel(what)
     legend_above(ax)
     return figure
@@ -195,13 +184,13 @@ def plot_force(
 ) -> None:
     """Plot clouds of (x, measured, model): measured as points, the model's as smaller ones."""
     x, measured, model = (np.concatenate(parts) for parts in zip(*shown, strict=True))
-    order = np.linspace(0, x.size - 1, min(x.size, _MOST_POINTS)).astype(int)
+    order = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.axhline(0.0, color=QUIET, lw=0.6)
     ax.plot(x[order], measured[order], "o", ms=3.4, mfc="none", mec=MEASURED, mew=0.5,
             label="measured")  # fmt: skip
     ax.plot(x[order], model[order], ".", color=MODEL, ms=3.0, mew=0)
     ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label=added)  # for the legend
-    ax.set_xlim(*(_ROOM * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
+    ax.set_xlim(*(1.06 * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
 
 
 def force_left_figure(residual: Residual) -> Figure:
@@ -230,7 +219,7 @@ def timing_figure(
     steep = [float(np.max(np.abs(np.diff(f.u)) / np.diff(f.t))) for f in own]
     force = own[int(np.argmax(steep))]
     at = float(force.t[int(np.argmax(np.abs(np.diff(force.u))))])
-    kept = (force.t > at - _EDGE[0]) & (force.t < at + _EDGE[1])
+    kept = (force.t > at - 0.15) & (force.t < at + 0.5)
     figure, (ax,) = panels(1.8)
     measured = (force.measured + force.arriving)[kept]
     ax.plot(force.t[kept], measured, ".", color=MEASURED, ms=4.0, mew=0, label="measured")
@@ -261,14 +250,15 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
             pooled[i] += np.abs(spectrum / window.sum()) ** 2
     motion, before, after = np.sqrt(pooled)
     total = np.cumsum(motion**2)
-    end = _BEYOND * f[np.searchsorted(total, _NEARLY_ALL * total[-1])]
+    # Half as far again as nearly all of the motion goes.
+    end = 1.5 * f[np.searchsorted(total, 0.995 * total[-1])]
     shown = (f > 0) & (f <= max(end, 8 * f[1]))
-    step = max(1, int(np.count_nonzero(shown) / _SPECTRUM))
+    step = max(1, int(np.count_nonzero(shown) / 600))
     index = np.flatnonzero(shown)[::step]
     figure, (ax,) = panels(1.9)
     ax.set_yscale("log")
     ax.plot(f[index], motion[index], color=MEASURED, lw=0.8, ls=":", label="measured motion")
-    ax.plot(f[index], before[index], color=SECOND, ls="--", lw=1.0, label="residual, linear model")
+    ax.plot(f[index], before[index], label="residual, linear model", **SECOND_LINE)
     ax.plot(f[index], after[index], color=MODEL, lw=1.0, label=f"residual, {added}")
     ax.set_ylabel(f"amplitude [{position_unit}]")
     ax.set_xlabel("frequency [Hz]")

@@ -11,32 +11,27 @@ from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.figures.bode import bode_panels
 from pipeline.report.figures.style import (
-    LIFT,
     MEASURED,
     MODEL,
     SECOND,
+    SECOND_LINE,
+    SHADE,
     THIRD,
     legend_above,
     panels,
     plot_line,
+    shorten,
 )
 from pipeline.report.figures.svg import tell
 from pipeline.report.figures.time import decay_figure, step_figure
-from pipeline.report.words import clean
 from pipeline.results import FrequencyResponse, LogDecrement, Record, StepGain
-
-_BINS = 10
-_ROW = 0.2  # inches
-_LONGEST_NAME = 26  # letters, where the numbers of the axis would stand
-_LINE_POINTS = 300
-_CURVE_POINTS = 2000
-_FASTEST = 10.0  # times the measured frequency: hertz taken for rad/s, and the other way, are seen
-_WIDEST = 30.0  # dB that the reported curve may stick out above and below what was measured
+from pipeline.set_up import Units
+from pipeline.words.text import clean
 
 
 def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
     """Return how many submissions have how many points: a bar for each tenth of them."""
-    counts, edges = np.histogram(points, bins=_BINS, range=(0.0, out_of))
+    counts, edges = np.histogram(points, bins=10, range=(0.0, out_of))
     centres = (edges[:-1] + edges[1:]) / 2
     figure, (ax,) = panels(1.5)
     ax.bar(centres, counts, width=0.94 * np.diff(edges), color=MODEL)
@@ -50,30 +45,54 @@ def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
     return figure
 
 
-def difficulty_figure(names: Sequence[str], shares: Array) -> Figure:
-    """Return the mean share of the points that each criterion earned, in percent.
+def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Figure:
+    """Return how many submissions have how much of the points, now and under another rubric.
+
+    Parameters
+    ----------
+    before, after : of each tenth of the points, from the lowest on.
+    """
+    edges = np.linspace(0.0, 100.0, len(before) + 1)
+    width = 0.42 * (edges[1] - edges[0])
+    centres = (edges[:-1] + edges[1:]) / 2
+    figure, (ax,) = panels(1.7)
+    ax.bar(centres - width / 2, before, width=width, color="none", edgecolor=MEASURED, lw=1.0,
+           label="now")  # fmt: skip
+    ax.bar(centres + width / 2, after, width=width, color=MODEL, label="with this rubric")
+    ax.set_xlim(0.0, 100.0)
+    ax.set_ylim(0.0, 1.08 * max(1, *before, *after))
+    ax.yaxis.set_major_locator(MaxNLocator(nbins=4, integer=True))
+    ax.set_xlabel("share of the points [%]")
+    ax.set_ylabel("submissions")
+    legend_above(ax)
+    return figure
+
+
+def difficulty_figure(titles: Sequence[str], shares: Array) -> Figure:
+    """Return the mean share of the points that each criterion earned: a bar under each title.
 
     Parameters
     ----------
     shares : (n,), between 0 and 1.
     """
-    tall = _ROW * len(names) + 0.1
-    figure, (ax,) = panels(tall)
-    y = -np.arange(len(names), dtype=float)
-    ax.hlines(y, 0.0, 100.0, color="#ececec", lw=6.0)
-    ax.hlines(y, 0.0, 100 * shares, color=MODEL, lw=6.0)
+    figure, (ax,) = panels(0.32 * len(titles) + 0.05)
+    y = -np.arange(len(titles), dtype=float)
+    ax.hlines(y, 0.0, 100.0, color=SHADE, lw=5.0)
+    ax.hlines(y, 0.0, 100 * shares, color=MODEL, lw=5.0)
+    for level, title, share in zip(y, titles, shares, strict=True):
+        for x, ha, text in (
+            (0.0, "left", shorten(clean(title), most=66)),
+            (100.0, "right", f"{100 * share:.0f}\u00a0%"),
+        ):
+            ax.annotate(text, (x, level), xytext=(0.0, 4.0), textcoords="offset points",
+                        ha=ha, va="bottom", color=MEASURED)  # fmt: skip
     ax.set_xlim(0.0, 100.0)
-    ax.set_ylim(y[-1] - 0.7, 0.7)
+    ax.set_ylim(y[-1] - 0.3, 0.75)
     ax.yaxis.set_visible(False)
     ax.spines["left"].set_visible(False)
-    for at, name in zip(y, map(clean, names), strict=True):
-        short = name if len(name) <= _LONGEST_NAME else f"{name[: _LONGEST_NAME - 1]}…"
-        ax.text(-0.02, at, short, transform=ax.get_yaxis_transform(), fontsize=7.5, ha="right",
-                va="center", color=MEASURED)  # fmt: skip
     box = ax.get_position()
-    ax.set_position((0.36, box.y0, box.x1 - 0.36, box.height))
+    ax.set_position((0.03, box.y0, 0.94, box.height))
     ax.set_xlabel("mean share of the points [%]")
-    ax.xaxis.set_label_coords(0.5, -0.31 / tall)
     return figure
 
 
@@ -82,22 +101,22 @@ def reported_bode_figure(
     *,
     chain: Chain | None,
     reported: tuple[Array, Sequence[Array]] | None,
-    units: tuple[str, str],
+    units: Units,
 ) -> Figure:
     """Return the measured response of one cart, the fit, and the curve of reported parameters.
 
     Parameters
     ----------
     reported : what reported parameters stand for, see `transfer_functions`; None draws no curve.
-    units : of position and input.
     """
-    figure = bode_panels(response, chain=chain, position_unit=units[0], input_unit=units[1])
+    figure = bode_panels(response, chain=chain, units=units)
     ax = figure.axes[0]
     if reported is not None:
         low, high = ax.get_ylim()
-        omega = np.geomspace(*ax.get_xlim(), _LINE_POINTS)
+        omega = np.geomspace(*ax.get_xlim(), 300)
         decibel = reported_magnitude(omega, cart=response.cart, reported=reported)
-        seen = np.abs(decibel - (low + high) / 2) < (high - low) / 2 + _WIDEST
+        # The curve may stick out 30 dB above and below what was measured.
+        seen = np.abs(decibel - (low + high) / 2) < (high - low) / 2 + 30.0
         if seen.any():
             ax.plot(omega[seen], decibel[seen], color=SECOND, ls="--", label="your numbers")
             ax.set_ylim(min(low, decibel[seen].min()), max(high, decibel[seen].max()))
@@ -142,19 +161,21 @@ def reported_decay_figure(
     figure = decay_figure([decay], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
     omega, zeta = reported
-    if 0 <= zeta < 1 and 0 < omega < _FASTEST * decay.omega_n:
-        t = np.linspace(decay.peak_t[0], decay.fit_t[-1], _CURVE_POINTS)
+    # Ten times: hertz taken for rad/s, and the other way, are still seen.
+    if 0 <= zeta < 1 and 0 < omega < 10.0 * decay.omega_n:
+        t = np.linspace(decay.peak_t[0], decay.fit_t[-1], 2000)
         rest = (decay.envelope_upper[-1] + decay.envelope_lower[-1]) / 2
         since = omega * (t - t[0])
         swing = np.exp(-zeta * since) * np.cos(np.sqrt(1 - zeta**2) * since)
         y = rest + (decay.peak_y[0] - rest) * swing
-        plot_line(ax, t - decay.release, y, name="your numbers", color=THIRD, ls="--", lw=1.0)
+        look = SECOND_LINE | {"color": THIRD}
+        plot_line(ax, t - decay.release, y, look, name="your numbers")
     return _titled(figure, ax, title)
 
 
 def _titled(figure: Figure, ax: Axes, title: str) -> Figure:
     ax.set_title(f"{ax.get_title(loc='left')}: {title}", loc="left")
-    legend_above(ax, columns=5, lift=LIFT)
+    legend_above(ax, columns=5)
     return figure
 
 

@@ -19,8 +19,8 @@ from matplotlib.path import Path
 
 from pipeline.arrays import Array
 from pipeline.report.figures.svg import tell
-from pipeline.report.numbers import subscript
-from pipeline.report.words import clean
+from pipeline.words.numbers import subscript
+from pipeline.words.text import clean
 
 WIDTH = 5.2  # inches: as wide as a page of text, on a phone three quarters of it
 MEASURED = "#222222"
@@ -29,24 +29,18 @@ SECOND = "#d55e00"
 THIRD = "#009e73"
 QUIET = "#8a8a8a"
 SHADE = "#ececec"
-CART_LINES = ("-", "--", "-.", ":")  # carts that share a panel differ by line style as well
-CART_MARKS = {"o": "circles", "s": "squares", "^": "triangles", "D": "diamonds"}  # and points so
-CART_COLOURS = (MODEL, SECOND, THIRD, MEASURED)
+# Carts that share a panel: colour, line, mark of single points, and what the mark is called.
+CARTS = (
+    (MODEL, "-", "o", "circles"),
+    (SECOND, "--", "s", "squares"),
+    (THIRD, "-.", "^", "triangles"),
+    (MEASURED, ":", "D", "diamonds"),
+)
 
-_BUCKETS = 240  # twice this many points a line: finer than print at this width shows
-_MOST_POINTS = 200  # of one record: more would hide the line of the model
-# Inches:
-_LEFT, _RIGHT = 0.62, 0.12  # for tick labels and axis titles
-_TOP, _BOTTOM = 0.26, 0.47  # for a legend or a title above, tick labels and title below
-_SHARED_GAP, _OWN_GAP = 0.13, 0.53  # between panels on one time axis, or each with its own
-_X_LABEL, _Y_LABEL = 0.31, 0.46  # from the axes to the middle of their titles
-_COLUMN_GAP, _TITLE_GAP = 0.5, 0.24
-LIFT = 0.22  # of a legend above the titles of panels
-_MOST_COLUMNS = 3
-_TITLE_LETTERS = 60  # side by side, over the whole width
-_DOT = 2.2  # points
-_STROKE = 1e-4  # of the time span
+Look = dict[str, Any]  # of a line: colour, kind, width (points), by matplotlib's names
+SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}
 
+_LIFT = 0.22  # inches, of a legend above the titles of panels
 _STYLE: dict[Any, Any] = {
     "font.family": ["DejaVu Sans"],  # comes with matplotlib, so the PDF has it too
     "font.size": 8.5,
@@ -77,78 +71,33 @@ def drawing() -> Iterator[None]:
         yield
 
 
-def panels(*heights: float, columns: int = 1, share_x: bool = True) -> tuple[Figure, list[Axes]]:
+def panels(
+    *heights: float,
+    columns: int = 1,
+    share_x: bool = True,
+    share_y: bool = False,
+    titled: bool = False,
+) -> tuple[Figure, list[Axes]]:
     """Return a figure with rows of the given heights (inches), its axes row by row.
 
     Margins are set in inches, not searched for: a search draws every figure twice. Panels that
     do not share their time axis each get room for tick labels and a title.
     """
-    return _grid(
-        heights,
-        columns,
-        gap=_SHARED_GAP if share_x else _OWN_GAP,
-        column_gap=_COLUMN_GAP,
-        top=_TOP,
-        share_x=share_x,
-        share_y=False,
-    )
-
-
-def small_multiples(
-    titles: Sequence[str], *, height: float, share_y: bool
-) -> tuple[Figure, list[Axes]]:
-    """Return a panel under each title, on one time axis: repeats are seen to be alike, or not."""
-    columns = min(len(titles), _MOST_COLUMNS)
-    if len(titles) == _MOST_COLUMNS + 1:  # two and two
-        columns -= 1
-    rows = -(-len(titles) // columns)
-    figure, axes = _grid(
-        [height] * rows,
-        columns,
-        gap=_TITLE_GAP,
-        column_gap=_SHARED_GAP if share_y else _COLUMN_GAP,
-        top=_TOP + LIFT,
-        share_x=True,
-        share_y=share_y,
-    )
-    for spare in axes[len(titles) :]:
-        figure.delaxes(spare)
-    for ax, title in zip(axes, _short(titles, most=_TITLE_LETTERS // columns), strict=False):
-        ax.set_title(title, loc="left", y=1.0)
-    return figure, axes[: len(titles)]
-
-
-def _short(titles: Sequence[str], *, most: int) -> list[str]:
-    """Return titles of so many letters; long ones lose first what they all begin with."""
-    titles = [clean(title) for title in titles]
-    if len(titles) > 1 and max(map(len, titles)) > most:
-        pairs = zip(min(titles), max(titles), strict=False)  # what these two share, all do
-        same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
-        titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
-    return [title if len(title) <= most else f"{title[: most - 1]}…" for title in titles]
-
-
-def _grid(
-    heights: Sequence[float],
-    columns: int,
-    *,
-    gap: float,
-    column_gap: float,
-    top: float,
-    share_x: bool,
-    share_y: bool,
-) -> tuple[Figure, list[Axes]]:
-    height = sum(heights) + gap * (len(heights) - 1) + top + _BOTTOM
-    width = (WIDTH - _LEFT - _RIGHT - column_gap * (columns - 1)) / columns
+    left, right, bottom = 0.62, 0.12, 0.47  # inches, for tick labels and axis titles
+    top = 0.26 + (_LIFT if titled else 0.0)  # for a legend
+    gap = 0.24 if titled else 0.13 if share_x else 0.53
+    column_gap = 0.13 if share_y else 0.5
+    height = sum(heights) + gap * (len(heights) - 1) + top + bottom
+    width = (WIDTH - left - right - column_gap * (columns - 1)) / columns
     figure = Figure(figsize=(WIDTH, height))
     grid = figure.add_gridspec(
         len(heights),
         columns,
         height_ratios=heights,
-        left=_LEFT / WIDTH,
-        right=1 - _RIGHT / WIDTH,
+        left=left / WIDTH,
+        right=1 - right / WIDTH,
         top=1 - top / height,
-        bottom=_BOTTOM / height,
+        bottom=bottom / height,
         hspace=gap * len(heights) / sum(heights),
         wspace=column_gap / width,
     )
@@ -162,10 +111,51 @@ def _grid(
                 sharey=first if share_y else None,
             )
             # Given places for labels save a search among all tick labels, and line them up.
-            ax.yaxis.set_label_coords(-_Y_LABEL / width, 0.5)
-            ax.xaxis.set_label_coords(0.5, -_X_LABEL / heights[row])
+            ax.yaxis.set_label_coords(-0.46 / width, 0.5)
+            ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
             axes.append(ax)
     return figure, axes
+
+
+def small_multiples(
+    titles: Sequence[str], *, height: float, share_y: bool
+) -> tuple[Figure, list[Axes]]:
+    """Return a panel under each title, on one time axis: repeats are seen to be alike, or not."""
+    columns = 2 if len(titles) == 4 else min(len(titles), 3)
+    rows = -(-len(titles) // columns)
+    figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)
+    for spare in axes[len(titles) :]:
+        figure.delaxes(spare)
+    # Side by side, 60 letters fill the whole width.
+    for ax, title in zip(axes, _short(titles, most=60 // columns), strict=False):
+        ax.set_title(title, loc="left", y=1.0)
+    return figure, axes[: len(titles)]
+
+
+def _short(titles: Sequence[str], *, most: int) -> list[str]:
+    """Return titles of so many letters; long ones lose first what they all begin with."""
+    titles = [clean(title) for title in titles]
+    if len(titles) > 1 and max(map(len, titles)) > most:
+        pairs = zip(min(titles), max(titles), strict=False)  # what these two share, all do
+        same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+        titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
+    return [shorten(title, most=most) for title in titles]
+
+
+def shorten(text: str, *, most: int) -> str:
+    """Return a text of at most so many letters, an ellipsis for what is cut off."""
+    return text if len(text) <= most else f"{text[: most - 1]}…"
+
+
+def name_rows(ax: Axes, rows: Sequence[tuple[str, str]]) -> None:
+    """Write names in colours where the numbers of the axis would stand; row i lies at y = -i."""
+    ax.set_ylim(1 - len(rows) - 0.7, 0.7)
+    ax.yaxis.set_visible(False)
+    for i, (name, colour) in enumerate(rows):
+        ax.text(-0.02, -i, name, transform=ax.get_yaxis_transform(), fontsize=7.5, ha="right",
+                va="center", color=colour)  # fmt: skip
+    box = ax.get_position()
+    ax.set_position((0.36, box.y0, box.x1 - 0.36, box.height))
 
 
 def log_frequency_axis(ax: Axes, omega: Array) -> None:
@@ -174,11 +164,12 @@ def log_frequency_axis(ax: Axes, omega: Array) -> None:
     ax.set_xlim(0.9 * float(omega.min()), 1.1 * float(omega.max()))
 
 
-def legend_above(ax: Axes, *, columns: int = 4, lift: float = 0.0) -> None:
-    """Put the legend above the axes, where it hides no data; `lift` (inches) clears a title."""
+def legend_above(ax: Axes, *, columns: int = 4) -> None:
+    """Put the legend above the axes and their title, where it hides no data."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     tall = ax.get_position().height * figure.get_size_inches()[1]
+    lift = _LIFT if ax.get_title(loc="left") else 0.0
     handles, labels = ax.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] != "measured")  # first what is
     ax.legend(
@@ -199,33 +190,40 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
 
     What the eye sees stays: every peak, and the envelope of what is too fast to see.
     """
-    if t.size <= 2 * _BUCKETS:
+    buckets = 240  # twice this many points a line: finer than print at this width shows
+    if t.size <= 2 * buckets:
         return t, y
-    starts = np.linspace(0, t.size, _BUCKETS + 1).astype(int)[:-1]
-    size = int(np.ceil(t.size / _BUCKETS)) + 1
+    starts = np.linspace(0, t.size, buckets + 1).astype(int)[:-1]
+    size = int(np.ceil(t.size / buckets)) + 1
     index = np.minimum(
         starts[:, None] + np.arange(size), np.append(starts[1:], t.size)[:, None] - 1
     )
     values = y[index]
-    rows = np.arange(_BUCKETS)
+    rows = np.arange(buckets)
     least, most = index[rows, values.argmin(1)], index[rows, values.argmax(1)]
     keep = np.unique(np.concatenate([least, most]))
     return t[keep], y[keep]
 
 
-def plot_measured(
+def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = 200) -> None:
+    """Draw a measured time series as points, and a point in the legend."""
+    plot_points(ax, t, y, most=most)
+    ax.plot([], [], ".", color=MEASURED, ms=3 * 2.2, mew=0, label="measured")
+
+
+def plot_points(
     ax: Axes,
     t: Array,
     y: Array,
     *,
-    most: int = _MOST_POINTS,
+    most: int = 200,
     name: str = "measured",
     color: str = MEASURED,
-    in_legend: bool = True,
 ) -> None:
-    """Draw a measured time series as points, of a long one `most` spread evenly.
+    """Draw a time series as points, of a long one `most` spread evenly.
 
-    They lie below the lines of models, which are thinner: both are seen where they agree.
+    More would hide the line of the model. They lie below the lines of models, which are thinner:
+    both are seen where they agree.
     """
     shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
     # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
@@ -233,50 +231,39 @@ def plot_measured(
     # all.) Added as an artist, or matplotlib walks every stroke.
     points = np.column_stack([t[shown], y[shown]])
     strokes = points.repeat(2, axis=0)
-    strokes[1::2, 0] += _STROKE * (points[-1, 0] - points[0, 0])
+    strokes[1::2, 0] += 1e-4 * (points[-1, 0] - points[0, 0])
     path = Path(strokes, np.tile([Path.MOVETO, Path.LINETO], shown.size))
-    dots = PathPatch(path, fill=False, color=color, lw=_DOT, capstyle="round", zorder=1.9)
+    dots = PathPatch(path, fill=False, color=color, lw=2.2, capstyle="round", zorder=1.9)
     tell(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
     ax.autoscale_view()  # a patch does not ask for it, and nothing else may be drawn here
-    if in_legend:
-        ax.plot([], [], ".", color=color, ms=3 * _DOT, mew=0, label=name)
 
 
 def plot_line(
-    ax: Axes,
-    t: Array,
-    y: Array,
-    *,
-    name: str,
-    color: str = MODEL,
-    ls: str = "-",
-    lw: float = 1.2,
-    in_legend: bool = True,
+    ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
 ) -> None:
-    """Draw a long line as thin as the eye cannot tell; a reader who zooms gets all of it."""
-    label = name if in_legend else None
-    (line,) = ax.plot(*thin(t, y), color=color, ls=ls, lw=lw, label=label)
+    """Draw a long line thinned to what the eye can resolve; a reader who zooms gets all of it."""
+    (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
     tell(line, t, y, name=name)
 
 
 def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
     """Draw a model as a line."""
-    plot_line(ax, t, y, name=label, lw=1.0)
+    plot_line(ax, t, y, {"color": MODEL, "lw": 1.0}, name=label)
 
 
 def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
     """Draw what a model is set against: another model, the same without effects."""
-    plot_line(ax, t, y, name=label, color=SECOND, ls="--", lw=1.0)
+    plot_line(ax, t, y, SECOND_LINE, name=label)
 
 
 def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
     """Draw the residuals of one or two models, by their names, in the models' colours."""
     ax.axhline(0.0, color=QUIET, lw=0.6)
-    looks = ((MODEL, "-"), (SECOND, "--"))
-    for (name, y), (colour, ls) in zip(residuals.items(), looks, strict=False):
-        plot_line(ax, t, y, name=name, color=colour, ls=ls, lw=0.8, in_legend=False)
+    looks = ({"color": MODEL, "lw": 0.8}, SECOND_LINE | {"lw": 0.8})
+    for (name, y), look in zip(residuals.items(), looks, strict=False):
+        plot_line(ax, t, y, look, name=name, in_legend=False)
 
 
 def keep_in_sight(ax: Axes, measured: Array) -> None:

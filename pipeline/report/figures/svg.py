@@ -18,22 +18,16 @@ from pipeline.report.figures.ticks import TAGS, draw_ticks
 
 _POINTS = 72.0  # units of the drawing in an inch
 _SAME = 1e-6  # of the figure
-_HUGE = 1e38  # the largest that float32 holds; only a model that runs away gets there
-_EVEN = 1e-5  # of the whole span: nobody sees a sample stand that far off
-_FINEST = 2  # decimals of a position on the page, in points
 
 # Names that matplotlib gives to groups: nobody refers to them, and each page needs them once.
 _GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
 _TAG = re.compile(rf' id="({"|".join(TAGS)})"')
 _TOLD = re.compile(r""" id=(["'])(\{.*?\})\1""")
-_DATA = re.compile(r' data-[a-z]+="[^"]*"')
-_HEADER = re.compile(r"^.*?(?=<svg )", re.DOTALL)
-_METADATA = re.compile(r"\s*<metadata>.*?</metadata>", re.DOTALL)
 
 
 def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
     """Give a drawn series a name and its whole data, which the drawing itself may thin out."""
-    artist.set_gid(json.dumps({"name": name, "x": _packed_time(x), "y": _packed(y)}))
+    artist.set_gid(json.dumps({"name": name, "x": packed_time(x), "y": _packed(y)}))
 
 
 def to_svg(figure: Figure, *, name: str, alt: str) -> str:
@@ -65,7 +59,8 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": name}):
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
-    svg = _METADATA.sub("", _HEADER.sub("", buffer.getvalue()))
+    svg = "<svg " + buffer.getvalue().partition("<svg ")[2]
+    svg = re.sub(r"\s*<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
     svg = _GROUP_ID.sub("", svg).replace("'DejaVu Sans'", "'DejaVu Sans', sans-serif")
     svg = _TOLD.sub(_attributes, _TAG.sub(r' class="\1"', svg))
     title = f"<title>{escape(alt, quote=False)}</title>"
@@ -74,7 +69,7 @@ def to_svg(figure: Figure, *, name: str, alt: str) -> str:
 
 def plain_svg(svg: str) -> str:
     """Return the drawing without the data, for print and for files of its own."""
-    return _DATA.sub("", svg)
+    return re.sub(r' data-[a-z]+="[^"]*"', "", svg)
 
 
 def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
@@ -85,7 +80,7 @@ def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
     at = ax.get_position()
     box = (at.x0 * width, (1 - at.y1) * height, at.width * width, at.height * height)
     return {
-        "box": [round(float(v), _FINEST) for v in box],
+        "box": [round(float(v), 2) for v in box],
         "x": [float(v) for v in ax.get_xlim()],
         "y": [float(v) for v in ax.get_ylim()],
         "log": [ax.get_xscale() == "log", ax.get_yscale() == "log"],
@@ -95,16 +90,18 @@ def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
 
 def _packed(values: Array) -> str:
     """Return numbers as base64 of little-endian float32: seven digits in five characters."""
-    shown = np.clip(np.asarray(values, dtype=float), -_HUGE, _HUGE)
+    # The largest that float32 holds; only a model that runs away gets there.
+    shown = np.clip(np.asarray(values, dtype=float), -1e38, 1e38)
     return b64encode(shown.astype("<f4").tobytes()).decode()
 
 
-def _packed_time(values: Array) -> str:
+def packed_time(values: Array) -> str:
     """Return evenly spaced numbers as "first last", others packed."""
     if values.size < 2:
         return _packed(values)
     even = np.linspace(values[0], values[-1], values.size)
-    if np.max(np.abs(values - even)) > _EVEN * abs(even[-1] - even[0]):
+    # Nobody sees a sample stand off by less than this share of the whole span.
+    if np.max(np.abs(values - even)) > 1e-5 * abs(even[-1] - even[0]):
         return _packed(values)
     return f"{float(values[0]):.9g} {float(values[-1]):.9g}"
 

@@ -14,15 +14,7 @@ from pipeline.arrays import Array
 # What a page that zooms draws anew or moves: grids, tick labels, letters that mark a place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
 GRID = "#e4e4e4"
-_OWN = (MultipleLocator, MaxNLocator)  # what a figure asks for: right angles, whole numbers
 _SIZE = 7.5  # points, of the labels
-_PAD = 3.5 / 72  # inches, between axis and label
-_SPACING = (0.45, 0.18)  # inches at least between ticks along x and along y
-_STEPS = (1.0, 2.0, 5.0, 10.0)
-_LOG_FACTORS = ((200.0, (1.0,)), (7.0, (1.0, 2.0, 5.0)), (0.0, (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0)))
-_FEW = 6  # on a logarithmic axis too short for 1, 2, 5
-_ROUNDING = 1e-9  # of a step
-_PLAIN = 4  # decimals, or digits before the point, beyond which powers of ten are clearer
 
 
 def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
@@ -36,9 +28,10 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
             continue
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
-        most = max(2, int(size / _SPACING[direction]))
+        most = max(2, int(size / (0.45, 0.18)[direction]))  # inches at least between ticks
         own = axis.get_major_locator()
-        if type(own) in _OWN:
+        # What a figure asks for itself: right angles, whole numbers.
+        if type(own) in (MultipleLocator, MaxNLocator):
             ticks = np.asarray(own())
             ticks = ticks[(ticks >= low) & (ticks <= high)]
         elif scale == "log":
@@ -49,9 +42,9 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
             set_locator(NullLocator())
         _grid(ax, ticks, direction=direction)
         if (label_x, label_y)[direction]:
-            shift = ScaledTranslation(
-                *((0.0, -_PAD) if direction == 0 else (-_PAD, 0.0)), figure.dpi_scale_trans
-            )
+            pad = -3.5 / 72  # inches
+            away = (0.0, pad) if direction == 0 else (pad, 0.0)
+            shift = ScaledTranslation(*away, figure.dpi_scale_trans)
             _labels(ax, ticks, direction=direction, shift=shift)
 
 
@@ -80,9 +73,9 @@ def linear_ticks(low: float, high: float, *, most: int) -> Array:
     """Return at least two round numbers between two limits, and no more than `most` if it can."""
     magnitude = 10.0 ** np.floor(np.log10((high - low) / most))
     ticks = np.array([low, high])
-    for factor in _STEPS:  # from fine to coarse
+    for factor in (1.0, 2.0, 5.0, 10.0):  # from fine to coarse
         step = factor * magnitude
-        first, last = np.ceil(low / step - _ROUNDING), np.floor(high / step + _ROUNDING)
+        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)  # rounding
         if last - first < 1:
             break
         ticks = step * np.arange(first, last + 1)
@@ -94,10 +87,11 @@ def linear_ticks(low: float, high: float, *, most: int) -> Array:
 def log_ticks(low: float, high: float) -> Array:
     """Return 1, 2, 5, 10 … between two limits; fewer over many decades, more within one."""
     exponents = np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    factors = next(f for span, f in _LOG_FACTORS if high > span * low)
+    factors = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0) if high <= 7 * low else (1.0, 2.0, 5.0)
+    factors = (1.0,) if high > 200 * low else factors
     ticks = np.sort(np.outer(10.0**exponents, factors).ravel())
     inside = ticks[(ticks >= low) & (ticks <= high)]
-    return inside if inside.size > 1 else linear_ticks(low, high, most=_FEW)
+    return inside if inside.size > 1 else linear_ticks(low, high, most=6)
 
 
 def tick_labels(ticks: Array) -> list[str]:
@@ -106,7 +100,7 @@ def tick_labels(ticks: Array) -> list[str]:
         return []
     step = np.min(np.diff(ticks)) if ticks.size > 1 else abs(ticks[0]) or 1.0
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    if decimals > _PLAIN or np.abs(ticks).max() >= 10.0 ** (_PLAIN + 2):
+    if decimals > 4 or np.abs(ticks).max() >= 1e6:  # powers of ten are clearer
         texts = [f"{tick + 0.0:.3g}" for tick in ticks]
     elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # logarithmic
         texts = [f"{tick:g}" for tick in ticks]

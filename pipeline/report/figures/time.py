@@ -9,14 +9,11 @@ from matplotlib.figure import Figure
 
 from pipeline.arrays import Array
 from pipeline.report.figures.style import (
-    CART_COLOURS,
-    CART_LINES,
-    CART_MARKS,
-    LIFT,
+    CARTS,
     MEASURED,
     MODEL,
     QUIET,
-    SECOND,
+    SECOND_LINE,
     SHADE,
     THIRD,
     keep_in_sight,
@@ -25,14 +22,13 @@ from pipeline.report.figures.style import (
     plot_line,
     plot_measured,
     plot_model,
+    plot_points,
     plot_residuals,
     plot_second,
     position_label,
     small_multiples,
 )
 from pipeline.report.figures.svg import tell
-from pipeline.report.numbers import subscript
-from pipeline.report.words import clean
 from pipeline.results import (
     FeedbackDesign,
     HardwareCheck,
@@ -41,17 +37,13 @@ from pipeline.results import (
     SinePoint,
     StepGain,
 )
+from pipeline.set_up import Units
+from pipeline.words.numbers import subscript
+from pipeline.words.text import clean
 
 _CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
-_SINE_POINTS = 300
-_STEP_POINTS = 400  # several panels a figure: enough to follow a swing
-_STEP_MARKS = 16  # of each cart: enough to know it without its colour
-_SETTLED_BAND = 0.02  # the 2 % of the settling time
-_ROOM = 1.12  # above the largest value
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
 _SMALL = 1.15  # inches, the height of a panel among many
-_ALIKE = 4.0  # times the smallest motion: larger ones are drawn on a scale of their own
-_AROUND = (0.15, 0.25)  # of a decay's length, shown before and after it
 
 
 # --------------------------------------------------------------------- decays
@@ -68,21 +60,20 @@ def decay_figure(
     for ax, decay, record in zip(axes, decays, records, strict=True):
         plot_decay(ax, decay, record=record)
     label_outer(axes, x="time [s]", y=position_label(decays[0].cart, position_unit))
-    legend_above(axes[0], lift=LIFT)
+    legend_above(axes[0])
     return figure
 
 
 def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
     """Plot one decay and what is near it: record, fit, envelope, and the extrema used."""
     fit_t, zero = decay.fit_t - decay.release, decay.release
-    before, after = (share * (fit_t[-1] - fit_t[0]) for share in _AROUND)
-    t = record.t - zero
-    shown = (t >= min(fit_t[0], 0.0) - before) & (t <= fit_t[-1] + after)
+    t, length = record.t - zero, fit_t[-1] - fit_t[0]
+    shown = (t >= min(fit_t[0], 0.0) - 0.15 * length) & (t <= fit_t[-1] + 0.25 * length)
     t, y = t[shown], record.position(decay.cart)[shown]
     plot_measured(ax, t, y)
     for envelope, label in ((decay.envelope_upper, "envelope"), (decay.envelope_lower, "")):
-        plot_line(ax, fit_t, envelope, name=label or "envelope below", color=SECOND, ls="--",
-                  lw=0.9, in_legend=bool(label))  # fmt: skip
+        plot_line(ax, fit_t, envelope, SECOND_LINE | {"lw": 0.9},
+                  name=label or "envelope below", in_legend=bool(label))  # fmt: skip
     plot_model(ax, fit_t, decay.fit_y, label="fit")
     ax.plot(decay.peak_t - zero, decay.peak_y, "D", ms=3.0, mfc="none", mec=MEASURED, mew=0.8,
             label="extrema used")  # fmt: skip
@@ -101,8 +92,8 @@ def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Fig
         ax.set_title(f"cart {cart}", loc="left", y=1.0)
         ax.set_xlabel(f"swing [{position_unit}]")
         most = np.max([decay.zeta_at_amplitude.max(axis=1) for decay in own], axis=0)
-        ax.set_xlim(0.0, _ROOM * most[0])
-        ax.set_ylim(0.0, _ROOM * most[1])
+        ax.set_xlim(0.0, 1.12 * most[0])
+        ax.set_ylim(0.0, 1.12 * most[1])
     axes[0].set_ylabel("ζ")
     return figure
 
@@ -132,7 +123,7 @@ def step_figure(
     for ax, gains, record in zip(axes, steps, records, strict=True):
         plot_step(ax, gains, record=record)
     label_outer(axes, x="time [s]", y=f"position [{position_unit}]")
-    legend_above(axes[0], columns=5, lift=LIFT)
+    legend_above(axes[0], columns=5)
     return figure
 
 
@@ -156,21 +147,19 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
 
 def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
     """Plot the points of one of several carts that share a panel, some with its own mark."""
-    style, name = (cart - 1) % len(CART_MARKS), f"x{subscript(cart)}"
-    plot_measured(ax, t, y, most=_STEP_POINTS, name=name, color=CART_COLOURS[style],
-                  in_legend=False)  # fmt: skip
-    # Every cart's marks at times of their own, or where carts move alike one would hide the other:
-    at = np.linspace(0, t.size - 1, len(CART_MARKS) * _STEP_MARKS).astype(int)
-    at = at[style :: len(CART_MARKS)]
-    ax.plot(t[at], y[at], list(CART_MARKS)[style], ms=3.6, mfc="white", mec=CART_COLOURS[style],
-            mew=0.9, label=name)  # fmt: skip
+    style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
+    colour, _, mark, _ = CARTS[style]
+    plot_points(ax, t, y, most=400, name=name, color=colour)
+    # Every cart's marks, 16 each, at times of their own, or where carts move alike one would hide
+    # the other:
+    at = np.linspace(0, t.size - 1, 16 * len(CARTS)).astype(int)[style :: len(CARTS)]
+    ax.plot(t[at], y[at], mark, ms=3.6, mfc="white", mec=colour, mew=0.9, label=name)
 
 
 def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:
     """Plot one of several carts that share a panel: its colour, and its own kind of line."""
-    style = (cart - 1) % len(CART_LINES)
-    plot_line(ax, t, y, name=f"x{subscript(cart)}", color=CART_COLOURS[style],
-              ls=CART_LINES[style], lw=lw)  # fmt: skip
+    colour, ls, *_ = CARTS[(cart - 1) % len(CARTS)]
+    plot_line(ax, t, y, {"color": colour, "ls": ls, "lw": lw}, name=f"x{subscript(cart)}")
 
 
 # ---------------------------------------------------------------------- sines
@@ -195,8 +184,8 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
     shown = record.t <= end
     t, y = record.t[shown], record.position(point.cart)[shown]
     steady = t >= point.steady_from
-    plot_line(ax, t, y, name="record", color=QUIET, lw=0.7, in_legend=False)
-    plot_measured(ax, t, y, most=_SINE_POINTS)
+    plot_line(ax, t, y, {"color": QUIET, "lw": 0.7}, name="record", in_legend=False)
+    plot_measured(ax, t, y, most=300)
     ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
     # The middle of the steady swing: mean over samples, near enough for ten cycles.
     middle = float(np.mean(y[steady])) if np.any(steady) else float(np.mean(y))
@@ -212,8 +201,7 @@ def hardware_figure(
     checks: Sequence[Sequence[HardwareCheck]],
     *,
     record: Record | None,
-    position_unit: str,
-    input_unit: str,
+    units: Units,
 ) -> Figure:
     """Return one run: each cart with its set point, below it the residuals, last the input.
 
@@ -226,14 +214,14 @@ def hardware_figure(
             above.step(group[0].t, set_point, where="post", color=THIRD, lw=0.9, ls="-.")
             axes[0].plot([], [], color=THIRD, lw=0.9, ls="-.", label="set point")
         plot_hardware(above, group)
-        above.set_ylabel(position_label(group[0].cart, position_unit))
+        above.set_ylabel(position_label(group[0].cart, units.position))
         residuals = {_LOOPS[check.loop]: check.measured - check.model for check in group}
         plot_residuals(below, group[0].t, residuals)
         keep_in_sight(below, group[0].measured - np.median(group[0].measured))
-        below.set_ylabel(f"residual [{position_unit}]")
+        below.set_ylabel(f"residual [{units.position}]")
     if driven:
         plot_effort(axes[-1], driven, model=checks[0][0].effort)
-        axes[-1].set_ylabel(f"u [{input_unit}]")
+        axes[-1].set_ylabel(f"u [{units.input}]")
     legend_above(axes[0])
     axes[-1].set_xlabel("time [s]")
     return figure
@@ -242,9 +230,10 @@ def hardware_figure(
 def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
     """Plot the input as logged, and what the modelled loop asks for."""
     assert record.u is not None
-    plot_measured(ax, record.t, record.u, in_legend=False)
+    plot_points(ax, record.t, record.u)
     if model is not None:
-        plot_line(ax, record.t, model, name="loop model", lw=1.0, in_legend=False)
+        look = {"color": MODEL, "lw": 1.0}
+        plot_line(ax, record.t, model, look, name="loop model", in_legend=False)
         keep_in_sight(ax, record.u)
 
 
@@ -256,14 +245,14 @@ def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
     keep_in_sight(ax, checks[0].measured)
 
 
-def design_figure(design: FeedbackDesign, *, position_unit: str, input_unit: str) -> Figure:
+def design_figure(design: FeedbackDesign, *, units: Units) -> Figure:
     """Return the simulated step of the designed loop: positions above, input below."""
     figure, (above, below) = panels(1.5, 0.8)
     plot_design(above, design)
-    above.set_ylabel(f"position [{position_unit}]")
+    above.set_ylabel(f"position [{units.position}]")
     legend_above(above, columns=5)
     below.step(design.t, design.u, where="post", color=MODEL, lw=1.0, label="u")
-    below.set_ylabel(f"u [{input_unit}]")
+    below.set_ylabel(f"u [{units.input}]")
     below.set_xlabel("time [s]")
     return figure
 
@@ -271,7 +260,7 @@ def design_figure(design: FeedbackDesign, *, position_unit: str, input_unit: str
 def plot_design(ax: Axes, design: FeedbackDesign) -> None:
     """Plot all carts' positions, the chosen cart's goal and its 2 % band."""
     r = design.reference
-    ax.axhspan(r - _SETTLED_BAND * abs(r), r + _SETTLED_BAND * abs(r), color=SHADE, lw=0)
+    ax.axhspan(r - 0.02 * abs(r), r + 0.02 * abs(r), color=SHADE, lw=0)
     ax.axhline(r, color=QUIET, lw=0.8)
     for cart, y in enumerate(design.y, start=1):
         _plot_cart(ax, design.t, y, cart=cart, lw=1.8 if cart == design.cart else 1.0)
@@ -284,7 +273,7 @@ def plot_design(ax: Axes, design: FeedbackDesign) -> None:
 
 def _alike(swings: Sequence[float]) -> bool:
     """Return whether motions are of a size to be drawn on one scale."""
-    return max(swings) < _ALIKE * min(swings)
+    return max(swings) < 4.0 * min(swings)
 
 
 def label_outer(axes: Sequence[Axes], *, x: str, y: str) -> None:

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 from pipeline.gap.types import FoundEffect, Gap, GapWindow
 from pipeline.report.document import Cell, Table, Tone, cell
-from pipeline.report.gap.words import WORDS, effect_name, phase, share
-from pipeline.report.numbers import percent, unit_text, with_error
+from pipeline.report.gap.verdict import WORDS, effect_name, phase, share
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean
-from pipeline.results_of_runs import Intervention
+from pipeline.results import Intervention
+from pipeline.words.numbers import percent, unit_text, with_error
+from pipeline.words.text import clean
 
 
 def error_table(page: Page, gap: Gap) -> Table:
@@ -20,40 +20,24 @@ def error_table(page: Page, gap: Gap) -> Table:
         limits.append(("repeats of one run differ by", gap.repeatability))
     rows = [[cell(name), cell(share(error))] for name, error in models]
     rows += [[cell(name, "quiet"), cell(share(error), "quiet")] for name, error in limits]
-    return page.table(WORDS.text("error_table"), ("Model", "Error"), rows, "ld")
+    return page.table(WORDS, "error_table", rows, "ld")
 
 
 def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Table:
     """Return where a model, "the linear model" say, fails most."""
-    return page.table(
-        WORDS.text("window_table", model=model),
-        ("Run", "Cart", "From [s]", "To [s]", "What happens", "Share"),
-        [
-            (
-                clean(w.experiment),
-                str(w.cart),
-                f"{w.start:.2f}",
-                f"{w.end:.2f}",
-                phase(w.what),
-                percent(100 * w.share),
-            )
-            for w in windows
-        ],
-        "lcddld",
-    )
+    rows = [(*_stretch(w), phase(w.what), percent(100 * w.share)) for w in windows]
+    return page.table(WORDS, "window_table", rows, "lcddld", model=model)
 
 
 def intervention_table(page: Page, interventions: Sequence[Intervention]) -> Table:
     """Return where a hand moved a cart."""
-    return page.table(
-        WORDS.text("intervention_table"),
-        ("Record", "Cart", "From [s]", "To [s]", "The cart is"),
-        [
-            (clean(one.experiment), str(one.cart), f"{one.start:.2f}", f"{one.end:.2f}", one.what)
-            for one in interventions
-        ],
-        "lcddl",
-    )
+    rows = [(*_stretch(one), one.what) for one in interventions]
+    return page.table(WORDS, "intervention_table", rows, "lcddl")
+
+
+def _stretch(one: GapWindow | Intervention) -> tuple[str, str, str, str]:
+    """Return run, cart, first and last second of a stretch."""
+    return clean(one.experiment), str(one.cart), f"{one.start:.2f}", f"{one.end:.2f}"
 
 
 def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
@@ -69,8 +53,7 @@ def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
         for detail, group in ((False, found.parameters), (True, found.details))
         for name, value in group.items()
     ]
-    caption = f"{found.effect.title}: parameters with standard errors."
-    return page.table(caption, ("Symbol", "Parameter", "Value", "Unit"), rows, "lldl")
+    return page.table(WORDS, "effect_table", rows, "lldl", effect=found.effect.title)
 
 
 def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
@@ -87,5 +70,4 @@ def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
         line(effect_name(rival.effect, rival.where), rival.nrmse_after, rival.confidence)
         for rival in found.rivals
     ]
-    head = ("Effect", "Error on held-out runs", "Weight")
-    return page.table(WORDS.text("rival_table"), head, [chosen, *others], "ldd")
+    return page.table(WORDS, "rival_table", [chosen, *others], "ldd")

@@ -18,8 +18,10 @@ from markupsafe import Markup, escape
 from pipeline.report.document import Block, Document, Picture, Table, Tiles, flat
 from pipeline.report.figures.style import MEASURED, MODEL, QUIET, SECOND, SHADE, THIRD
 from pipeline.report.figures.ticks import GRID
-from pipeline.report.math.tree import Term, to_mathml
 from pipeline.resources import TEMPLATES
+from pipeline.words.math import Term, to_mathml
+from pipeline.words.numbers import unbroken
+from pipeline.words.spans import plain
 
 # The style sheet says what each colour is in light and in dark.
 _ROLES = {
@@ -28,6 +30,7 @@ _ROLES = {
 }  # fmt: skip
 ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
 _SOMETIMES = (EXPLORE, FINDER)
+PLOTS = ("uplot.min.js", "plots.js")  # of the page of plots, which has no others
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
 _NARROW = " .,()"  # half a digit wide
 _WIDE = "±×%"  # wider than a digit
@@ -51,6 +54,13 @@ def render_html(document: Document) -> str:
 def render_fragment(blocks: Sequence[Block]) -> str:
     """Return blocks as a piece of a page that is not ours, such as a notebook; no script."""
     return _environment().get_template("fragment.html.j2").render(blocks=blocks)
+
+
+def render_plots(**values: object) -> str:
+    """Return the page of plots to look through; every value is escaped."""
+    text = script(*PLOTS)
+    page = _environment().get_template("plots.html.j2")
+    return page.render(script=Markup(text), script_hash=Markup(script_hash(text)), **values)
 
 
 def render_text(template: str, **values: object) -> str:
@@ -90,6 +100,7 @@ def every_hash() -> Iterable[str]:
     for n in range(len(_SOMETIMES) + 1):
         for names in combinations(_SOMETIMES, n):
             yield script_hash(script(ALWAYS, *names))
+    yield script_hash(script(*PLOTS))
 
 
 def _scripts(document: Document) -> list[str]:
@@ -112,7 +123,10 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"mathml": _mathml, "svg": _svg, "tails": _tails, "board": _board}
+    environment.filters |= {
+        "mathml": _mathml, "svg": _svg, "tails": _tails, "heads": _heads, "board": _board,
+        "unbroken": unbroken,
+    }  # fmt: skip
     return environment
 
 
@@ -145,6 +159,11 @@ def _tails(table: Table) -> list[str]:
         f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
         for how, column in zip(table.align, columns, strict=False)
     ]
+
+
+def _heads(table: Table) -> list[str]:
+    """Return the heading that a phone shows before each value of a row, "" where none is shown."""
+    return [plain(head.text) if table.told else "" for head in table.head]
 
 
 def _board(board: Tiles) -> str:

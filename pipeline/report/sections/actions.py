@@ -3,20 +3,21 @@
 from collections.abc import Iterator, Sequence
 
 from pipeline.names import read_name
-from pipeline.report import limits
-from pipeline.report.document import Items, Span, Spans, bullet_list, spans
-from pipeline.report.numbers import listing
-from pipeline.report.phrases import phrases
+from pipeline.report.document import Items, bullet_list
+from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.parameters import reported_off
-from pipeline.report.words import clean, names_spans, rich
-from pipeline.results import SIGN, Analysis, Check
+from pipeline.results import Analysis, Check, Stage
+from pipeline.words.numbers import listing
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Span, Spans, spans
+from pipeline.words.text import clean, names_spans, rich
 
 _WORDS = phrases("summary")
 _MOST_TOLD = 3  # messages of one kind
 # The checks, the worst failure first: what spoils every number, what spoils some, and what the
 # linear carts leave out. One that is not listed stands before the last group.
 _WORST_FIRST = (
-    SIGN,
+    "input_sign",
     "data",
     "record",
     "position_unit",
@@ -27,8 +28,8 @@ _WORST_FIRST = (
     "held",
     "dwells",
     "late_channel",
-    "fit.identified",
-    "fit.converged",
+    "fit_identified",
+    "fit_converged",
     "physical",
     "vanishing",
     "repeats",
@@ -36,9 +37,9 @@ _WORST_FIRST = (
     "hardware",
     "feedback",
 )
-_LAST = ("fit.explains_data", "step", "decay")
-_AT_THE_TOP = (SIGN, "position_unit", "input_unit")  # what is wrong with every number
-_TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit.identified")  # there, and by the first words of a summary
+_LAST = ("fit_explains_data", "step", "decay")
+_AT_THE_TOP = ("input_sign", "position_unit", "input_unit")  # what is wrong with every number
+_TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")  # there, and by the first words of a summary
 _ALIKE = ("initial_final", "step", "decay")  # of these one message stands for all
 
 
@@ -63,13 +64,13 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
             told=rich("".join(f"{message} " for message in messages)),
             names=_names(groups[group]),
         )
-        if group == SIGN:
+        if group == "input_sign":
             yield _WORDS.spans("next_again")
 
 
 def _group(check: Check) -> str:
     """Return what one action is for: checks of a kind; those of the fit ask different things."""
-    return check.id if check.kind in ("fit", "input") else check.kind
+    return f"{check.kind}_{check.part}" if check.kind in ("fit", "input") else check.kind
 
 
 def _place(group: str) -> tuple[int, int]:
@@ -89,25 +90,20 @@ def _excess(check: Check) -> float:
 def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
     """Return what to do about the failed checks of a group."""
     if group == "initial_final":
-        return _WORDS.spans("do_initial_final", names=names_spans([c.about for c in checks]))
-    if group == "fit.identified":
+        return _WORDS.spans("do_initial_final", names=names_spans([c.parameter for c in checks]))
+    if group == "fit_identified":
         return _to_identify(analysis)
     if group == "decay":
         decays = {d.experiment for d in analysis.log_decrements} - analysis.steps
         return _WORDS.spans("do_decay" if decays else "do_first_decay")
     known = group in (*_WORST_FIRST, *_LAST)
-    return _WORDS.spans(_key("do_", group if known else "other"))
-
-
-def _key(what: str, group: str) -> str:
-    """Return where the sentence about a group of checks stands."""
-    return f"{what}{group.replace('.', '_')}"
+    return _WORDS.spans(f"do_{group if known else 'other'}")
 
 
 def _to_identify(analysis: Analysis) -> Spans:
     """Return what lets the carts be identified, or why they cannot be."""
     for skip in reversed(analysis.skipped):
-        if skip.stage == "final estimates":
+        if skip.stage is Stage.FINAL_ESTIMATES:
             if skip.missing:
                 return _WORDS.spans("do_record_for_fit", missing=skip.missing)
             return _WORDS.spans("do_identify", reason=_sentence(clean(skip.reason)))
@@ -137,16 +133,17 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     if short := sorted({point.experiment for point in analysis.sine_points if not point.settled}):
         yield say("next_short", runs=clean(listing(short)))
     doubted = {check.experiment for check in analysis.hardware if check.contradicted}
-    poor = [c for c in analysis.hardware if c.nrmse > limits.CLOSE and c.experiment not in doubted]
+    poor = [c for c in analysis.hardware if c.nrmse > CLOSE and c.experiment not in doubted]
     left = poor or (fit is not None and not fit.explains_data)
-    if left and "fit.explains_data" not in asked:
+    if left and "fit_explains_data" not in asked:
         yield say("do_fit_explains_data")
     to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
     if to_run:
         yield say("next_run")
     # What follows the carts waits for them, and for the recordings that are to be fixed.
     if fit is not None and not asked & {"data", "record"}:
-        lacking = [s for s in analysis.skipped if not (to_run and s.stage == "hardware check")]
+        run = {Stage.HARDWARE_CHECK} if to_run else frozenset[Stage]()
+        lacking = [skip for skip in analysis.skipped if skip.stage not in run]
         missing = dict.fromkeys(skip.missing for skip in lacking if skip.missing)
         if missing:
             yield say("next_missing", missing=rich(clean(listing(list(missing)))))
@@ -158,7 +155,8 @@ def _may_lack_springs(analysis: Analysis) -> bool:
     """Tell whether steps contradict a fit that leaves springs out, where dry friction does not."""
     fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
     off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
-    return off and not dry and fit is not None and not (fit.explains_data or all(analysis.springs))
+    may_be_whole = fit is None or fit.explains_data or all(analysis.bench.springs)
+    return off and not dry and not may_be_whole
 
 
 def _nothing_left(analysis: Analysis) -> Spans:
@@ -170,7 +168,5 @@ def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
     wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
     if not wrong:
         return None
-    said = (
-        _WORDS.spans(_key("top_", _group(c)), message=_sentence(clean(c.message))) for c in wrong
-    )
+    said = (_WORDS.spans(f"top_{_group(c)}", message=_sentence(clean(c.message))) for c in wrong)
     return False, tuple(span for one in said for span in (*one, Span(" ")))[:-1]

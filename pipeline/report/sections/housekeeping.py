@@ -3,27 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from pipeline.report.document import (
-    Block,
-    Details,
-    Span,
-    Table,
-    Tone,
-    bullet_list,
-    cell,
-    paragraph,
-    spans,
-)
-from pipeline.report.numbers import count, listing
-from pipeline.report.phrases import phrases
+from pipeline.report.document import Block, Details, Table, Tone, bullet_list, cell, paragraph
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, rich
 from pipeline.results import Assumption, Check
+from pipeline.words.numbers import count, listing
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Span, spans
+from pipeline.words.text import clean, rich
 
 _WORDS = phrases("report")
-OUTCOMES = {"fail": "failed", "pass": "passed", "skip": "not checked"}  # in the order of a table
-SUPPORT: dict[str, Tone] = {"supported": "good", "contradicted": "bad", "open": "quiet"}
-TONES: dict[str, Tone] = {"fail": "bad", "pass": "good", "skip": "quiet"}
+OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of a table
+    "fail": ("failed", "bad"),
+    "pass": ("passed", "good"),
+    "skip": ("not checked", "quiet"),
+}
 
 
 def check_blocks(page: Page) -> list[Block]:
@@ -33,31 +26,26 @@ def check_blocks(page: Page) -> list[Block]:
     passed = sum(check.outcome == "pass" for check in others)
     blocks: list[Block] = []
     if failed:
-        blocks.append(_check_table(page, failed, "Consistency checks that failed."))
+        blocks.append(_check_table(page, failed, "failed_table"))
     if others:
         title = f"{count(passed, 'check')} passed"
         if unchecked := len(others) - passed:
             title += f", {unchecked} could not be done"
-        caption = "Consistency checks that passed or could not be done."
-        blocks.append(Details(spans(title), (_check_table(page, others, caption),)))
+        blocks.append(Details(spans(title), (_check_table(page, others, "other_checks_table"),)))
     return blocks
 
 
-def _check_table(page: Page, checks: Sequence[Check], caption: str) -> Table:
+def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
     order = list(OUTCOMES)
-    return page.table(
-        caption,
-        ("Outcome", "Check", "What was found"),
+    rows = [
         [
-            [
-                cell(OUTCOMES[check.outcome], TONES[check.outcome]),
-                cell(Span(clean(check.id), "code")),
-                cell(rich(clean(check.message))),
-            ]
-            for check in sorted(checks, key=lambda check: order.index(check.outcome))
-        ],
-        "lll",
-    )
+            cell(*OUTCOMES[check.outcome]),
+            cell(Span(clean(check.id), "code")),
+            cell(rich(clean(check.message))),
+        ]
+        for check in sorted(checks, key=lambda check: order.index(check.outcome))
+    ]
+    return page.table(_WORDS, key, rows, "lll")
 
 
 def assumption_blocks(page: Page) -> list[Block]:
@@ -65,19 +53,19 @@ def assumption_blocks(page: Page) -> list[Block]:
     assumptions = page.analysis.assumptions
     if not assumptions:
         return []
+    tones: dict[str, Tone] = {"supported": "good", "contradicted": "bad", "open": "quiet"}
     rows = [
         [
             cell(Span(clean(one.key), "code")),
             cell(clean(one.about)),
             cell(rich(clean(taken_text(one)))),
             cell(_WORDS.text(f"origin_{one.origin}"), "quiet"),
-            cell(_WORDS.text(f"support_{one.support}"), SUPPORT[one.support]),
+            cell(_WORDS.text(f"support_{one.support}"), tones[one.support]),
             cell(rich(clean(one.reason))),
         ]
         for one in assumptions
     ]
-    head = ("Key", "Which", "Taken as", "From", "Do the data support it?", "Why")
-    return [page.table(_WORDS.text("assumption_table"), head, rows, "llllll")]
+    return [page.table(_WORDS, "assumption_table", rows, "llllll")]
 
 
 def taken_text(one: Assumption) -> str:
@@ -89,13 +77,13 @@ def taken_text(one: Assumption) -> str:
         return f"cart{'s' if len(one.value) > 1 else ''} {carts} free"
     if isinstance(one.value, str):
         return one.value
-    return f"{one.value:+g}" if one.key.endswith("sign") else f"{one.value:g}"
+    return f"{one.value:+g}" if one.key == "system.input.sign" else f"{one.value:g}"
 
 
 def skipped_blocks(page: Page) -> list[Block]:
     """Return which stages were skipped, and why."""
     told = [
-        spans(Span(f"{clean(skip.stage)}: ", "strong"), rich(clean(skip.reason)))
+        spans(Span(f"{clean(skip.name)}: ", "strong"), rich(clean(skip.reason)))
         for skip in page.analysis.skipped
     ]
     return [bullet_list(told)] if told else []
@@ -115,6 +103,4 @@ def file_table(page: Page) -> Table:
         [cell(Span(clean(text), "code")) for text in entry]
         for entry in sorted(page.analysis.files.items())
     ]
-    return replace(
-        page.table(_WORDS.text("file_table"), ("File", "SHA-256"), rows, "ll"), small=True
-    )
+    return replace(page.table(_WORDS, "file_table", rows, "ll"), small=True)

@@ -3,17 +3,16 @@
 import numpy as np
 
 from pipeline.arrays import ComplexArray
-from pipeline.report import limits
 from pipeline.report.document import Block, Table, paragraph
 from pipeline.report.figures.time import design_figure, hardware_figure
-from pipeline.report.numbers import NOTHING, complex_text, count, percent, significant, unit_text
-from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, remarks
-from pipeline.report.words import clean
 from pipeline.results import FeedbackDesign, HardwareCheck, Margins
+from pipeline.words.numbers import NOTHING, complex_text, count, percent, significant, unit_text
+from pipeline.words.phrases import phrases
+from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-_TABLES = phrases("report")
+CLOSE = 0.10  # of the motion, rms: within it a good linear model; beyond, worth a question
 
 
 def feedback_blocks(page: Page) -> list[Block]:
@@ -21,29 +20,24 @@ def feedback_blocks(page: Page) -> list[Block]:
     design = page.analysis.feedback
     if design is None:
         return []
+    settling = design.settling_time
     said = {
-        "cart": str(design.cart),
+        "cart": design.cart,
         "goal": f"{significant(design.reference)} {page.position}",
         "overshoot": percent(design.overshoot_percent),
         "peak": significant(design.peak_input, digits=3),
         "drive": page.drive,
+        "settled": _WORDS.text("never_settles")
+        if settling is None
+        else _WORDS.text("settles", seconds=significant(settling, digits=3)),
     }
-    settled = (
-        _WORDS.text("settles", seconds=significant(design.settling_time, digits=3))
-        if design.settling_time is not None
-        else _WORDS.text("never_settles")
-    )
     method = _WORDS.text(f"method_{design.method}")
+    figure = design_figure(design, units=page.units)
     return [
         paragraph(_WORDS.text("feedback", method=method, message=clean(design.message))),
         _feedback_table(page, design),
         _pole_table(page, design),
-        page.picture(
-            "feedback",
-            design_figure(design, position_unit=page.position, input_unit=page.drive),
-            caption=_WORDS.text("design", settled=settled, **said),
-            alt=_WORDS.text("design_alt", **said),
-        ),
+        page.picture("feedback", figure, _WORDS, "design", **said),
     ]
 
 
@@ -72,13 +66,9 @@ def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
         (name, value, f"{unit} {at}".strip())
         for name, value, unit, at in margin_rows(design.margins)
     ]
-    goal = significant(design.reference)
-    return page.table(
-        _TABLES.text("feedback_table", cart=design.cart, goal=goal, unit=position),
-        ("Quantity", "Value", "Unit"),
-        [(what, value, unit_text(unit)) for what, value, unit in rows],
-        "ldl",
-    )
+    rows = [(what, value, unit_text(unit)) for what, value, unit in rows]
+    goal = f"{significant(design.reference)} {position}"
+    return page.table(_WORDS, "feedback_table", rows, "ldl", cart=design.cart, goal=goal)
 
 
 def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:
@@ -101,23 +91,21 @@ def _at(omega: float | None) -> str:
 
 def _pole_table(page: Page, design: FeedbackDesign) -> Table:
     """Return the closed-loop poles, beside the requested ones where some were."""
-    poles = _ascending(design.poles)
-    head = ["Pole [rad/s]", "Frequency [rad/s]", "Damping ratio"]
     rows = [
         [
             complex_text(pole, digits=3),
             significant(abs(pole), digits=3),
             significant(-pole.real / abs(pole), digits=3) if pole != 0 else NOTHING,
         ]
-        for pole in poles
+        for pole in _ascending(design.poles)
     ]
-    if design.requested_poles is not None:
-        # A delay adds poles that nobody asked for.
-        requested = [complex_text(pole, digits=3) for pole in _ascending(design.requested_poles)]
-        requested += [NOTHING] * (poles.size - len(requested))
-        head = ["Requested [rad/s]", *head]
-        rows = [[asked, *row] for asked, row in zip(requested, rows, strict=True)]
-    return page.table("Poles of the closed loop.", head, rows, "r" * len(head))
+    if design.requested_poles is None:
+        return page.table(_WORDS, "pole_table", rows, "rrr")
+    # A delay adds poles that nobody asked for.
+    requested = [complex_text(pole, digits=3) for pole in _ascending(design.requested_poles)]
+    requested += [NOTHING] * (len(rows) - len(requested))
+    rows = [[asked, *row] for asked, row in zip(requested, rows, strict=True)]
+    return page.table(_WORDS, "requested_pole_table", rows, "rrrr")
 
 
 def _ascending(poles: ComplexArray) -> ComplexArray:
@@ -130,25 +118,23 @@ def hardware_blocks(page: Page) -> list[Block]:
     if not checks:
         return []
     blocks: list[Block] = [_hardware_table(page)]
-    runs = list(dict.fromkeys(check.experiment for check in checks))
-    for i, run in enumerate(runs, start=1):
+    for i, run in enumerate(dict.fromkeys(check.experiment for check in checks), start=1):
         of_run = [check for check in checks if check.experiment == run]
         carts = sorted({check.cart for check in of_run})
-        figure = hardware_figure(
-            [[check for check in of_run if check.cart == cart] for cart in carts],
-            record=page.records.get(run),
-            position_unit=page.position,
-            input_unit=page.drive,
-        )
+        by_cart = [[check for check in of_run if check.cart == cart] for cart in carts]
+        figure = hardware_figure(by_cart, record=page.records.get(run), units=page.units)
         worst = max(of_run, key=lambda check: check.nrmse)
-        said = {"run": run, "cart": str(worst.cart), "left": percent(100 * worst.nrmse)}
-        caption = _WORDS.text("hardware", **said)
-        alt = _WORDS.text("hardware_alt", carts=count(len(carts), "cart"), **said)
-        blocks.append(page.picture(f"hardware-{i}", figure, caption=caption, alt=alt))
+        said = {
+            "run": run,
+            "cart": worst.cart,
+            "carts": count(len(carts), "cart"),
+            "left": percent(100 * worst.nrmse),
+        }
+        blocks.append(page.picture(f"hardware-{i}", figure, _WORDS, "hardware", **said))
     scales = [
         _WORDS.text("input_scale", run=c.experiment, scale=significant(c.input_scale, digits=3))
         for c in checks
-        if c.input_scale is not None and abs(c.input_scale - 1) > limits.INPUT_AS_LOGGED
+        if c.input_scale is not None and abs(c.input_scale - 1) > 0.05  # nearer is not worth a word
     ]
     return [*blocks, *remarks(list(dict.fromkeys(scales)))]
 
@@ -166,13 +152,7 @@ def _hardware_table(page: Page) -> Table:
         )
         for check in page.analysis.hardware
     ]
-    return page.table(
-        _TABLES.text("hardware_table"),
-        ("Record", "Cart", "Simulated", "Difference", "Overshoot [%]", "Settling [s]",
-         f"Steady state [{page.position}]"),
-        rows,
-        "lcldrrr",
-    )  # fmt: skip
+    return page.table(_WORDS, "hardware_table", rows, "lcldrrr", position=page.position)
 
 
 def _overshoots(check: HardwareCheck) -> str:

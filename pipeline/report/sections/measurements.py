@@ -3,21 +3,19 @@
 import numpy as np
 
 from pipeline.names import mode_suffixes, omega_names
-from pipeline.report.document import Block, Details, Table, cell, paragraph, spans
+from pipeline.report.document import Block, Details, Table, cell, paragraph
 from pipeline.report.figures.bode import bode_figure, overview_figure
-from pipeline.report.figures.style import CART_MARKS
+from pipeline.report.figures.style import CARTS
 from pipeline.report.figures.time import damping_figure, decay_figure, sine_figure, step_figure
-from pipeline.report.numbers import count, listing, percent, significant, with_error
-from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page, left_out
-from pipeline.report.words import clean, name_span
-from pipeline.results import FrequencyResponse, SinePoint
+from pipeline.results import FrequencyResponse, LogDecrement
+from pipeline.words.numbers import count, listing, percent, significant, with_error
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import spans
+from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-_TABLES = phrases("report")
 _MOST_PANELS = 6  # repeats drawn in one figure; the tables hold all
-_PAPER_DWELL = 2 * np.pi * 4.0  # rad/s: the 4 Hz of the paper's Figures 12-14
-_ORDINALS = {1: "first", 2: "second", 3: "third", 4: "fourth"}
 
 
 # ----------------------------------------------------------- frequency response
@@ -25,27 +23,22 @@ _ORDINALS = {1: "first", 2: "second", 3: "third", 4: "fourth"}
 
 def response_blocks(page: Page) -> list[Block]:
     """Return a Bode figure for every cart, last cart first as the paper shows them."""
-    chain = page.analysis.chain
-    blocks: list[Block] = []
-    for response in sorted(page.analysis.frequency_responses, key=lambda r: -r.cart):
+    responses, chain = page.analysis.frequency_responses, page.analysis.chain
+    key, pictures = "bode" if chain else "bode_points", []
+    for response in sorted(responses, key=lambda r: -r.cart):
         if np.any(response.magnitude > 0):
-            figure = bode_figure(
-                response, chain=chain, position_unit=page.position, input_unit=page.drive
-            )
-            caption, alt = _bode_caption(page, response), _bode_alt(page, response)
-            blocks.append(
-                page.picture(f"bode-cart-{response.cart}", figure, caption=caption, alt=alt)
-            )
-    if not blocks:
+            figure = bode_figure(response, chain=chain, units=page.units)
+            name, said = f"bode-cart-{response.cart}", _bode_words(page, response)
+            pictures.append(page.picture(name, figure, _WORDS, key, alt="bode_alt", **said))
+    if not pictures:
         return []
-    found = {response.source for response in page.analysis.frequency_responses}
-    said = {"source_dwells": {}, "source_table": {}, "source_records": {"kinds": _kinds(page)}}
-    used = [
-        _WORDS.text(key, **values)
-        for key, values in said.items()
-        if key.removeprefix("source_") in found
+    found = {response.source for response in responses}
+    sources = [
+        _WORDS.text(f"source_{source}", kinds=_kinds(page))
+        for source in ("dwells", "table", "records")
+        if source in found
     ]
-    return [paragraph(_WORDS.text("source", sources=listing(used))), *blocks]
+    return [paragraph(_WORDS.text("source", sources=listing(sources))), *pictures]
 
 
 def _kinds(page: Page) -> str:
@@ -60,52 +53,43 @@ def overview_blocks(page: Page) -> list[Block]:
     shown = [r for r in page.analysis.frequency_responses if np.any(r.magnitude > 0)]
     if not shown:
         return []
-    chain, marks = page.analysis.chain, listing(omega_names(mode_suffixes(page.analysis.carts)))
-    figure = overview_figure(shown, chain=chain, position_unit=page.position, input_unit=page.drive)
-    key = "overview" if chain else "overview_points"
-    alt = _WORDS.text("overview_alt", carts=count(len(shown), "cart"))
-    return [page.picture("overview", figure, caption=_WORDS.text(key, marks=marks), alt=alt)]
+    chain, marks = page.analysis.chain, listing(omega_names(mode_suffixes(page.analysis.bench.n)))
+    figure = overview_figure(shown, chain=chain, units=page.units)
+    key, said = "overview" if chain else "overview_points", {"carts": count(len(shown), "cart")}
+    return [page.picture("overview", figure, _WORDS, key, alt="overview_alt", marks=marks, **said)]
 
 
-def _bode_caption(page: Page, response: FrequencyResponse) -> str:
-    """Say how near the fit is, and where it is farthest off."""
-    chain, n, cart = page.analysis.chain, page.analysis.carts, response.cart
-    ordinal = _ORDINALS.get(cart, f"{cart}th")
-    name = _WORDS.text("of_carts" if n > 1 else "one_cart", cart=cart, ordinal=ordinal)
-    if chain is None:
-        return _WORDS.text("bode_points", cart=name)
-    shown = response.magnitude > 0
-    omega, measured = response.omega[shown], response.magnitude[shown]
-    off = 100 * (measured / np.abs(chain.frequency_response(omega)[cart - 1]) - 1)
-    worst = int(np.argmax(np.abs(off)))
-    return _WORDS.text(
-        "bode",
-        cart=name,
-        half=significant(float(np.median(np.abs(off))), digits=2),
-        omega=significant(float(omega[worst]), digits=3),
-        most=significant(float(abs(off[worst])), digits=2),
-        side="above" if off[worst] > 0 else "below",
-        marks=listing(omega_names(mode_suffixes(n))),
-    )
-
-
-def _bode_alt(page: Page, response: FrequencyResponse) -> str:
-    omega, magnitude, fitted = response.omega, response.magnitude, ""
-    if chain := page.analysis.chain:
-        line = np.abs(chain.frequency_response(omega)[response.cart - 1])
-        middle = float(np.median(np.abs(100 * (magnitude / line - 1))))
-        fitted = _WORDS.text("bode_alt_fitted", middle=percent(middle))
+def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
+    """Say how far the points reach, how near the fit is, and where it is farthest off."""
+    chain, n, cart = page.analysis.chain, page.analysis.bench.n, response.cart
+    omega, magnitude = response.omega, response.magnitude
     peak = int(np.argmax(magnitude))
     numbers = {"first": omega[0], "last": omega[-1], "peak": omega[peak]}
     numbers["magnitude"] = magnitude[peak]
-    return _WORDS.text(
-        "bode_alt",
-        cart=response.cart,
-        points=omega.size,
-        unit=f"{page.position}/{page.drive}",
-        fitted=fitted,
+    ordinal = {1: "first", 2: "second", 3: "third"}.get(cart, f"{cart}th")
+    said: dict[str, object] = {
         **{name: significant(float(value), digits=3) for name, value in numbers.items()},
-    )
+        "cart": _WORDS.text("of_carts" if n > 1 else "one_cart", cart=cart, ordinal=ordinal),
+        "number": cart,
+        "points": omega.size,
+        "unit": page.units.gain,
+        "fitted": "",
+        "marks": listing(omega_names(mode_suffixes(n))),
+    }
+    if chain is None:
+        return said
+    off = 100 * (magnitude / np.abs(chain.frequency_response(omega)[cart - 1]) - 1)
+    middle = percent(float(np.median(np.abs(off))))
+    shown = magnitude > 0
+    omega, off = omega[shown], off[shown]
+    worst = int(np.argmax(np.abs(off)))
+    return said | {
+        "fitted": _WORDS.text("bode_alt_fitted", middle=middle),
+        "half": significant(float(np.median(np.abs(off))), digits=2),
+        "omega": significant(float(omega[worst]), digits=3),
+        "most": significant(float(abs(off[worst])), digits=2),
+        "side": "above" if off[worst] > 0 else "below",
+    }
 
 
 # ----------------------------------------------------------------- time records
@@ -122,34 +106,31 @@ def decay_blocks(page: Page) -> list[Block]:
         drawn = of_cart[:_MOST_PANELS]
         if not drawn:
             continue
-        records = [page.records[decay.experiment] for decay in drawn]
+        records, first = [page.records[decay.experiment] for decay in drawn], drawn[0]
+        sticks = [clean(d.name) for d in drawn if _is_dry(d)]
+        said = {
+            "cart": cart,
+            "zeta": with_error(first.zeta, first.zeta_std),
+            "run": clean(first.name),
+            "freed": _WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
+            "sticking": _WORDS.text("decay_sticking", sticking=listing(sticks)) if sticks else "",
+            "more": left_out(len(of_cart) - len(drawn)),
+            "records": count(len(drawn), "record"),
+            "swing": significant(float(np.ptp(first.peak_y)), digits=2),
+            "unit": page.position,
+        }
         figure = decay_figure(drawn, records=records, position_unit=page.position)
-        first = drawn[0]
-        sticks = [clean(d.name) for d in drawn if d.friction and d.friction.present]
-        said = {"cart": str(cart), "zeta": with_error(first.zeta, first.zeta_std)}
-        caption = _WORDS.text(
-            "decay",
-            run=clean(first.name),
-            freed=_WORDS.text("let_go" if records[0].kind == "decay" else "stepped"),
-            sticking=_WORDS.text("decay_sticking", sticking=listing(sticks)) if sticks else "",
-            more=left_out(len(of_cart) - len(drawn)),
-            **said,
-        )
-        alt = _WORDS.text(
-            "decay_alt",
-            records=count(len(drawn), "record"),
-            swing=significant(float(np.ptp(first.peak_y)), digits=2),
-            unit=page.position,
-            **said,
-        )
-        blocks.append(page.picture(f"decay-cart-{cart}", figure, caption=caption, alt=alt))
-    rubbing = [d for d in decays if d.friction and d.friction.present]
-    if rubbing := [d for d in rubbing if d.zeta_at_amplitude.shape[1] > 1]:  # one is no rise
+        blocks.append(page.picture(f"decay-cart-{cart}", figure, _WORDS, "decay", **said))
+    # Of one amplitude there is no rise to see.
+    if rubbing := [d for d in decays if _is_dry(d) and d.zeta_at_amplitude.shape[1] > 1]:
         figure = damping_figure(rubbing, position_unit=page.position)
         runs = listing(list(dict.fromkeys(clean(d.name) for d in rubbing)))
-        caption, alt = _WORDS.text("damping", runs=runs), _WORDS.text("damping_alt")
-        blocks.append(page.picture("damping", figure, caption=caption, alt=alt))
+        blocks.append(page.picture("damping", figure, _WORDS, "damping", runs=runs))
     return blocks
+
+
+def _is_dry(decay: LogDecrement) -> bool:
+    return decay.friction is not None and decay.friction.present
 
 
 def _decay_table(page: Page) -> Table:
@@ -163,25 +144,15 @@ def _decay_table(page: Page) -> Table:
             verdict = cell(with_error(friction.drop, friction.drop_std), "bad")
         else:
             verdict = cell("none seen", "good")
-        rows.append(
-            (
-                clean(decay.name),
-                str(decay.cart),
-                with_error(decay.omega_n, decay.omega_n_std),
-                with_error(decay.zeta, decay.zeta_std),
-                with_error(decay.zeta_peaks, decay.zeta_peaks_std),
-                str(decay.peak_t.size),
-                verdict,
-            )
+        estimates = (
+            (decay.omega_n, decay.omega_n_std),
+            (decay.zeta, decay.zeta_std),
+            (decay.zeta_peaks, decay.zeta_peaks_std),
         )
-    zeta = name_span("zeta")
-    return page.table(
-        _TABLES.text("decay_table"),
-        ("Record", "Cart", spans(name_span("omega_n"), " [rad/s]"), spans(zeta, " of the fit"),
-         spans(zeta, " of the extrema"), "Extrema", f"Dry friction d [{page.position}]"),
-        rows,
-        "lcdddcr",
-    )  # fmt: skip
+        numbers = [with_error(*estimate) for estimate in estimates]
+        extrema = str(decay.peak_t.size)
+        rows.append((clean(decay.name), str(decay.cart), *numbers, extrema, verdict))
+    return page.table(_WORDS, "decay_table", rows, "lcdddcr", position=page.position)
 
 
 def step_blocks(page: Page) -> list[Block]:
@@ -197,11 +168,13 @@ def step_blocks(page: Page) -> list[Block]:
             records=[page.records[run] for run in drawn],
             position_unit=page.position,
         )
-        caption = _WORDS.text(
-            "steps", styles=_marks(page.analysis.carts), more=left_out(len(runs) - len(drawn))
-        )
-        alt = _WORDS.text("steps_alt", records=count(len(drawn), "record"))
-        blocks.append(page.picture("steps", figure, caption=caption, alt=alt))
+        carts = zip(range(1, page.analysis.bench.n + 1), CARTS, strict=False)
+        said = {
+            "styles": ", ".join(f"cart {cart} {mark}" for cart, (*_, mark) in carts).capitalize(),
+            "more": left_out(len(runs) - len(drawn)),
+            "records": count(len(drawn), "record"),
+        }
+        blocks.append(page.picture("steps", figure, _WORDS, "steps", **said))
     return blocks
 
 
@@ -214,15 +187,8 @@ def _step_table(page: Page) -> Table:
             value = " to ".join(significant(v, digits=3) for v in gain.interval)
         edges, shift = str(len(gain.edges)), significant(gain.rest_shift, digits=2)
         rows.append((clean(gain.experiment), str(gain.cart), edges, value, shift))
-    unit, moved = f"K [{page.position}/{page.drive}]", f"Rest moved by [{page.position}]"
-    return page.table(
-        _TABLES.text("step_table"), ("Record", "Cart", "Edges", unit, moved), rows, "lccdd"
-    )
-
-
-def _marks(carts: int) -> str:
-    marks = zip(range(1, carts + 1), CART_MARKS.values(), strict=False)
-    return ", ".join(f"cart {cart} {mark}" for cart, mark in marks).capitalize()
+    units = {"gain": page.units.gain, "position": page.position}
+    return page.table(_WORDS, "step_table", rows, "lccdd", **units)
 
 
 def dwell_blocks(page: Page) -> list[Block]:
@@ -230,7 +196,9 @@ def dwell_blocks(page: Page) -> list[Block]:
     points = [p for p in page.analysis.sine_points if p.experiment in page.records]
     if not points:
         return []
-    chosen = min(points, key=_instructive)
+    # A settled one, the nearest to the 4 Hz of the paper's Figures 12-14.
+    paper = 2 * np.pi * 4.0
+    chosen = min(points, key=lambda p: (not p.settled, abs(float(np.log(p.omega / paper)))))
     shown = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)
     figure = sine_figure(shown, record=page.records[chosen.experiment], position_unit=page.position)
     ratios = [f"cart {p.cart}: {with_error(p.gain, p.gain_std)}" for p in shown]
@@ -238,29 +206,22 @@ def dwell_blocks(page: Page) -> list[Block]:
     said = {
         "hertz": significant(chosen.omega / (2 * np.pi), digits=3),
         "seconds": significant(chosen.steady_from, digits=3),
+        "carts": "every cart" if len(shown) > 1 else "the cart",
+        "run": clean(chosen.experiment),
+        "amplitudes": listing(amplitudes),
+        "unit": page.units.gain,
+        "ratios": "; ".join(ratios),
+        "dwells": count(len({p.experiment for p in page.analysis.sine_points}), "dwell"),
     }
-    carts, run = "every cart" if len(shown) > 1 else "the cart", clean(chosen.experiment)
-    unit = f"{page.position}/{page.drive}"
     return [
-        paragraph(_WORDS.text("dwell", unit=unit, ratios="; ".join(ratios), **said)),
-        page.picture(
-            "sine",
-            figure,
-            caption=_WORDS.text("sine", run=run, carts=carts, **said),
-            alt=_WORDS.text("sine_alt", amplitudes=listing(amplitudes), **said),
-        ),
-        _all_dwells(page),
+        paragraph(_WORDS.text("dwell", **said)),
+        page.picture("sine", figure, _WORDS, "sine", **said),
+        Details(spans(_WORDS.text("all_dwells", **said)), (dwell_table(page),)),
     ]
-
-
-def _all_dwells(page: Page) -> Block:
-    dwells = count(len({point.experiment for point in page.analysis.sine_points}), "dwell")
-    return Details(spans(_WORDS.text("all_dwells", dwells=dwells)), (dwell_table(page),))
 
 
 def dwell_table(page: Page) -> Table:
     """Return frequency, amplitudes, ratio and phase of every dwell and cart; whether it settled."""
-    position, drive = page.position, page.drive
     rows = [
         (
             clean(point.experiment),
@@ -277,13 +238,5 @@ def dwell_table(page: Page) -> Table:
             page.analysis.sine_points, key=lambda p: (p.omega, p.experiment, p.cart)
         )
     ]  # fmt: skip
-    head = (
-        "Record", "f [Hz]", "Cart", f"|U| [{drive}]", f"|X| [{position}]",
-        f"|X|/|U| [{position}/{drive}]", "Phase [°]", "Steady from [s]",
-    )  # fmt: skip
-    return page.table(_TABLES.text("dwell_table"), head, rows, "ldcddddr")
-
-
-def _instructive(point: SinePoint) -> tuple[bool, float]:
-    """Settled dwells first, then those nearest the paper's 4 Hz."""
-    return not point.settled, abs(float(np.log(point.omega / _PAPER_DWELL)))
+    units = {"drive": page.drive, "position": page.position, "gain": page.units.gain}
+    return page.table(_WORDS, "dwell_table", rows, "ldcddddr", **units)

@@ -10,20 +10,9 @@ from urllib.parse import urlsplit
 from markdown_it import MarkdownIt
 from markdown_it.tree import SyntaxTreeNode
 
-from pipeline.report.document import (
-    Block,
-    Cell,
-    Code,
-    Heading,
-    Items,
-    Paragraph,
-    Quote,
-    Span,
-    Spans,
-    Table,
-    plain,
-)
-from pipeline.report.words import clean
+from pipeline.report.document import Block, Cell, Code, Heading, Items, Paragraph, Quote, Table
+from pipeline.words.spans import Span, Spans, plain
+from pipeline.words.text import clean
 
 _DEEPEST_HEADING = 6
 _TOP_HEADING = 3  # the report's own headings are above

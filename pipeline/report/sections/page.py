@@ -1,50 +1,43 @@
-"""What all sections of a report share: the analysis, running numbers, figures as blocks."""
+"""What all sections of a report share: the analysis, its records and its units."""
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
-from itertools import count as counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
-from matplotlib.figure import Figure
-
-from pipeline import __version__
-from pipeline.report.document import (
-    Block,
-    Cell,
-    Document,
-    Picture,
-    Section,
-    Spans,
-    Table,
-    bullet_list,
-    make_table,
-)
-from pipeline.report.figures.style import WIDTH, drawing
-from pipeline.report.figures.svg import to_svg
-from pipeline.report.numbers import count
-from pipeline.report.words import clean, rich
+from pipeline.report.document import Block, Document, Section, bullet_list
+from pipeline.report.render.builder import PageBuilder
 from pipeline.results import Analysis, Record
+from pipeline.set_up import Units
+from pipeline.words.numbers import count
+from pipeline.words.text import clean, rich
 
 
 @dataclass(frozen=True)
-class Page:
-    """The analysis, its text made fit to show, and the running numbers of figures and tables."""
+class Page(PageBuilder):
+    """A page about an analysis, its text made fit to show."""
 
     analysis: Analysis
-    records: dict[str, Record]
-    position: str
-    drive: str
-    _figures: counter = field(default_factory=lambda: counter(1))
-    _tables: counter = field(default_factory=lambda: counter(1))
 
-    @classmethod
-    def of(cls, analysis: Analysis) -> "Page":
-        """Return the page of an analysis, nothing numbered yet."""
-        return cls(
-            analysis=analysis,
-            records={record.id: record for record in analysis.records},
-            position=clean(analysis.position_unit),
-            drive=clean(analysis.input_unit),
-        )
+    @cached_property
+    def records(self) -> dict[str, Record]:
+        """The records by their ids."""
+        return {record.id: record for record in self.analysis.records}
+
+    @cached_property
+    def units(self) -> Units:
+        """The units, fit to show."""
+        stated = self.analysis.bench.units
+        return Units(position=clean(stated.position), input=clean(stated.input))
+
+    @property
+    def position(self) -> str:
+        """The unit of positions."""
+        return self.units.position
+
+    @property
+    def drive(self) -> str:
+        """The unit of the input."""
+        return self.units.input
 
     def document(self, sections: Iterable[Section], *, about: str) -> Document:
         """Return the sections under title, authors and what the document is about.
@@ -54,52 +47,14 @@ class Page:
         analysis = self.analysis
         title = clean(analysis.title).strip()
         section = [f"Section {clean(analysis.section)}"] if analysis.section else []
-        people = analysis.authors
         return Document(
             title=title or about,
             subtitle=" · ".join([*section, *([about] if title else [])]),
-            authors=tuple(clean(f"{name} ({id_})" if name else id_) for id_, name in people),
+            authors=tuple(
+                clean(f"{name} ({id_})" if name else id_) for id_, name in analysis.authors
+            ),
             sections=tuple(sections),
-            footer=f"cartlab {__version__}",
         )
-
-    def sections(
-        self, parts: Iterable["Part"], *, doing: str, progress: Callable[[str], None] | None
-    ) -> list[Section]:
-        """Return the sections that have something to show, each said to `progress` beforehand."""
-        found = []
-        with drawing():
-            for id_, title, blocks_of in parts:
-                if progress:
-                    progress(f"{doing}: {title.lower()}")
-                if blocks := blocks_of(self):
-                    found.append(Section(id=id_, title=title, blocks=tuple(blocks)))
-        return found
-
-    def table(
-        self,
-        caption: str | Spans,
-        head: Iterable[str | Spans],
-        rows: Iterable[Sequence[Cell | str | Spans]],
-        align: str,
-    ) -> Table:
-        """Return a table, see `make_table`, under the next table number."""
-        return make_table(next(self._tables), caption, head, rows, align)
-
-    def picture(self, name: str, figure: Figure, *, caption: str, alt: str) -> Picture:
-        """Return a figure as SVG, under the next figure number."""
-        alt = clean(alt)
-        return Picture(
-            number=next(self._figures),
-            name=name,
-            caption=rich(clean(caption)),
-            alt=alt,
-            svg=to_svg(figure, name=name, alt=alt),
-            width=WIDTH,
-        )
-
-
-Part = tuple[str, str, Callable[[Page], list[Block]]]  # anchor, title, blocks
 
 
 def remarks(notes: Sequence[str]) -> list[Block]:

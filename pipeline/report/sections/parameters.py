@@ -5,19 +5,11 @@ from decimal import Decimal
 
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.report import limits
-from pipeline.report.document import (
-    Block,
-    Cell,
-    Heading,
-    Spans,
-    Table,
-    bullet_list,
-    cell,
-    paragraph,
-    spans,
-)
-from pipeline.report.numbers import (
+from pipeline.report.document import Block, Cell, Heading, Table, bullet_list, cell, paragraph
+from pipeline.report.sections.page import Page
+from pipeline.results import Analysis, Estimate, ParameterRow
+from pipeline.stages.compare import SIGMA_LIMIT, change_limit
+from pipeline.words.numbers import (
     NOTHING,
     listing,
     percent,
@@ -26,15 +18,11 @@ from pipeline.report.numbers import (
     with_error,
     with_errors,
 )
-from pipeline.report.phrases import phrases
-from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, names_spans, rich, source_text
-from pipeline.results import Analysis, ChainFit, Estimate, ParameterRow
-from pipeline.stages.compare import change_limit
-from pipeline.stages.limits import SIGMA_LIMIT
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Spans, spans
+from pipeline.words.text import clean, name_span, names_spans, rich
 
 _WORDS = phrases("report")
-_INITIAL_COLUMNS = 4  # the first ones, which are all that is filled without a fit
 
 
 def parameter_blocks(page: Page) -> list[Block]:
@@ -75,21 +63,15 @@ def _origins(analysis: Analysis) -> Spans:
 
 def parameter_table(page: Page) -> Table:
     """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
-    words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.carts
-    rows = page.analysis.rows
-    columns = None if any(row.final for row in rows) else _INITIAL_COLUMNS
-    head = ("Parameter", "Unit", "Initial estimate", "from", "Final estimate", "Change", "Limit",
-            "Verdict")  # fmt: skip
-    return page.table(
-        _WORDS.text("parameter_table", carts=words.get(carts, carts)),
-        head[:columns],
-        [_parameter_row(row, steps=page.analysis.steps)[:columns] for row in rows],
-        "lldlddrl"[:columns],
-    )
+    words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.bench.n
+    rows, steps = page.analysis.rows, page.analysis.steps
+    columns = None if any(row.final for row in rows) else 4  # all that is filled without a fit
+    shown = [_parameter_row(row, steps=steps)[:columns] for row in rows]
+    align, told = "lldlddrl"[:columns], words.get(carts, carts)
+    return page.table(_WORDS, "parameter_table", shown, align, carts=told)
 
 
 def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
-    source = source_text(row.initial, steps=steps)
     change = percent(row.change_percent, signed=True)
     if row.change_sigmas is not None:
         change += f" ({significant(row.change_sigmas, digits=2)} σ)"
@@ -98,12 +80,29 @@ def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
         cell(name_span(row.name)),
         cell(_unit(row)),
         cell(_estimate(row.initial)),
-        cell(source, "quiet"),
+        cell(source_text(row.initial, steps=steps), "quiet"),
         cell(_estimate(row.final)),
         cell(change),
         cell(f"{change_limit(row.name):.0f} %" if judged else NOTHING, "quiet"),
         _verdict(row.consistent),
     ]
+
+
+def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
+    """Return what an estimate comes from; what rings after one of the `steps` is no decay."""
+    if estimate is None:
+        return ""
+    if estimate.source == "log_decrement" and set(estimate.experiments) & set(steps):
+        return "ringing after a step"
+    sources = {
+        "step": "step",
+        "log_decrement": "decay",
+        "bode_fit": "Bode fit",
+        "time_fit": "fit in time",
+        "assumed": "assumed",
+        "frequency_response": "response",
+    }
+    return sources.get(estimate.source, clean(estimate.source))
 
 
 def _unit(row: ParameterRow) -> str:
@@ -142,8 +141,7 @@ def reported_table(page: Page) -> Table:
         for row in page.analysis.rows
         if (yours := claimed.get(row.name)) is not None
     ]
-    head = ("Parameter", "Estimate", "Yours", "From your data", "Unit", "Off", "Look at")
-    return page.table(_WORDS.text("reported_table"), head, lines, "llddldl")
+    return page.table(_WORDS, "reported_table", lines, "llddldl")
 
 
 def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
@@ -163,7 +161,8 @@ def _is_off(name: str, yours: Decimal, found: Estimate | None) -> bool:
     if found is None or not found.value or found.source == "assumed":
         return False
     rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    few = limits.FEW * change_limit(name) / 100 * abs(found.value)
+    # Other ways through the same data differ by a third of the limit for initial and final.
+    few = change_limit(name) / 3 / 100 * abs(found.value)
     return abs(float(yours) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
 
 
@@ -202,27 +201,19 @@ def _staged_differences(analysis: Analysis) -> Block | None:
     if not changes:
         return None
     worst = max(changes, key=changes.__getitem__)
-    if changes[worst] < limits.NO_CHANGE:
+    if changes[worst] < 0.05:  # percent: nothing to speak of
         return paragraph(_WORDS.text("staged_same"))
-    return paragraph(
-        _WORDS.text("staged_differs", share=percent(changes[worst])),
-        names_spans([worst]),
-        _WORDS.text("joint_reported"),
-    )
-
-
-def fitted_chain_table(page: Page, fit: ChainFit) -> Table:
-    """Return masses, dampings and springs of a joint fit."""
-    return chain_table(page, fit.chain, std=fit.std)
+    differs = {"share": percent(changes[worst]), "name": names_spans([worst])}
+    return paragraph(_WORDS.spans("staged_differs", **differs))
 
 
 def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
     """Return masses, dampings and springs, each with its standard error where it was fitted."""
-    drive, position = page.drive, page.position
+    units = page.units
     kinds = (
-        ("m", "mass", chain.m, f"{drive} s²/{position}"),
-        ("c", "damping", chain.c, f"{drive} s/{position}"),
-        ("k", "spring", chain.k, f"{drive}/{position}"),
+        ("m", "mass", chain.m, units.mass),
+        ("c", "damping", chain.c, units.damping),
+        ("k", "spring", chain.k, units.stiffness),
     )
     listed = [
         (letter, noun, unit, i, float(value), std.get(f"{letter}_{i}"))
@@ -240,9 +231,7 @@ def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
         )
         for (letter, noun, unit, i, value, error), text in zip(listed, numbers, strict=True)
     ]
-    return page.table(
-        _WORDS.text("chain_table"), ("Symbol", "Meaning", "Value", "Unit"), rows, "lldl"
-    )
+    return page.table(_WORDS, "chain_table", rows, "lldl")
 
 
 def _where(noun: str, i: int, n: int) -> str:

@@ -11,24 +11,17 @@ from typing import Literal
 import numpy as np
 
 from pipeline.names import read_name
-from pipeline.report import limits
-from pipeline.report.document import (
-    Block,
-    Heading,
-    Paragraph,
-    Question,
-    Section,
-    Span,
-    paragraph,
-    plain,
-)
-from pipeline.report.numbers import count, listing, percent, significant
-from pipeline.report.phrases import phrases
+from pipeline.report.document import Block, Heading, Paragraph, Question, Section, paragraph
 from pipeline.report.sections.answers import named
+from pipeline.report.sections.loops import CLOSE
 from pipeline.report.sections.notes import discussion_blocks, even_headings
-from pipeline.report.words import clean, rich, source_text
+from pipeline.report.sections.parameters import source_text
 from pipeline.results import Analysis, HardwareCheck, ParameterRow
-from pipeline.stages.limits import DAMPING_LIMIT
+from pipeline.stages.compare import DAMPING_LIMIT
+from pipeline.words.numbers import count, listing, percent, significant
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Span, plain
+from pipeline.words.text import clean, rich
 
 _WORDS = phrases("questions")
 _MOST = 6  # a report with more would be a questionnaire
@@ -157,7 +150,7 @@ def _friction(analysis: Analysis) -> Iterator[Asked]:
             if at_small > at_large > 0:
                 sizes = {"small": small, "large": large, "at_small": at_small, "at_large": at_large}
                 told = {name: significant(value, digits=2) for name, value in sizes.items()}
-                unit = clean(analysis.position_unit)
+                unit = clean(analysis.bench.units.position)
                 rise = _WORDS.text("friction_rises", unit=unit, **told)
         text = _WORDS.text("friction", run=decay.experiment, cart=cart, rise=rise)
         yield Asked(kind="friction", id=f"friction-{cart}", section="decays", text=text)
@@ -205,20 +198,20 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
     design = analysis.feedback
     controlled = [c for c in closed if design is None or c.cart == design.cart] or closed
     off = max(controlled, key=_level_error, default=None)
-    if off and _level_error(off) > limits.LEVEL:
+    if off and _level_error(off) > 0.03:  # of the level: worth a question
         yield _of_run(
             off,
             "level",
             measured=significant(off.steady_state_measured, digits=3),
             model=significant(off.steady_state_model, digits=3),
-            unit=clean(analysis.position_unit),
+            unit=clean(analysis.bench.units.position),
         )
     over = max(controlled, key=_overshoot_error, default=None)
-    if over and _overshoot_error(over) > limits.OVERSHOOT:
+    if over and _overshoot_error(over) > 5.0:  # percent of the step: worth a question
         measured, model = percent(over.overshoot_measured), percent(over.overshoot_model)
         yield _of_run(over, "overshoot", measured=measured, model=model)
     far = max(analysis.hardware, key=lambda check: check.nrmse, default=None)
-    if far and far.nrmse > limits.CLOSE:
+    if far and far.nrmse > CLOSE:
         yield _of_run(far, "hardware", share=percent(100 * far.nrmse))
 
 

@@ -4,20 +4,15 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 
 from pipeline.names import Name, read_name
-from pipeline.report import limits
-from pipeline.report.document import (
-    Block,
-    Span,
-    Spans,
-    Tile,
-    Tiles,
-    Tone,
-    bullet_list,
-    paragraph,
-    plain,
-    spans,
-)
-from pipeline.report.numbers import (
+from pipeline.plant.limits import CALIBRATION
+from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
+from pipeline.report.sections.actions import next_steps, set_up_in_doubt
+from pipeline.report.sections.housekeeping import taken_text
+from pipeline.report.sections.loops import CLOSE
+from pipeline.report.sections.measurements import overview_blocks
+from pipeline.report.sections.page import Page
+from pipeline.results import Analysis, Estimate, HardwareCheck, ParameterRow
+from pipeline.words.numbers import (
     NOTHING,
     count,
     listing,
@@ -26,13 +21,9 @@ from pipeline.report.numbers import (
     unit_text,
     with_error,
 )
-from pipeline.report.phrases import phrases
-from pipeline.report.sections.actions import next_steps, set_up_in_doubt
-from pipeline.report.sections.housekeeping import taken_text
-from pipeline.report.sections.measurements import overview_blocks
-from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, names_spans, plain_lines, rich
-from pipeline.results import Analysis, Estimate, HardwareCheck, ParameterRow
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Span, Spans, plain, spans
+from pipeline.words.text import clean, name_span, names_spans, rich
 
 _WORDS = phrases("summary")
 _KINDS = {  # of recordings
@@ -96,8 +87,8 @@ def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
 
 
 def _identified(analysis: Analysis) -> Block:
-    single, fit = analysis.carts == 1, analysis.fit
-    carts = _WORDS.text("one_cart" if single else "carts", n=analysis.carts)
+    single, fit = analysis.bench.n == 1, analysis.fit
+    carts = _WORDS.text("one_cart" if single else "carts", n=analysis.bench.n)
     if fit is None:
         unused = {one.experiment for one in analysis.left_out}
         used = _runs(analysis, [r.id for r in analysis.records if r.id not in unused])
@@ -156,7 +147,7 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
             error=error,
         )
         for row in analysis.rows
-        if row.final and (analysis.carts == 1 or _is_told(read_name(row.name)))
+        if row.final and (analysis.bench.n == 1 or _is_told(read_name(row.name)))
     )
 
 
@@ -169,13 +160,14 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error:
     """Return a number in four digits; a smaller error than any calibration's is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
-        value = significant(final.value, digits=limits.UNSURE_DIGITS)
-    elif 0 < share < limits.CALIBRATION:
+        value = significant(final.value, digits=3)  # the error says too little of the rest
+    elif 0 < share < CALIBRATION:
         value = significant(final.value)
         told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {told}" if unit else told
     else:
-        value = with_error(final.value, final.std, digits=2 if share >= limits.COARSE else 1)
+        # Of an error from a percent on two digits leave four of the value.
+        value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
 
@@ -206,7 +198,7 @@ def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
         tiles.append(Tile(spans(label), spans(value), spans(note), _tone(good), "#feedback"))
     if analysis.hardware:
         best, worst = _extremes(analysis)
-        good, note = worst.nrmse <= limits.CLOSE, _WORDS.text("tile_apart")
+        good, note = worst.nrmse <= CLOSE, _WORDS.text("tile_apart")
         value = _range(best, worst, to="–")
         tiles.append(_tile("tile_hardware", value, note, good=good, url="#hardware"))
     return tuple(tiles)
@@ -327,7 +319,7 @@ def _hardware(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not analysis.hardware:
         return None
     best, worst = _extremes(analysis)
-    return worst.nrmse <= limits.CLOSE, _WORDS.spans(
+    return worst.nrmse <= CLOSE, _WORDS.spans(
         "hardware",
         range=_range(best, worst, to=" to "),
         cart=str(worst.cart),
@@ -348,7 +340,7 @@ def _range(best: HardwareCheck, worst: HardwareCheck, *, to: str) -> str:
 def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
     if not analysis.skipped:
         return None
-    names = list(dict.fromkeys(clean(skip.stage) for skip in analysis.skipped))
+    names = list(dict.fromkeys(clean(skip.name) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
     # A name has commas in it: "log decrement, decay-1, cart 1".
     stages = "; ".join(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))

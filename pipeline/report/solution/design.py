@@ -8,20 +8,20 @@ from scipy.linalg import solve_discrete_are
 from pipeline.arrays import Array, ComplexArray
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
-from pipeline.report.document import Block, Code, bullet_list, cell, paragraph, spans
+from pipeline.report.document import Block, Code, bullet_list, paragraph
 from pipeline.report.equations.algebra import value_term
 from pipeline.report.equations.model import formula, matlab_matrix, number_matrix
-from pipeline.report.math.tex import from_tex
-from pipeline.report.math.tree import Math, Term, matrix, parens, power, row, total
-from pipeline.report.numbers import complex_text, percent, significant
-from pipeline.report.phrases import phrases
 from pipeline.report.sections.loops import margin_rows
 from pipeline.report.sections.page import Page
 from pipeline.results import FeedbackDesign
+from pipeline.words.math import Math, Term, fraction, matrix, parens, power, row, total
+from pipeline.words.numbers import complex_text, percent, significant
+from pipeline.words.phrases import phrases
 
 _WORDS = phrases("solution")
 _INVERSE = row("−", "1")
-_WEIGHED = r"{R + \Gamma^T P \Gamma}"
+_PHI_T, _GAMMA_T = power("Φ", "T"), power("Γ", "T")
+_WEIGHED = row("R", "+", _GAMMA_T, "P", "Γ")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -106,6 +106,7 @@ def design_blocks(page: Page) -> list[Block]:
     except np.linalg.LinAlgError:
         return [paragraph(_WORDS.text("too_far_apart"))]
     T = significant(design.sample_time)
+    loop = parens("I", "−", "Φ", "+", "Γ", "G")
     return [
         paragraph(_WORDS.text("sampled", seconds=T)),
         formula(
@@ -127,43 +128,40 @@ def design_blocks(page: Page) -> list[Block]:
         paragraph(_WORDS.text("prefilter", cart=design.cart)),
         formula(
             row(
-                from_tex(r"\text{prefilter} = \frac{1}{c (I - \Phi + \Gamma G)^{-1} \Gamma}"),
+                row("prefilter", "=", fraction(row("1"), row("c", power(loop, _INVERSE), "Γ"))),
                 "≈",
                 value_term(worked.prefilter),
             )
         ),
         _pole_table(page, design, worked),
-        paragraph("The same in Matlab:"),
+        paragraph(_WORDS.text("in_matlab")),
         Code(_matlab(design)),
-        paragraph(
-            f"Simulated with the delay and the input's limit, the step overshoots by "
-            f"{percent(design.overshoot_percent)}, settles "
-            + (
-                f"in {significant(design.settling_time, digits=3)} s"
-                if design.settling_time is not None
-                else "not within the time simulated"
-            )
-            + f" and needs {significant(design.peak_input, digits=3)} {page.drive} at most."
-        ),
+        paragraph(_simulated(design, drive=page.drive)),
         *_margins(design),
         paragraph(_WORDS.text("not_unique")),
         bullet_list(
-            spans(text)
-            for text in (
-                _WORDS.text("right_poles"),
-                _WORDS.text("right_prefilter", cart=design.cart),
-                _WORDS.text("right_step"),
-            )
+            _WORDS.spans(f"right_{what}", cart=str(design.cart))
+            for what in ("poles", "prefilter", "step")
         ),
     ]
 
 
+def _simulated(design: FeedbackDesign, *, drive: str) -> str:
+    """Say what the step does, simulated with the delay and the input's limit."""
+    settled = design.settling_time
+    return _WORDS.text(
+        "simulated" if settled is not None else "simulated_unsettled",
+        overshoot=percent(design.overshoot_percent),
+        seconds=significant(settled, digits=3),
+        peak=significant(design.peak_input, digits=3),
+        drive=drive,
+    )
+
+
 def _margins(design: FeedbackDesign) -> list[Block]:
     rows = margin_rows(design.margins)
-    found = [f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows]
-    if not found:
-        return []
-    return [paragraph(_WORDS.text("margins", margins=", ".join(found)))]
+    found = ", ".join(f"{name} {value}{unit} {at}".strip() for name, value, unit, at in rows)
+    return [paragraph(_WORDS.text("margins", margins=found))] if found else []
 
 
 def _regulator(design: FeedbackDesign, worked: WorkedDesign, *, tied: bool) -> list[Block]:
@@ -176,11 +174,14 @@ def _regulator(design: FeedbackDesign, worked: WorkedDesign, *, tied: bool) -> l
         formula(row("R", "≈", value_term(float(design.R or 1.0)))),
         paragraph(_WORDS.text("riccati")),
         formula(
-            from_tex(rf"P = Q + \Phi^T P \Phi - \frac{{\Phi^T P \Gamma \Gamma^T P \Phi}}{_WEIGHED}")
+            row(
+                *("P", "=", "Q", "+", _PHI_T, "P", "Φ", "−"),
+                fraction(row(_PHI_T, "P", "Γ", _GAMMA_T, "P", "Φ"), _WEIGHED),
+            )
         ),
         _numbers("P", worked.P, "P"),
-        paragraph("and gives the gains:"),
-        formula(from_tex(rf"G = \frac{{\Gamma^T P \Phi}}{_WEIGHED}")),
+        paragraph(_WORDS.text("riccati_gains")),
+        formula(row("G", "=", fraction(row(_GAMMA_T, "P", "Φ"), _WEIGHED))),
     ]
 
 
@@ -193,31 +194,24 @@ def _placement(design: FeedbackDesign, worked: WorkedDesign) -> list[Block]:
     poles = design.poles if design.requested_poles is None else design.requested_poles
     slow = poles[np.argmin(np.abs(poles))]
     zeta = float(-slow.real / abs(slow))
-    words = (
-        f"The slowest pair has ω = {significant(float(abs(slow)), digits=3)} rad/s and ζ = "
-        f"{significant(zeta, digits=3)}; alone it would overshoot by "
-        f"{percent(_overshoot(zeta))} and settle in about 4/(ζω) = "
-        f"{significant(float(-4 / slow.real), digits=3)} s. "
-        if slow.imag != 0 and slow.real < 0
-        else ""
-    )
+    slowest, n = "", worked.gamma.size
+    if slow.imag != 0 and slow.real < 0:
+        slowest = _WORDS.text(
+            "slowest",
+            omega=significant(float(abs(slow)), digits=3),
+            zeta=significant(zeta, digits=3),
+            overshoot=percent(_overshoot(zeta)),
+            seconds=significant(float(-4 / slow.real), digits=3),
+        )
+    last = matrix([[*["0"] * (n - 1), "1"]])
+    gains = row("G", "=", last, power(_controllability(n), _INVERSE), "p", parens("Φ"))
     return [
-        paragraph(
-            f"{words}Every pole s becomes z = exp(sT), and the poles multiply out to the wanted "
-            "polynomial; the plant's own is that of Φ:"
-        ),
+        paragraph(_WORDS.text("placed", slowest=slowest)),
         formula(_polynomial("p", worked.closed_loop)),
         formula(_polynomial("a", worked.open_loop)),
-        paragraph(
-            _WORDS.text("ackermann")
-        ),
-        formula(
-            row(
-                "G", "=", matrix([[*["0"] * (worked.gamma.size - 1), "1"]]),
-                power(_controllability(worked.gamma.size), _INVERSE), "p", parens("Φ"),
-            )
-        ),
-    ]  # fmt: skip
+        paragraph(_WORDS.text("ackermann")),
+        formula(gains),
+    ]
 
 
 def _controllability(n: int) -> Math:
@@ -264,18 +258,14 @@ def _overshoot(zeta: float) -> float:
 def _pole_table(page: Page, design: FeedbackDesign, worked: WorkedDesign) -> Block:
     order = np.lexsort((worked.z.imag, -np.abs(worked.z)))
     s = np.log(worked.z[order]) / design.sample_time
-    return page.table(
-        _WORDS.text("worked_poles"),
-        ("z", "|z|", "s [rad/s]", "Frequency [rad/s]", "Damping ratio"),
-        [
-            [
-                cell(complex_text(z, digits=4)),
-                cell(significant(abs(z))),
-                cell(complex_text(pole, digits=4)),
-                cell(significant(abs(pole), digits=3)),
-                cell(significant(-pole.real / abs(pole), digits=3)),
-            ]
-            for z, pole in zip(worked.z[order], s, strict=True)
-        ],
-        "rrrrr",
-    )
+    rows = [
+        (
+            complex_text(z, digits=4),
+            significant(abs(z)),
+            complex_text(pole, digits=4),
+            significant(abs(pole), digits=3),
+            significant(-pole.real / abs(pole), digits=3),
+        )
+        for z, pole in zip(worked.z[order], s, strict=True)
+    ]
+    return page.table(_WORDS, "worked_poles", rows, "rrrrr")

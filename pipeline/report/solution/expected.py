@@ -1,7 +1,7 @@
 """What a rubric would expect: every number with its tolerance, and why so wide."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -10,71 +10,91 @@ from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
 from pipeline.grading.references.reference import in_doubt, recompute
 from pipeline.grading.rubric import Rubric, matching
-from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.rubric_file import shipped_rubric
+from pipeline.json_files import Matrix, computed, json_text, result, written
 from pipeline.names import read_name
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Block, Span, bullet_list, cell, paragraph, spans
+from pipeline.report.document import Block, Cell, bullet_list, cell, paragraph
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import evaluate, work_out
-from pipeline.report.numbers import NOTHING, count, percent, significant, unit_text
-from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.words import clean, name_span, rich
-from pipeline.resources import RUBRICS
-from pipeline.results import Analysis
-from pipeline.results_json import provenance
-from pipeline.schemas import solution as schema
-from pipeline.schemas.base import fields_of, json_text
-from pipeline.submission import Input, System
+from pipeline.results import Analysis, Check, FeedbackDesign, Provenance, Submitted
+from pipeline.submission import InputScale, System
+from pipeline.words.numbers import NOTHING, count, percent, significant, unit_text
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Span
+from pipeline.words.text import clean, name_span, rich
 
 _WORDS = phrases("solution")
-SCHEMA = "cartlab-solution/1"
 
 
-@dataclass(frozen=True, kw_only=True)
+@result()
 class Expected:
-    """A final estimate, and from where to where the rubric gives full points for it.
+    """A parameter and what the rubric gives full points for; null where it is not judged."""
 
-    Attributes
-    ----------
-    percent : that the rubric allows beyond the reference's own bounds; None if it is not judged.
-    low, high : the bounds for full points, in the parameter's unit; None if it is not judged.
-    """
-
-    name: str
-    unit: str
-    value: float
-    std: float | None
-    percent: float | None
-    low: float | None
-    high: float | None
+    name: str = written()
+    unit: str = written()
+    value: float = written()
+    std: float | None = written()
+    percent: float | None = written("beyond the reference's own bounds")
+    low: float | None = written("the least for full points, in its unit")
+    high: float | None = written("the most for full points, in its unit")
 
     @property
+    @computed()
     def tolerance(self) -> float | None:
-        """Half of the way between the bounds."""
+        """Half of the way between the two."""
         return None if self.low is None or self.high is None else (self.high - self.low) / 2
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
 class ExpectedModel:
-    """A (2n, 2n) and B (2n,) with what the parameters' tolerances make of every entry."""
+    """The state model, and how far each entry moves within the parameters' tolerances.
 
-    A: Array
-    B: Array
-    A_tolerance: Array
-    B_tolerance: Array
+    A is (2n, 2n), B is (2n, 1).
+    """
+
+    A: Matrix = written()
+    A_tolerance: Matrix = written()
+    B: Matrix = written()
+    B_tolerance: Matrix = written()
+
+
+@result(eq=False)
+class Solution:
+    """What a rubric would expect, with tolerances."""
+
+    schema: Literal["cartlab-solution/1"] = written(default="cartlab-solution/1")
+    submission: Submitted = written(part=("title", "carts", "springs", "units"))
+    rubric: str = written("title of the one that says what is accepted")
+    parameters: tuple[Expected, ...] = written()
+    state_space: ExpectedModel | None = written()
+    feedback: FeedbackDesign | None = written(
+        "the reference design; gains are not unique, so others may be as right",
+        part=(
+            "cart", "method", "sample_time", "gains", "prefilter", "poles", "overshoot_percent",
+            "settling_time", "peak_input", "margins",
+        ),
+    )  # fmt: skip
+    doubts: tuple[Check, ...] = written(
+        "the checks that failed: the numbers are no reference before they are explained",
+        part=("id", "message"),
+        older=(),
+    )
+    provenance: Provenance = written()
 
 
 def default_rubric(analysis: Analysis) -> Rubric:
     """Return the shipped rubric for so many carts, else one with the checks' own limits."""
-    shipped = RUBRICS / f"throne-{analysis.carts}dof.toml"
-    if shipped.is_file():
-        return load_rubric(shipped)
+    if shipped := shipped_rubric(analysis.bench.n):
+        return shipped
     checks = (
         asked.Parameters(id="final", points=1.0, check="final"),
         asked.StateModel(id="state-model", points=1.0, check="state_space"),
     )
-    system = System(carts=analysis.carts, springs=analysis.springs, input=Input(unit="V"))
+    system = System(
+        carts=analysis.bench.n, springs=analysis.bench.springs, input=InputScale(unit="V")
+    )
     return Rubric(version=1, title=_WORDS.text("no_rubric"), system=system, criteria=checks)
 
 
@@ -134,7 +154,7 @@ def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedMod
     A, B, _, _ = chain.state_space()
     if not chain.is_tied or chain.n > derivation.MOST_CARTS:
         zero = np.zeros_like(A)
-        return ExpectedModel(A=A, B=B[:, 0], A_tolerance=zero, B_tolerance=zero[:, 0])
+        return ExpectedModel(A=A, B=B, A_tolerance=zero, B_tolerance=zero[:, :1])
     table = derivation.given(chain)
     steps = derivation.state_steps(chain.n)
     rows, column = derivation.state_entries(chain.n)
@@ -153,7 +173,7 @@ def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedMod
     moved = np.sqrt(np.sum(np.square(moves), axis=0))
     size = A.size
     return ExpectedModel(
-        A=A, B=B[:, 0], A_tolerance=moved[:size].reshape(A.shape), B_tolerance=moved[size:]
+        A=A, B=B, A_tolerance=moved[:size].reshape(A.shape), B_tolerance=moved[size:, None]
     )
 
 
@@ -171,33 +191,27 @@ def expected_blocks(page: Page, rubric: Rubric) -> list[Block]:
         ]
     blocks += [
         paragraph(_WORDS.text("accepted", rubric=clean(rubric.title) or _WORDS.text("untitled"))),
-        page.table(
-            _WORDS.text("expected_table"),
-            ("Parameter", "Unit", "Expected", "Full points within", "from", "to", "In Hz: a slip"),
-            [
-                [
-                    cell(name_span(p.name)),
-                    cell(unit_text(clean(p.unit)) or "1"),
-                    cell(significant(p.value)),
-                    cell(f"{p.percent:g} %" if p.percent is not None else "not judged"),
-                    cell(significant(p.low)),
-                    cell(significant(p.high)),
-                    cell(
-                        significant(p.value / (2 * np.pi))
-                        if read_name(p.name).is_frequency
-                        else NOTHING,
-                        "quiet",
-                    ),
-                ]
-                for p in parameters
-            ],
-            "llrrrrr",
-        ),
+        page.table(_WORDS, "expected_table", map(_expected_row, parameters), "llrrrrr"),
     ]
     if analysis.chain.is_tied and analysis.chain.n <= derivation.MOST_CARTS:
         model = expected_model(analysis.chain, _tolerances(parameters))
         blocks += [_state_table(page, model), *_state_judged(rubric)]
-    return [*blocks, paragraph("How to judge a hand-in:"), _advice(analysis)]
+    advice = ("order", "large", "initial", *(["laws"] if analysis.bench.n > 1 else []))
+    judged = bullet_list(_WORDS.spans(f"advice_{what}") for what in advice)
+    return [*blocks, paragraph(_WORDS.text("how_to_judge")), judged]
+
+
+def _expected_row(p: Expected) -> list[Cell]:
+    hertz = significant(p.value / (2 * np.pi)) if read_name(p.name).is_frequency else NOTHING
+    return [
+        cell(name_span(p.name)),
+        cell(unit_text(clean(p.unit)) or "1"),
+        cell(significant(p.value)),
+        cell(f"{p.percent:g} %" if p.percent is not None else "not judged"),
+        cell(significant(p.low)),
+        cell(significant(p.high)),
+        cell(hertz, "quiet"),
+    ]
 
 
 def _tolerances(parameters: Iterable[Expected]) -> dict[str, float]:
@@ -220,33 +234,22 @@ def _state_judged(rubric: Rubric) -> list[Block]:
 
 
 def _state_table(page: Page, model: ExpectedModel) -> Block:
-    rows = []
-    for i, line in enumerate(model.A):
-        for j, value in enumerate(line):
-            if model.A_tolerance[i, j] > 0:
-                name = f"A({i + 1}, {j + 1})"
-                rows.append(_state_row(name, float(value), float(model.A_tolerance[i, j])))
-    rows += [
-        _state_row(f"B({i + 1})", float(value), float(tolerance))
-        for i, (value, tolerance) in enumerate(zip(model.B, model.B_tolerance, strict=True))
+    B, B_tolerance = model.B.ravel(), model.B_tolerance.ravel()
+    A, B = (
+        zip(np.ndindex(M.shape), M.flat, tolerance.flat, strict=True)
+        for M, tolerance in ((model.A, model.A_tolerance), (B, B_tolerance))
+    )
+    rows = [
+        (
+            f"{name}({', '.join(str(i + 1) for i in at)})",
+            significant(float(value)),
+            percent(100 * float(tolerance) / abs(float(value))),
+        )
+        for name, entries in (("A", A), ("B", B))
+        for at, value, tolerance in entries
         if tolerance > 0
     ]
-    return page.table(_WORDS.text("state_table"), ("Entry", "Expected", "moves by ±"), rows, "lrr")
-
-
-def _state_row(name: str, value: float, tolerance: float) -> list:
-    return [cell(name), cell(significant(value)), cell(percent(100 * tolerance / abs(value)))]
-
-
-def _advice(analysis: Analysis) -> Block:
-    advice = [
-        _WORDS.text("advice_order"),
-        _WORDS.text("advice_large"),
-        _WORDS.text("advice_initial"),
-    ]
-    if analysis.carts > 1:
-        advice.append(_WORDS.text("advice_laws"))
-    return bullet_list(spans(text) for text in advice)
+    return page.table(_WORDS, "state_table", rows, "lrr")
 
 
 def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
@@ -256,34 +259,13 @@ def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
     """
     rubric = rubric or default_rubric(analysis)
     parameters = expected_parameters(analysis, rubric)
-    chain, design = analysis.chain, analysis.feedback
-    model = chain and expected_model(chain, _tolerances(parameters))
-    content = {
-        "schema": SCHEMA,
-        "submission": fields_of(
-            schema.SolutionSubmission,
-            analysis,
-            units={"position": analysis.position_unit, "input": analysis.input_unit},
-        ),
-        "rubric": rubric.title,
-        "parameters": [
-            fields_of(schema.ExpectedParameter, p, tolerance=p.tolerance) for p in parameters
-        ],
-        "state_space": model
-        and {
-            "A": model.A,
-            "A_tolerance": model.A_tolerance,
-            "B": model.B[:, None],
-            "B_tolerance": model.B_tolerance[:, None],
-        },
-        "feedback": design
-        and fields_of(
-            schema.ReferenceFeedback,
-            design,
-            poles=[[pole.real, pole.imag] for pole in design.poles],
-            margins=design.margins and vars(design.margins),
-        ),
-        "doubts": [fields_of(schema.Doubt, check) for check in analysis.failed_checks],
-        "provenance": provenance(analysis),
-    }
-    return json_text(content)
+    solution = Solution(
+        submission=analysis.submission,
+        rubric=rubric.title,
+        parameters=parameters,
+        state_space=analysis.chain and expected_model(analysis.chain, _tolerances(parameters)),
+        feedback=analysis.feedback,
+        doubts=analysis.failed_checks,
+        provenance=analysis.provenance,
+    )
+    return json_text(solution)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from pipeline.report.document import Block, Formula, Heading, Paragraph, paragraph, spans
+from pipeline.report.document import Block, Formula, Heading, Paragraph, paragraph
 from pipeline.report.equations import derivation
 from pipeline.report.equations.algebra import (
     Equation,
@@ -15,11 +15,12 @@ from pipeline.report.equations.algebra import (
 )
 from pipeline.report.equations.model import formula, symbolic_transfer_functions
 from pipeline.report.figures.carts import free_body_figure
-from pipeline.report.math.tree import Math, Term, lines, matrix, row, total
-from pipeline.report.phrases import phrases
 from pipeline.report.sections.page import Page
-from pipeline.report.sections.parameters import fitted_chain_table
-from pipeline.report.words import rich
+from pipeline.report.sections.parameters import chain_table
+from pipeline.words.math import Math, Term, lines, matrix, row, total
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import spans
+from pipeline.words.text import rich
 
 _WORDS = phrases("solution")
 _MOST_ADDENDS = 3  # of a sum whose products are written out with numbers
@@ -28,16 +29,11 @@ _A_LINE = 7  # terms of a sum
 
 def motion_blocks(page: Page) -> list[Block]:
     """Derive the equations of motion from the carts cut free."""
-    springs = page.analysis.springs
+    springs = page.analysis.bench.springs
     n = len(springs) - 1
     return [
         paragraph(_WORDS.text("cut_free")),
-        page.picture(
-            "free-bodies",
-            free_body_figure(springs),
-            caption=_WORDS.text("free_bodies"),
-            alt=_WORDS.text("free_bodies_alt", n=n),
-        ),
+        page.picture("free-bodies", free_body_figure(springs), _WORDS, "free_bodies", n=n),
         paragraph(_WORDS.text("newton")),
         _written(derivation.newton(springs)),
         paragraph(_WORDS.text("laplace")),
@@ -47,17 +43,16 @@ def motion_blocks(page: Page) -> list[Block]:
 
 def transfer_blocks(page: Page) -> list[Block]:
     """Derive the transfer functions by eliminating the carts from the last to the first."""
-    springs = page.analysis.springs
+    springs = page.analysis.bench.springs
     n = len(springs) - 1
     symbolic = symbolic_transfer_functions(springs)
     if not all(springs[1:-1]) or n > derivation.MOST_CARTS:
         return []
     if n == 1:
+        said = rich(_WORDS.text("one_cart" if symbolic else "one_cart_no_spring"))
         return [
-            rich_paragraph(
-                _WORDS.text("one_cart") if symbolic else _WORDS.text("one_cart_no_spring")
-            ),
-            *([symbolic] if symbolic else [_written([Equation("X_1/U", "1/(m*s**2+c*s)")])]),
+            Paragraph(said),
+            symbolic or _written([Equation("X_1/U", "1/(m*s**2+c*s)")]),
         ]
     last = f"carts 1 and {n}" if n > 2 else "the two carts"
     blocks: list[Block] = [
@@ -67,11 +62,7 @@ def transfer_blocks(page: Page) -> list[Block]:
         _written(derivation.per_mass(n)),
         paragraph(_WORDS.text("eliminate", last=last)),
         _written(derivation.elimination(n)),
-        paragraph(
-            "Δ(s) is the characteristic polynomial: all transfer functions share it. The zeros of "
-            "a cart are the poles of what lies beyond it, with the cart itself held."
-            + (" N(s) belongs to carts 2 and 3." if n == 3 else "")
-        ),
+        paragraph(_WORDS.text("characteristic_3" if n == 3 else "characteristic")),
         _written(derivation.transfer(n)),
         paragraph(_WORDS.text("static_gains")),
         _written(derivation.static_gains(n)),
@@ -87,12 +78,12 @@ def transfer_blocks(page: Page) -> list[Block]:
 def state_blocks(page: Page) -> list[Block]:
     """Put the numbers in: from the table of parameters to A and B, and to masses and springs."""
     analysis = page.analysis
-    fit, springs = analysis.fit, analysis.springs
+    fit, springs = analysis.fit, analysis.bench.springs
     if fit is None:
         return []
     chain = fit.chain
     n = chain.n
-    table = fitted_chain_table(page, fit)
+    table = chain_table(page, fit.chain, std=fit.std)
     if not chain.is_tied or n > derivation.MOST_CARTS:
         return [paragraph(_WORDS.text("no_wall")), table]
     values = derivation.work_state_model(chain)
@@ -104,7 +95,7 @@ def state_blocks(page: Page) -> list[Block]:
         known: list[Math] = [row(shown(k), "=", value_term(v)) for k, v in unnamed.items()]
         blocks += [paragraph(_WORDS.text("unnamed")), _together(known)]
     for title, words, equations in _steps(n):
-        blocks += [Heading(spans(title)), *([rich_paragraph(words)] if words else [])]
+        blocks += [Heading(spans(title)), *([Paragraph(rich(words))] if words else [])]
         blocks += worked(equations, values)
     blocks += [Heading(spans("The state model")), *_matrices(n, values)]
     blocks += [
@@ -134,10 +125,10 @@ def _matrices(n: int, values: Mapping[str, float]) -> list[Block]:
     A, B = derivation.state_entries(n)
     names = "(x1, v1)" if n == 1 else "(x1, v1, x2, v2)" if n == 2 else "(x1, v1, x2, v2, …)"
     return [
-        paragraph(f"With the state {names}, position before velocity:"),
+        paragraph(_WORDS.text("with_state", names=names)),
         formula(row("A", "=", matrix([[shown(entry) for entry in line] for line in A]))),
         formula(row("B", "=", matrix([[shown(entry)] for entry in B]))),
-        paragraph("With numbers:"),
+        paragraph(_WORDS.text("with_numbers")),
         formula(row("A", "=", matrix([[_entry(entry, values) for entry in line] for line in A]))),
         formula(row("B", "=", matrix([[_entry(entry, values)] for entry in B]))),
     ]
@@ -148,25 +139,19 @@ def _entry(text: str, values: Mapping[str, float]) -> Term:
 
 
 def _redundancies(laws: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
-    count = "One law is" if len(laws) == 1 else f"{len(laws)} laws are"
+    count = "one law is" if len(laws) == 1 else f"{len(laws)} laws are"
     return [
-        paragraph(_WORDS.text("laws_left", count=count.lower())),
+        paragraph(_WORDS.text("laws_left", count=count)),
         *(_law(law, values) for law in laws),
     ]
 
 
 def _law(law: Equation, values: Mapping[str, float]) -> Formula:
-    sides = (value_term(evaluate(side, values)) for side in (law.left, law.right))
-    left, right = sides
+    left, right = (value_term(evaluate(side, values)) for side in (law.left, law.right))
     return formula(lines([row(shown(law.left), "=", shown(law.right)), row(left, "=", right)]))
 
 
 # ------------------------------------------------------------------------- formulas
-
-
-def rich_paragraph(text: str) -> Paragraph:
-    """Return a paragraph with parameter names as mathematics."""
-    return Paragraph(rich(text))
 
 
 def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:

@@ -1,17 +1,15 @@
 """The instructor's reference: the report, with the derivations and the numbers put in."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from pipeline.gap.types import Gap
 from pipeline.grading.rubric import Rubric
 from pipeline.output import write_file
-from pipeline.report.document import Document, Paragraph, Span, paragraph
-from pipeline.report.draft.content import Part, build_document
+from pipeline.report.document import Document, Paragraph, paragraph
+from pipeline.report.draft.content import build_document
 from pipeline.report.gap.section import with_gap
-from pipeline.report.numbers import count
-from pipeline.report.phrases import phrases
+from pipeline.report.render.builder import Part
 from pipeline.report.render.write import write_document
 from pipeline.report.sections.questions import Asked
 from pipeline.report.solution.design import design_blocks
@@ -22,9 +20,13 @@ from pipeline.report.solution.expected import (
     solution_text,
 )
 from pipeline.report.solution.model import motion_blocks, state_blocks, transfer_blocks
-from pipeline.report.words import rich
 from pipeline.results import Analysis
 from pipeline.submission import Submission
+from pipeline.words.numbers import count
+from pipeline.words.phrases import phrases
+from pipeline.words.progress import Progress, silent
+from pipeline.words.spans import Span
+from pipeline.words.text import rich
 from pipeline.workflow import analyse
 
 _WORDS = phrases("solution")
@@ -36,7 +38,7 @@ def make_solution(
     *,
     rubric: Rubric | None = None,
     pdf: bool = True,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[Analysis, str]:
     """Analyse a submission, write its reference; return the analysis and solution.json.
 
@@ -64,7 +66,7 @@ def render_solution(
     rubric: Rubric | None = None,
     gap: Gap | None = None,
     pdf: bool = True,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> None:
     """Write `solution.html`, `solution.pdf` and `figures/*.svg` into the folder `out`."""
     document = build_solution(analysis, rubric=rubric, gap=gap, progress=progress)
@@ -76,7 +78,7 @@ def build_solution(
     *,
     rubric: Rubric | None = None,
     gap: Gap | None = None,
-    progress: Callable[[str], None] | None = None,
+    progress: Progress = silent,
 ) -> Document:
     """Return the report with the worked sections in the place of the short ones on the model.
 
@@ -94,7 +96,7 @@ def build_solution(
     document = build_document(
         analysis, gap=gap, worked=worked, answer=model_answer, progress=progress
     )
-    told = ["Worked reference for instructors", count(analysis.carts, "cart")]
+    told = ["Worked reference for instructors", count(analysis.bench.n, "cart")]
     if analysis.failed_checks:
         told.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
     return replace(document, subtitle=" · ".join(told))

@@ -15,7 +15,7 @@ from pipeline.grading.batch.worker import Setup, Task
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import Students, write_submission
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 
@@ -61,9 +61,8 @@ def grade(folder, out, execute, progress=lambda *_: None):
     with Gradebook(out, create=True) as book:
         batch = grade_batch(
             find_hand_ins([folder], scratch=out / "scratch"),
-            rubric=RUBRIC,
+            setup=Setup(rubric=RUBRIC, scratch=out / "scratch"),
             book=book,
-            scratch=out / "scratch",
             execute=execute,
             progress=progress,
         )
@@ -78,11 +77,11 @@ def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp
     for number in range(5):
         write_submission(
             tmp_path / "class" / f"team-{number}",
-            chain="throne-1dof",
+            "throne-1dof",
             seed=number,
-            authors=(f"s{number}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{number}",)),
         )
     (tmp_path / "class" / "team-9").mkdir()
     seen = []
@@ -113,9 +112,9 @@ def test_an_address_that_is_no_schedulers_is_refused():
 def test_nobody_there_is_said(monkeypatch):
     """Where no scheduler listens the batch does not begin."""
     monkeypatch.setattr("pipeline.grading.batch.cluster._CONNECT_LIMIT", 1)
-    setup = Setup(rubric="", time_limit=1.0, memory_limit=1, scratch="")
+    setup = Setup(rubric=RUBRIC, scratch=Path())
     with socket.socket() as bound:  # a port that answers nobody
         bound.bind(("127.0.0.1", 0))
         execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
         with pytest.raises(ConfigError, match="no scheduler answers"):
-            list(execute([Task(id="t", key="k", sources=())], setup, 1.0))
+            list(execute([Task(id="t", key="k", sources=())], setup))

@@ -16,7 +16,7 @@ from pipeline.grading.batch.worker import Task, grade_task
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.places import ROOT
 
 RUBRIC = load_rubric(Path("throne-1dof"))
@@ -31,11 +31,11 @@ def teams(tmp_path_factory) -> Path:
     for number in (0, 2):
         write_submission(
             folder / f"team-{number}",
-            chain="throne-1dof",
+            "throne-1dof",
             seed=number,
-            authors=(f"s{number}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{number}",)),
         )
         lines = "".join(f"{i / 1000:.3f},{i % 97}\n" for i in range(_MEMBER // 10))
         (folder / f"team-{number}" / "data" / "all.txt").write_text(lines, encoding="utf-8")

@@ -13,17 +13,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.grading.batch.runner import Limits, grade_batch, run_here
+from pipeline.grading.batch.runner import Grader, grade_batch, run_here
 from pipeline.grading.batch.worker import Setup, Task, grade_task
-from pipeline.grading.batch.worker_process import Worker
+from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish import feedback_figures
 from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.processes import LineProcess
-from pipeline.schemas.grade import grade_text, read_grade
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.grades import in_this_process, n_graded
 from tests.helpers.waiting import PATIENCE, started, until
 
@@ -37,11 +36,11 @@ def school(tmp_path_factory):
     for number in range(3):
         write_submission(
             folder / f"team-{number}",
-            chain="throne-1dof",
+            "throne-1dof",
             seed=number,
-            authors=(f"s{number}",),
             compact=True,
             reported=True,
+            students=Students(authors=(f"s{number}",)),
         )
     step = (folder / "team-0" / "data" / "step-1.csv").read_bytes()
     (folder / "team-2" / "data" / "step-2.csv").write_bytes(step)
@@ -50,18 +49,16 @@ def school(tmp_path_factory):
     return folder
 
 
-def run(paths, out, *, jobs=1, limits=None, execute=None, progress=lambda *_: None):
+def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
     """Grade into a gradebook of our own; return the batch, and outcomes and grades by id."""
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
     with Gradebook(out, create=True) as book:
         batch = grade_batch(
             find_hand_ins(paths, scratch=scratch),
-            rubric=RUBRIC,
+            setup=Setup(rubric=RUBRIC, scratch=scratch, time_limit=time_limit),
             book=book,
-            scratch=scratch,
             execute=execute or run_here(jobs=jobs),
-            limits=limits or Limits(time=PATIENCE),
             progress=progress,
         )
         rows = {}
@@ -105,7 +102,7 @@ def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
 def test_only_what_changed_is_graded_again(school, graded, tmp_path):
     """A second run starts no process; a changed file costs its own submission only."""
 
-    def nobody(tasks, setup, out_of):
+    def nobody(tasks, setup):
         raise AssertionError([task.id for task in tasks])
 
     out, _, first, _ = graded
@@ -125,12 +122,7 @@ def task(school):
 
 @pytest.fixture
 def setup(tmp_path):
-    return Setup(
-        rubric=RUBRIC.model_dump_json(),
-        time_limit=PATIENCE,
-        memory_limit=1_000_000_000,
-        scratch=str(tmp_path),
-    )
+    return Setup(rubric=RUBRIC, scratch=tmp_path, time_limit=PATIENCE)
 
 
 @pytest.fixture
@@ -150,7 +142,7 @@ def kill_next(monkeypatch):
 
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
     """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
-    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+    with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
         kill_next()
         outcome = worker.run(task)
@@ -162,7 +154,7 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next
 def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
     """It costs nothing: the hand-in that it was started for is graded."""
     kill_next()
-    with closing(Worker(setup, out_of=RUBRIC.out_of)) as worker:
+    with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
 
 
@@ -197,7 +189,7 @@ def test_memory_is_limited(school, setup, tmp_path):
     rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(1_500_000))
     (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
     small = replace(setup, memory_limit=100_000_000)
-    with closing(Worker(small, out_of=RUBRIC.out_of)) as worker:
+    with closing(Grader(small)) as worker:
         outcome = worker.run(Task(id="large", key="k", sources=(str(large),)))
         assert outcome.reason == "needed more than 0.1 GB of memory"
         assert not outcome.settled
@@ -207,7 +199,7 @@ def test_memory_is_limited(school, setup, tmp_path):
 
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
     """Past the time limit there is a row that says so; a run that gives it more time grades it."""
-    _, hung = run([school / "team-0"], tmp_path, limits=Limits(time=0.01))
+    _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
     assert hung["team-0"][0].reason == "stopped after 0.01 s"
     _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
     assert graded["team-0"][0].status == "graded"

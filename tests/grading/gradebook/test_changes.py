@@ -10,7 +10,7 @@ import pytest
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradings import Batch
-from pipeline.synthesis import write_submission
+from pipeline.simulated.submission import Students, write_submission
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import make_grade, make_outcome, n_graded, two_cart_rubric
 from tests.helpers.places import ROOT
@@ -81,8 +81,8 @@ _LEFT = 4
 def test_ctrl_c_says_how_to_go_on(tmp_path):
     """One line, the status of an interrupt, no worker left; the same command goes on."""
     for number in range(_LEFT + 1):
-        write_submission(tmp_path / "c" / f"t{number}", chain="throne-1dof", seed=number,
-                         authors=(f"s{number}",), compact=True)  # fmt: skip
+        write_submission(tmp_path / "c" / f"t{number}", "throne-1dof", seed=number,
+                         compact=True, students=Students(authors=(f"s{number}",)))  # fmt: skip
     command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "c"), "--rubric",
                "throne-1dof", "--out", str(tmp_path / "out"), "--jobs", "1",
                "--no-figures"]  # fmt: skip

@@ -16,15 +16,14 @@ from sqlalchemy import create_engine, text
 from sqlalchemy.exc import DBAPIError
 
 from pipeline.errors import ConfigError
+from pipeline.grading.grade import CODES
 from pipeline.grading.gradebook import rows
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.history import history_dict, history_text
-from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.override import with_overrides
+from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.gradebook.schema import FILE, metadata
 from pipeline.grading.gradings import Batch
-from pipeline.schemas.grade import CODES
-from tests.helpers import postgres
 from tests.helpers.grades import (
     failed_grade,
     hertz_flag,
@@ -36,30 +35,6 @@ from tests.helpers.grades import (
 from tests.helpers.places import ROOT
 
 RUBRIC = two_cart_rubric()
-
-
-@pytest.fixture(scope="session")
-def server():
-    """A PostgreSQL server of our own."""
-    if why := postgres.missing():
-        (pytest.fail if os.environ.get(postgres.NEEDED) else pytest.skip)(why)
-    with postgres.running() as url:
-        yield url
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def place(request, tmp_path):
-    """Where a gradebook can be made, empty."""
-    if request.param == "sqlite":
-        yield str(tmp_path)
-        return
-    url = request.getfixturevalue("server")
-    yield url
-    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
-    with engine.begin() as connection:
-        connection.execute(text("DROP SCHEMA public CASCADE"))
-        connection.execute(text("CREATE SCHEMA public"))
-    engine.dispose()
 
 
 @pytest.fixture
@@ -375,15 +350,18 @@ def test_rows_are_only_added(open_book, place):
     """The database itself refuses to change or delete what is in any of its tables."""
     book = open_book()
     figures = (("a.svg", "<svg/>"),)
-    finish(book, make_outcome(make_grade("team-1", flags=(hertz_flag(),)), figures=figures))
+    graded = make_grade("team-1", flags=(hertz_flag(),))
+    finish(book, make_outcome(graded, figures=figures, findings="{}"))
     book.override("team-1", "pieces", 0.0, why="x", by="y")
     book.close()
-    with closing(OpenBook(place)) as shared:
+    with closing(RequestBook(place)) as shared:
         shared.mark("team-1", by="y", seen=True)
+        shared.release(True, by="y")
+        shared.ask("team-1", "pieces", why="x", by="z")
 
     url = place.replace("postgresql:", "postgresql+psycopg:")
     engine = create_engine(url if "://" in url else f"sqlite:///{place}/{FILE}")
-    assert len(metadata.sorted_tables) == 9
+    assert len(metadata.sorted_tables) == 11
     for table in metadata.sorted_tables:
         column = table.columns.keys()[0]
         for attempt in (

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import SubmissionError
-from pipeline.grading.intake.unpack import HAND_IN, Limits, is_debris, member_names, unpack
+from pipeline.grading.intake.unpack import HAND_IN, UnpackLimits, is_debris, member_names, unpack
 
-SMALL = Limits(members=20, total=100_000, ratio=200.0, directory=10_000)
-BRIEF = Limits(total=1_000_000, directory=10_000)
+SMALL = UnpackLimits(members=20, total=100_000, ratio=200.0, directory=10_000)
+BRIEF = UnpackLimits(total=1_000_000, directory=10_000)
 
 
 def zipped(path, members, *, mode=None):

@@ -7,12 +7,12 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from pipeline.grading.mistakes.state_model import StateModel, compare_entries, model_harm
+from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.mistakes.state_model import StateMatrices, compare_entries, model_harm
 from pipeline.grading.references.tolerance import exact, late_deduction, to_step
 from pipeline.grading.rubric import Late, Rubric
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.schemas.grade import Criterion, Grade
-from pipeline.submission import StateSpace
+from pipeline.submission import ReportedStateSpace
 from tests.helpers.grading_students import Student, student, typed
 
 
@@ -28,10 +28,10 @@ def with_model(one: Student, A: np.ndarray, B: np.ndarray) -> Student:
     return one.reporting(state_space=space_of(A, B))
 
 
-def space_of(A: np.ndarray, B: np.ndarray) -> StateSpace:
+def space_of(A: np.ndarray, B: np.ndarray) -> ReportedStateSpace:
     """Return a model as typed to three digits."""
     rows = tuple(tuple(typed(float(a)) if a else Decimal(0) for a in row) for row in A)
-    return StateSpace(A=rows, B=tuple(typed(float(b)) if b else Decimal(0) for b in B))
+    return ReportedStateSpace(A=rows, B=tuple(typed(float(b)) if b else Decimal(0) for b in B))
 
 
 def under(one: Student, **changed: object) -> Student:
@@ -106,7 +106,7 @@ def test_an_honest_model_does_no_harm(preset):
     chain, rng = PRESETS[preset], np.random.default_rng(5)
     A, B, _, _ = chain.state_space()
     right = np.hstack([A, B])
-    models = [StateModel(right=right, slack=np.zeros_like(right))]
+    models = [StateMatrices(right=right, slack=np.zeros_like(right))]
     grown = 0
     for _ in range(100):
         off = np.exp(rng.uniform(-0.1, 0.1, A.shape)) * A

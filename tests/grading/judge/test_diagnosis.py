@@ -7,8 +7,8 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from pipeline.schemas.grade import Flag
-from pipeline.submission import Reported, StateSpace
+from pipeline.grading.grade import Flag
+from pipeline.submission import Reported, ReportedStateSpace
 from tests.helpers.grading_students import Student, student, typed
 from tests.helpers.textbook_student import by_eye, final_table, initial_table
 
@@ -208,7 +208,7 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
     """A table of zeros, however they are typed, is impossible, and so are dampings of 0.0."""
     one = student(carts)
     zeros = dict.fromkeys(one.rubric.names, Decimal(vague))
-    space = StateSpace(
+    space = ReportedStateSpace(
         A=tuple((Decimal(vague),) * (2 * carts) for _ in range(2 * carts)),
         B=(Decimal(vague),) * (2 * carts),
     )

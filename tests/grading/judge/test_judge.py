@@ -11,15 +11,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.grading.grade import CODES, Flag, Grade, grade_text
 from pipeline.grading.judge.checks import between
 from pipeline.grading.judge.run import grade_submission, under_rubric
-from pipeline.grading.mistakes.state_model import StateModel, compare_entries
+from pipeline.grading.mistakes.state_model import StateMatrices, compare_entries
 from pipeline.grading.references.springs import with_all_springs
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.schemas.grade import CODES, Flag, Grade, grade_text
-from pipeline.submission import Input, InputOverride, StateSpace, load_submission
-from pipeline.synthesis import write_submission
-from pipeline.synthesis.hidden import prepare_bench, write_bench
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import (
+    InputOverride,
+    InputScale,
+    ReportedStateSpace,
+    load_submission,
+)
 from pipeline.workflow import analyse
 from tests.helpers.grading_students import student
 
@@ -28,7 +33,7 @@ from tests.helpers.grading_students import student
 def folder(tmp_path_factory):
     """One cart's submission on disk."""
     path = tmp_path_factory.mktemp("grading") / "team-07"
-    write_submission(path, chain="throne-1dof", seed=3, compact=True, reported=True)
+    write_submission(path, "throne-1dof", seed=3, compact=True, reported=True)
     return path
 
 
@@ -92,7 +97,7 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, honest,
 def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
     """Only under feedback, where benches log other signals, it stands; a sign of its own does."""
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
-    system = rubric.system.model_copy(update={"input": Input(sign=1, per_count=1e-4)})
+    system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
     own = InputOverride(sign=-1, per_count=0.5)
     claiming = submission.model_copy(
         update={
@@ -140,9 +145,9 @@ def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
 def test_rounding_is_no_error():
     """What MATLAB leaves in an A of noughts and ones is right."""
     model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
-    exactly = StateModel(right=model, slack=np.zeros_like(model))
+    exactly = StateMatrices(right=model, slack=np.zeros_like(model))
     noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
-    space = StateSpace(
+    space = ReportedStateSpace(
         A=tuple(tuple(map(Decimal, row)) for row in noisy), B=(Decimal("-3e-14"), Decimal(5000))
     )
     assert not any(entry.error for entry in compare_entries(space, models=[exactly], n=1))
@@ -169,7 +174,7 @@ def test_the_rubric_s_system_wins(folder, honest, tmp_path):
 def test_a_delay_is_not_read_as_a_spring(tmp_path):
     """A spring that the fit puts at none is not asked for, however well it then explains."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
-    write_bench(tmp_path, bench, seed=304)
+    write_submission(tmp_path, bench, seed=304)
     rubric = load_rubric(Path("throne-2dof"))
     submission, _ = under_rubric(load_submission(tmp_path), rubric)
     _, springs = with_all_springs(submission, analyse(submission, design=False))

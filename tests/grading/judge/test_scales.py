@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.grading.grade import Grade
 from pipeline.grading.judge.run import grade_submission
 from pipeline.grading.rubric_file import load_rubric
-from pipeline.schemas.grade import Grade
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse
 
 COUNT = 0.00227  # cm
@@ -17,7 +17,7 @@ COUNT = 0.00227  # cm
 
 def scaled(folder: Path, column: str, factor: float, *, whole: bool = False) -> Path:
     """Write a submission and multiply a column of every recording."""
-    write_submission(folder, chain="throne-1dof", seed=3, compact=True, reported=True)
+    write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
     for path in (folder / "data").glob("*.csv"):
         with path.open(encoding="utf-8", newline="") as file:
             head, *rows = csv.reader(file)

@@ -14,12 +14,13 @@ import pytest
 from pipeline.arrays import Array
 from pipeline.estimation.chain.follow import find_misread, follow
 from pipeline.grading.judge.run import grade_submission
-from pipeline.grading.mistakes.recordings import bad_runs
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.results import Analysis
+from pipeline.simulated.hidden import preset_bench
+from pipeline.simulated.submission import write_submission
+from pipeline.soundness.bad_recordings import find_bad_recordings
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
 from pipeline.workflow import analyse
 
 PRESET = "throne-2dof"
@@ -33,7 +34,7 @@ Spoil = Callable[[Columns], Columns]
 def bench(tmp_path_factory) -> Path:
     """A whole session: two decays a cart, four steps, dwells, a sweep, a closed loop."""
     folder = tmp_path_factory.mktemp("bench")
-    write_submission(folder, chain=PRESET, seed=3, compact=True, reported=True)
+    write_submission(folder, PRESET, seed=3, compact=True, reported=True)
     return folder
 
 
@@ -245,7 +246,7 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
         ),
         encoding="utf-8",
     )
-    problems = bad_runs(analyse(load_submission(folder), design=False))
+    problems = find_bad_recordings(analyse(load_submission(folder), design=False))
     assert problems
     assert all("rad/s" in why for why in problems.values())
 
@@ -268,7 +269,7 @@ def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
     analysis = analyse(load_submission(folder))
     assert [one.experiment for one in analysis.left_out] == ["control"]
     assert analysis.hardware == ()
-    (skip,) = [s for s in analysis.skipped if s.stage == "hardware check, control"]
+    (skip,) = [s for s in analysis.skipped if s.name == "hardware check, control"]
     assert "milliseconds" in skip.reason
 
 
@@ -380,7 +381,7 @@ def test_records_of_two_carts_identify_no_third(bench, tmp_path):
 @pytest.mark.parametrize("kind", ["step-3", "sine-05"])
 def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
     """At two counts a sample no reading shows it by itself: the cart moves on, and far."""
-    write_submission(tmp_path, chain=PRESET, seed=5, compact=True, count=0.03)
+    write_submission(tmp_path, replace(preset_bench(PRESET), count=0.03), seed=5, compact=True)
     (path,) = files(tmp_path, kind)
 
     def freeze(columns: Columns) -> Columns:

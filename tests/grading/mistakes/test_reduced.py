@@ -17,7 +17,7 @@ def reduced(analysis: Analysis) -> tuple[FrequencyResponse, ...]:
     runs = {record.id: record for record in analysis.records}
     rng = np.random.default_rng(5)
     tables = []
-    for cart in range(1, analysis.carts + 1):
+    for cart in range(1, analysis.bench.n + 1):
         points = sorted((p for p in analysis.sine_points if p.cart == cart), key=lambda p: p.omega)
         ratios = []
         for point in points:

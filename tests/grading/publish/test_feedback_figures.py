@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
+from pipeline.grading.grade import Criterion
 from pipeline.grading.publish.feedback_figures import draw_figures, draw_records, numbers_in
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import transfer_functions
 from pipeline.report.figures.grading import reported_magnitude
-from pipeline.schemas.grade import Criterion
 from tests.helpers.grading_students import student
 
 

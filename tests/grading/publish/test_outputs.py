@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.errors import ConfigError
-from pipeline.grading.batch.grade_class import grade_class
-from pipeline.grading.batch.runner import Limits
+from pipeline.grading.batch.grade_class import Options, grade_class
 from pipeline.grading.csv_table import read_table
+from pipeline.grading.grade import CODES, Criterion, Flag
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import Line
-from pipeline.grading.gradebook.override import Override, read_points, with_overrides
+from pipeline.grading.gradebook.override import HandPoints, read_points, with_overrides
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
@@ -27,9 +27,8 @@ from pipeline.grading.publish.export import results_text
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
-from pipeline.report.document import plain
-from pipeline.schemas.base import Units
-from pipeline.schemas.grade import CODES, Criterion, Flag
+from pipeline.set_up import Units
+from pipeline.words.spans import plain
 from tests.helpers.grades import (
     failed_grade,
     hertz_flag,
@@ -309,8 +308,8 @@ def test_a_broken_submission_hears_every_reason(tmp_path):
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "grades"
     grade_class(
-        [folder], rubric_file=Path("throne-2dof"), out=out, jobs=1, cluster=None,
-        limits=Limits(), figures=False, progress=lambda *_: None,
+        [folder], rubric_file=Path("throne-2dof"), out=out,
+        options=Options(figures=False),
     )  # fmt: skip
     html = (out / "feedback" / "team-1" / "feedback.html").read_text(encoding="utf-8")
     wanted = ("system.spring: unknown key", "design.cart: expected", "reportd: unknown key")
@@ -483,7 +482,7 @@ def missing_flag() -> Flag:
 def test_points_by_hand_are_not_asked_for_again():
     """Who was graded by hand reads so, on the page and in Gradescope, and hands in nothing anew."""
     grade = failed_grade("team-7", "no submission.toml in it")
-    given = Override(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
+    given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
     given = {given.criterion: given}
     by_hand = with_overrides(grade, given, rubric=RUBRIC)
     page = feedback_page(by_hand, rubric=RUBRIC, figures=(), name="team-7")

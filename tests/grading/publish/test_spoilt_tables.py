@@ -42,7 +42,7 @@ def filled(platform) -> Callable[[Path], object]:
 
     def fill(path: Path) -> None:
         roster = Roster.read(path, platform=platform)
-        text, _ = roster.filled(STUDENTS, {"Lab 3": lambda s: s.points}, possible="20")
+        text, _ = roster.fill(STUDENTS, {"Lab 3": lambda s: s.points}, possible="20")
         rows = list(csv.reader(io.StringIO(text, newline="")))
         assert len(rows) == len(roster.table) + 1 == text.count("\n")
         assert {len(row) for row in rows} == {len(rows[0])}

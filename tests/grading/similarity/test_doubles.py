@@ -12,8 +12,8 @@ from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.similarity.doubles import Double, find_doubles, with_recordings
 from pipeline.grading.similarity.prints import fingerprint
 from pipeline.ingest.read import read_data
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import write_submission
 from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
 
 RUBRIC = two_cart_rubric()
@@ -24,7 +24,7 @@ def recordings(tmp_path_factory) -> list[bytes]:
     """The fingerprints of two submissions with recordings of their own."""
     folder = tmp_path_factory.mktemp("teams")
     for seed in (0, 1):
-        write_submission(folder / f"{seed}", chain="throne-1dof", seed=seed, compact=True)
+        write_submission(folder / f"{seed}", "throne-1dof", seed=seed, compact=True)
     return [fingerprint(read_data(load_submission(folder / f"{seed}")).records) for seed in (0, 1)]
 
 

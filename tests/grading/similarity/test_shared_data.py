@@ -12,8 +12,10 @@ from pipeline.grading.similarity import shared
 from pipeline.grading.similarity.prints import fingerprint, unpack
 from pipeline.grading.similarity.shared import find_shared, same_recordings, shared_flag
 from pipeline.ingest.read import read_data
+from pipeline.simulated.bench import COUNT
+from pipeline.simulated.hidden import preset_bench
+from pipeline.simulated.submission import write_submission
 from pipeline.submission import load_submission
-from pipeline.synthesis import COUNT, write_submission
 from tests.helpers.bench_classes import move_class, read_class
 from tests.helpers.ucsd import write_two_cart_submission
 
@@ -23,7 +25,7 @@ def teams(tmp_path_factory):
     """The recordings of six teams that used the same bench in the same way."""
     folder = tmp_path_factory.mktemp("teams")
     for seed in range(6):
-        write_submission(folder / str(seed), chain="throne-2dof", seed=seed, compact=True)
+        write_submission(folder / str(seed), "throne-2dof", seed=seed, compact=True)
     return [read_data(load_submission(folder / str(seed))).records for seed in range(6)]
 
 
@@ -61,7 +63,10 @@ def quiet_teams(tmp_path_factory):
     folder = tmp_path_factory.mktemp("quiet")
     for seed in range(3):
         write_submission(
-            folder / str(seed), chain="throne-2dof", seed=seed, compact=True, count=COUNT / 100
+            folder / str(seed),
+            replace(preset_bench("throne-2dof"), count=COUNT / 100),
+            seed=seed,
+            compact=True,
         )
     return [read_data(load_submission(folder / str(seed))).records for seed in range(3)]
 
@@ -113,11 +118,9 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     for seed in (1, 2, 7):
         write_submission(
             tmp_path / str(seed),
-            chain="throne-2dof",
+            replace(preset_bench("throne-2dof"), count=1 / per_cm, travel=0.3),
             seed=seed,
             compact=True,
-            count=1 / per_cm,
-            travel=0.3,
         )
     batch = [
         prints(str(seed), read_data(load_submission(tmp_path / str(seed))).records)

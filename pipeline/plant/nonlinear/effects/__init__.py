@@ -29,7 +29,12 @@ from pipeline.plant.nonlinear.effects import (
     slack_spring,
     stiction,
 )
-from pipeline.plant.nonlinear.effects.base import AugmentedChain, Effect, Parameter, Term, make_term
+from pipeline.plant.nonlinear.effects.base import (
+    AugmentedChain,
+    Effect,
+    EffectParameter,
+    EffectTerm,
+)
 
 CATALOGUE: tuple[Effect, ...] = (
     coulomb_friction.EFFECT,
@@ -54,9 +59,15 @@ CATALOGUE: tuple[Effect, ...] = (
 )
 
 _WORD = re.compile(r"[a-z]+")
-_LONGEST = 60  # letters of a name that are looked at
 
-__all__ = ["CATALOGUE", "AugmentedChain", "Effect", "Parameter", "Term", "find_effect", "make_term"]
+__all__ = [
+    "CATALOGUE",
+    "AugmentedChain",
+    "Effect",
+    "EffectParameter",
+    "EffectTerm",
+    "find_effect",
+]
 
 
 def find_effect(key: str) -> Effect:
@@ -82,7 +93,7 @@ def _with_words(typed: str) -> list[str]:
 
     In the order of the catalogue, which begins with the commonest.
     """
-    words = set(_WORD.findall(typed[:_LONGEST].lower()))
+    words = set(_WORD.findall(typed[:60].lower()))  # no name is longer
     for names in (attrgetter("key"), attrgetter("title")):
         found = [e.key for e in CATALOGUE if words and words <= {*_WORD.findall(names(e).lower())}]
         if found:

@@ -1,24 +1,18 @@
 """First-order lag of the drive."""
 
 from pipeline.plant.limits import MUCH_SHORTER
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Built
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import BuiltLaw
+from pipeline.words.math import dot, row, sub
 
 EFFECT = Effect(
     key="actuator_lag",
     title="First-order lag of the drive",
     sentence="The force follows the input with a time constant.",
     place="input",
-    law=Built("lag", r"\tau \dot u + u = u_\text{command}"),
+    law=BuiltLaw("lag", row("τ", dot("u"), "+", "u", "=", sub("u", "command"))),
     parameters=(
-        Parameter(
-            "time_constant",
-            "τ",
-            "s",
-            scale=lambda s: s.sample_time,
-            trials=(0.3, 1.5, 5.0),
-            neutral=0.0,
-        ),
+        EffectParameter("time_constant", "τ", "s", scale="sample_time", typical=1.5, neutral=0.0),
     ),
     fingerprint="Edges of the input are rounded; at higher frequencies less force arrives, later.",
     deciding_run="A sweep beyond the resonances: a delay keeps the amplitude, a lag does not.",

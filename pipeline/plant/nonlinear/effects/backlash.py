@@ -1,48 +1,52 @@
 """Backlash between motor and cart 1."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Built, Growth
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import BuiltLaw, Growth
+from pipeline.words.math import NO_BREAK, WIDE_SPACE, function, parens, row, sub
+
+_PAST = ("|", "d", "|", ">", "g", "/", "2")
+_FORMULA = row(
+    *(sub("f", "1"), "=", sub("k", "c"), parens("|", "d", "|", "−", "g", "/", "2")),
+    *(*function("sign"), "d", ",", WIDE_SPACE),
+    *("d", "=", sub("x", "m"), "−", sub("x", "1"), ",", NO_BREAK, *_PAST),
+)
 
 EFFECT = Effect(
     key="backlash",
     title="Backlash between motor and cart 1",
     sentence="Pinion and rack have play: at each reversal the motor runs free through a gap.",
     place="input",
-    law=Built(
-        "play", r"f_1 = k_c (|d| - g/2) \operatorname{sign} d, \quad d = x_m - x_1, \ |d| > g/2"
-    ),
+    law=BuiltLaw("play", _FORMULA),
     growth=Growth(("g", "m_m", "e")),  # e: the share of their speed with which bodies part
     parameters=(
-        Parameter(
-            "gap", "g", "position", scale=lambda s: s.position, trials=(0.02, 0.08), neutral=0.0
-        ),
-        Parameter(
+        EffectParameter("gap", "g", "position", scale="position", typical=0.08, neutral=0.0),
+        EffectParameter(
             "motor_mass",
             "m_m",
             "input s^2/position",
-            scale=lambda s: s.mass,
-            trials=(0.1, 0.3),
+            scale="mass",
+            typical=0.3,
             lower=0.02,
             upper=0.9,
             reported=False,
         ),
-        Parameter(
+        EffectParameter(
             "contact_stiffness",
             "k_c",
             "input/position",
-            scale=lambda s: s.stiffness,
-            trials=(30.0,),
+            scale="stiffness",
+            typical=30.0,
             lower=3.0,
             upper=1000.0,
             reported=False,
         ),
-        Parameter(
+        EffectParameter(
             "contact_damping",
             "c_c",
             "input s/position",
             # A third of critical for the motor's share of the mass on the usual contact.
-            scale=lambda s: (s.stiffness * s.mass) ** 0.5,
-            trials=(1.0,),
+            scale="(stiffness * mass) ** 0.5",
+            typical=1.0,
             lower=0.02,
             upper=30.0,
             reported=False,

@@ -3,34 +3,34 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
 from enum import IntEnum
-from itertools import product
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from pipeline.arrays import Array
-from pipeline.errors import ConfigError
+from pipeline.json_files import computed, result, written
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.effects.law import (
-    Built,
-    Force,
-    Friction,
+    BuiltLaw,
+    ForceLaw,
+    FrictionLaw,
     Growth,
-    Hysteresis,
-    Input,
+    HysteresisLaw,
+    InputLaw,
     Law,
-    equation_of,
     evaluate,
+    formula_of,
     names_in,
 )
 from pipeline.plant.nonlinear.tables import TABLES, Cart, Drive, Tables, linear_tables
+from pipeline.words.math import Math
 
 Place = Literal["cart", "spring", "input"]
 Axis = Literal["velocity", "position", "stretch", "input", "time", "frequency"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scales:
+class PlaceScales:
     """Typical sizes at one place of one bench, from its records and its linear model.
 
     Attributes
@@ -50,14 +50,15 @@ class Scales:
 
 
 @dataclass(frozen=True)
-class Parameter:
+class EffectParameter:
     """One number of an effect.
 
     Attributes
     ----------
     unit : in terms of "position", "input" and "s"; "" for a pure number.
-    scale : its typical size at a place; starts and steps are multiples of it.
-    trials : the multiples of `scale` to try first, all combinations; or see the effect's.
+    scale : its typical size at a place, an expression in what `PlaceScales` has; starts and steps
+        are multiples of it.
+    typical : the multiple of `scale` that makes the effect plain to see.
     signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
     neutral : the value that gives the base model (where one exists).
     lower, upper : bounds of the magnitude, in multiples of `scale`.
@@ -69,8 +70,8 @@ class Parameter:
     symbol: str
     unit: str
     _: KW_ONLY
-    scale: Callable[[Scales], float]
-    trials: tuple[float, ...] = ()
+    scale: str
+    typical: float = 1.0
     signed: bool = False
     side: bool = False
     neutral: float | None = None
@@ -78,6 +79,10 @@ class Parameter:
     upper: float = np.inf
     reach: float = 0.4
     reported: bool = True
+
+    def size(self, scales: PlaceScales) -> float:
+        """Return the typical size at a place."""
+        return evaluate(self.scale, vars(scales))
 
     def unit_text(self, *, position: str, input: str) -> str:
         """Return the unit with the submission's own units in it."""
@@ -93,7 +98,6 @@ class Effect:
     key : its name in files; `sentence` tells a student what it is.
     law : in the symbols of the parameters; growth : its coordinates in a fit from nothing, where
         they are others.
-    trials : multiples of all scales to try first, where not all combinations make sense.
     fingerprint : what it does to the data; deciding_run: the experiment that settles it.
     axis : what to plot the force (or reading) against, to see it.
     between_carts : on a spring to a wall it would be part of the linear chain.
@@ -107,18 +111,19 @@ class Effect:
     genuine : False where the values have degenerated into another law.
     """
 
+    written_as: ClassVar[str] = "key"
+
     key: str
     title: str
     sentence: str
     place: Place
     law: Law
-    parameters: tuple[Parameter, ...]
+    parameters: tuple[EffectParameter, ...]
     fingerprint: str
     deciding_run: str
     reference: str
     axis: Axis
     growth: Growth | None = None
-    trials: tuple[tuple[float, ...], ...] = ()
     family: str = ""
     between_carts: bool = False
     fewest_carts: int = 1
@@ -128,18 +133,6 @@ class Effect:
     same_as: str = ""
     same_below: float = np.inf
     genuine: Callable[[Mapping[str, float]], bool] = lambda p: True
-
-    @property
-    def trial_points(self) -> tuple[tuple[float, ...], ...]:
-        """The multiples of the parameters' scales to try first."""
-        return self.trials or tuple(product(*(p.trials for p in self.parameters)))
-
-    @property
-    def typical(self) -> tuple[float, ...]:
-        """Multiples of the parameters' scales that make the effect plain to see."""
-        if self.trials:
-            return self.trials[len(self.trials) // 2]
-        return tuple(p.trials[len(p.trials) // 2] for p in self.parameters)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -152,20 +145,20 @@ class Effect:
         return not all(p.reported for p in self.parameters)
 
     @property
-    def equation(self) -> str:
-        """TeX of the law, without details of the contact."""
+    def formula(self) -> Math:
+        """The law, without details of the contact."""
         unseen = {p.symbol for p in self.parameters if not p.reported}
-        return equation_of(self.law, place=self.place, unseen=unseen)
+        return formula_of(self.law, place=self.place, unseen=unseen)
 
     @property
     def dry(self) -> bool:
         """Whether it is friction whose size differs from run to run."""
-        return isinstance(self.law, Friction | Hysteresis)
+        return isinstance(self.law, FrictionLaw | HysteresisLaw)
 
     @property
     def many_rests(self) -> bool:
         """Whether carts may lie still elsewhere than where their springs alone would let them."""
-        repeats = isinstance(self.law, Force) and {"x", "sin"} <= names_in(self.law.force)
+        repeats = isinstance(self.law, ForceLaw) and {"x", "sin"} <= names_in(self.law.force)
         return self.dry or repeats
 
     @property
@@ -181,26 +174,30 @@ class Effect:
     @property
     def needs_input(self) -> bool:
         """Whether it changes nothing in a motion without an input."""
-        powered = isinstance(self.law, Force) and "on" in names_in(self.law.force)
-        return powered or isinstance(self.law, Input) or self.is_built("delay", "lag")
+        powered = isinstance(self.law, ForceLaw) and "on" in names_in(self.law.force)
+        return powered or isinstance(self.law, InputLaw) or self.is_built("delay", "lag")
 
     @property
     def needs_drive(self) -> bool:
         """Whether its law asks for the input."""
         law = self.law
         text = (
-            law.force if isinstance(law, Force) else law.size if isinstance(law, Friction) else ""
+            law.force
+            if isinstance(law, ForceLaw)
+            else law.size
+            if isinstance(law, FrictionLaw)
+            else ""
         )
         return bool({"u", "on"} & names_in(text)) or self.place == "input"
 
     def is_built(self, *kinds: str) -> bool:
         """Whether its law is one of those that the simulators have built in."""
-        return isinstance(self.law, Built) and self.law.kind in kinds
+        return isinstance(self.law, BuiltLaw) and self.law.kind in kinds
 
     @property
-    def own(self) -> tuple[Parameter, ...]:
+    def own(self) -> tuple[EffectParameter, ...]:
         """The parameters but those that it shares with the friction within it."""
-        if not (isinstance(self.law, Friction) and self.law.beyond):
+        if not (isinstance(self.law, FrictionLaw) and self.law.beyond):
             return self.parameters
         mine = {*self.grown.coordinates, *self.grown.parameters}
         return tuple(p for p in self.parameters if p.symbol in mine)
@@ -211,10 +208,10 @@ class Effect:
         symbols = tuple(p.symbol for p in self.parameters)
         return self.growth or Growth(symbols, signed=self.parameters[0].signed)
 
-    def column_name(self, parameter: Parameter) -> str:
+    def column_name(self, parameter: EffectParameter) -> str:
         """Return the name of the column that holds a parameter."""
-        shared = isinstance(self.law, Friction) and parameter not in self.own
-        owner = self.law.beyond if isinstance(self.law, Friction) and shared else self.key
+        shared = isinstance(self.law, FrictionLaw) and parameter not in self.own
+        owner = self.law.beyond if isinstance(self.law, FrictionLaw) and shared else self.key
         return f"{owner}_{parameter.name}".upper()
 
     def columns(self, values: Mapping[str, float]) -> dict[IntEnum, float]:
@@ -269,18 +266,33 @@ class Effect:
                 spring[place - 1, column] = value
 
 
-@dataclass(frozen=True, kw_only=True)
-class Term:
+@result()
+class EffectTerm:
     """An effect at a place, with its parameter values in the effect's order."""
 
-    effect: Effect
+    effect: Effect = written("its name in the catalogue")
     place: int
     values: tuple[float, ...]
 
     @property
+    @computed()
     def where(self) -> dict[str, int]:
-        """The place as it is written to files."""
+        """{"cart": 1} or {"spring": 2}; empty: the input."""
         return self.effect.where(self.place)
+
+    @property
+    @computed()
+    def parameters(self) -> dict[str, float]:
+        """The values by name."""
+        return self.effect.named(self.values)
+
+    @classmethod
+    def from_written(
+        cls, *, effect: Effect, where: Mapping[str, int], parameters: Mapping[str, float]
+    ) -> "EffectTerm":
+        """Return what a file holds; a `KeyError` where it lacks a parameter."""
+        values = tuple(parameters[name] for name in effect.names)
+        return cls(effect=effect, place=next(iter(where.values()), 0), values=values)
 
     @property
     def label(self) -> str:
@@ -288,12 +300,12 @@ class Term:
         return self.effect.key + (f"@{self.place}" if self.place else "")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@result(eq=False)
 class AugmentedChain:
     """The linear chain and the effects that act on it."""
 
-    chain: Chain
-    terms: tuple[Term, ...] = ()
+    chain: Chain = written()
+    terms: tuple[EffectTerm, ...] = written(key="effects", default=())
 
     def tables(self) -> Tables:
         """Return the simulator's tables."""
@@ -303,65 +315,27 @@ class AugmentedChain:
         return tables
 
 
-def spring_force(scales: Scales) -> float:
-    """Return the usual size of a force: that of the springs."""
-    return scales.stiffness * scales.position
-
-
-def make_term(effect: Effect, *, place: int, values: Mapping[str, float], chain: Chain) -> Term:
-    """Make a term from named values; contact details not given get their usual size.
-
-    Raises
-    ------
-    ConfigError : a place or a parameter the effect does not have, or a missing one.
-    """
-    springs = tuple(bool(k > 0) for k in chain.k)
-    # Either wall spring of a single cart will do: they act through their sum.
-    either_wall = effect.place == "spring" and chain.n == 1 and place in (1, 2)
-    if place not in effect.places(springs) and not either_wall:
-        raise ConfigError(f"{effect.key}: no {effect.place} {place} on this bench")
-    unknown = [name for name in values if name not in effect.names]
-    if unknown:
-        raise ConfigError(f"{effect.key}: has {', '.join(effect.names)}, found {unknown[0]}")
-    mirrored = either_wall and chain.k[place - 1] == 0.0
-    place = 3 - place if mirrored else place
-    scales = chain_scales(chain, place=effect.place, at=place)
-    chosen: list[float] = []
-    for parameter in effect.parameters:
-        if parameter.name in values:
-            # The other spring is stretched where this one is slackened.
-            side = -1.0 if mirrored and parameter.side else 1.0
-            chosen.append(side * float(values[parameter.name]))
-        elif parameter.reported:
-            raise ConfigError(f"{effect.key}: needs {parameter.name}")
-        else:
-            chosen.append(parameter.scale(scales) * parameter.trials[0])
-    return Term(effect=effect, place=place, values=tuple(chosen))
-
-
 def chain_scales(
     chain: Chain,
     *,
     place: Place,
     at: int,
-    position: Array | None = None,
-    velocity: Array | None = None,
+    largest: tuple[Array, Array] | None = None,
     input: float = 1.0,
     sample_time: float = 0.01,
-) -> Scales:
+) -> PlaceScales:
     """Return the typical sizes at a place.
 
-    `position` and `velocity` (n + 1,) are the largest of each cart or spring stretch; default 1.
+    `largest` are position and velocity (n + 1,) of each cart or spring stretch; default 1.
     """
-    position = np.ones(chain.n + 1) if position is None else position
-    velocity = np.ones(chain.n + 1) if velocity is None else velocity
+    position, velocity = np.ones((2, chain.n + 1)) if largest is None else largest
     i = max(at - 1, 0)
     near = min(i, chain.n - 1)
     stiffness = chain.k[i] if place == "spring" else float(np.diag(chain.stiffness)[near])
     if stiffness <= 0.0:
         # A cart without springs: what its inertia needs stands in for the spring force.
         stiffness = chain.m[near] * (velocity[i] / position[i]) ** 2
-    return Scales(
+    return PlaceScales(
         position=float(position[i]),
         velocity=float(velocity[i]),
         input=input,

@@ -1,17 +1,17 @@
 """Dry (Coulomb) friction."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter, spring_force
-from pipeline.plant.nonlinear.effects.law import Friction
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import FrictionLaw
 
-FORCE = Parameter(
-    "force", "F", "input", scale=spring_force, trials=(0.003, 0.012, 0.04), neutral=0.0
+FORCE = EffectParameter(
+    "force", "F", "input", scale="stiffness * position", typical=0.012, neutral=0.0
 )
 EFFECT = Effect(
     key="coulomb_friction",
     title="Dry (Coulomb) friction",
     sentence="A constant force opposes the motion and holds the cart when it stops.",
     place="cart",
-    law=Friction("F"),
+    law=FrictionLaw("F"),
     parameters=(FORCE,),
     fingerprint="Peaks fall along a straight line, not an exponential; the cart stops dead and "
     "its rest point scatters.",

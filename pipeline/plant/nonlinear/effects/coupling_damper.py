@@ -2,23 +2,18 @@
 
 from math import inf
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 
 EFFECT = Effect(
     key="coupling_damper",
     title="A damper between two carts",
     sentence="The spring (or a hose, a cable) dissipates as it is stretched.",
     place="spring",
-    law=Force("c * rate", step=inf),
+    law=ForceLaw("c * rate", step=inf),
     parameters=(
-        Parameter(
-            "coefficient",
-            "c",
-            "input s/position",
-            scale=lambda s: s.damping,
-            trials=(0.3,),
-            neutral=0.0,
+        EffectParameter(
+            "coefficient", "c", "input s/position", scale="damping", typical=0.3, neutral=0.0
         ),
     ),
     fingerprint="Modes in which the carts move against each other are damped more.",

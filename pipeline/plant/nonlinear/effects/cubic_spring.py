@@ -1,21 +1,21 @@
 """Hardening or softening spring."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 
 EFFECT = Effect(
     key="cubic_spring",
     title="Hardening or softening spring",
     sentence="The spring grows stiffer (or softer) the further it is stretched, either way.",
     place="spring",
-    law=Force("a * d**3"),
+    law=ForceLaw("a * d**3"),
     parameters=(
-        Parameter(
+        EffectParameter(
             "coefficient",
             "a",
             "input/position^3",
-            scale=lambda s: s.stiffness / s.position**2,
-            trials=(0.03, 0.2),
+            scale="stiffness / position**2",
+            typical=0.2,
             signed=True,
             neutral=0.0,
         ),

@@ -1,19 +1,15 @@
 """Dead zone of the input."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Input
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import InputLaw
 
 EFFECT = Effect(
     key="dead_zone",
     title="Dead zone of the input",
     sentence="The amplifier or motor does nothing until the input passes a threshold.",
     place="input",
-    law=Input("sign(u) * max(abs(u) - w, 0)"),
-    parameters=(
-        Parameter(
-            "width", "w", "input", scale=lambda s: s.input, trials=(0.02, 0.08, 0.25), neutral=0.0
-        ),
-    ),
+    law=InputLaw("sign(u) * max(abs(u) - w, 0)"),
+    parameters=(EffectParameter("width", "w", "input", scale="input", typical=0.08, neutral=0.0),),
     fingerprint="Small inputs move the cart less than in proportion; the static gain grows with "
     "the step.",
     deciding_run="Steps of three sizes: level against input is a line that misses the origin.",

@@ -2,22 +2,22 @@
 
 from math import inf
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 
 EFFECT = Effect(
     key="drive_damping",
     title="Braking by the driven motor",
     sentence="The motor brakes cart 1 while it is powered, and runs free when it is off.",
     place="input",
-    law=Force("-c * v * on", step=inf),
+    law=ForceLaw("-c * v * on", step=inf),
     parameters=(
-        Parameter(
+        EffectParameter(
             "coefficient",
             "c",
             "input s/position",
-            scale=lambda s: s.damping,
-            trials=(0.2,),
+            scale="damping",
+            typical=0.2,
             signed=True,
             neutral=0.0,
         ),

@@ -1,40 +1,33 @@
 """End stop."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Contact, Growth
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ContactLaw, Growth
 
 EFFECT = Effect(
     key="end_stop",
     title="End stop",
     sentence="Past some position the cart runs against a stop.",
     place="cart",
-    law=Contact("-k * (x - p) - c * v", past="p"),
+    law=ContactLaw("-k * (x - p) - c * v", past="p"),
     growth=Growth(("k", "p", "c")),
     parameters=(
-        Parameter(
-            "position",
-            "p",
-            "position",
-            scale=lambda s: s.position,
-            trials=(0.6, 0.8, 0.93),
-            side=True,
-        ),
-        Parameter(
+        EffectParameter("position", "p", "position", scale="position", typical=0.8, side=True),
+        EffectParameter(
             "stiffness",
             "k",
             "input/position",
-            scale=lambda s: s.stiffness,
-            trials=(20.0,),
+            scale="stiffness",
+            typical=20.0,
             lower=0.05,
             upper=3000.0,
             neutral=0.0,
         ),
-        Parameter(
+        EffectParameter(
             "damping",
             "c",
             "input s/position",
-            scale=lambda s: (s.stiffness * s.mass) ** 0.5,
-            trials=(0.5,),
+            scale="(stiffness * mass) ** 0.5",
+            typical=0.5,
             reported=False,
         ),
     ),

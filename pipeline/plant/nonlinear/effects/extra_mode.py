@@ -1,35 +1,50 @@
 """A hidden mass on a cart."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Built, Growth
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import BuiltLaw, Growth
+from pipeline.words.math import WIDE_SPACE, dot, parens, row, sub
 
 EFFECT = Effect(
     key="extra_mode",
     title="A hidden mass on a cart",
     sentence="Something on the cart (a weight, a cable, the post) moves on its own spring.",
     place="cart",
-    law=Built("hidden mass", r"f = k (x_h - x) + c (v_h - v), \quad m \dot v_h = -f"),
+    law=BuiltLaw(
+        "hidden mass",
+        row(
+            *("f", "=", "k", parens(sub("x", "h"), "−", "x")),
+            *("+", "c", parens(sub("v", "h"), "−", "v"), ",", WIDE_SPACE),
+            *("m", sub(dot("v"), "h"), "=", "−", "f"),
+        ),
+    ),
     growth=Growth(("m", "κ", "γ"), {"k": "m * κ", "c": "m * γ"}),
     parameters=(
-        Parameter(
+        EffectParameter(
             "mass",
             "m",
             "input s^2/position",
-            scale=lambda s: s.mass,
+            scale="mass",
+            typical=0.1,
             lower=1e-3,
             upper=3.0,
             neutral=0.0,
         ),
-        Parameter("stiffness", "k", "input/position", scale=lambda s: s.stiffness, upper=300.0),
-        Parameter(
-            "damping", "c", "input s/position", scale=lambda s: (s.stiffness * s.mass) ** 0.5
+        # A little faster than the cart itself, with 3 % of critical damping.
+        EffectParameter(
+            "stiffness",
+            "k",
+            "input/position",
+            scale="stiffness",
+            typical=0.1 * 1.05**2,
+            upper=300.0,
         ),
-    ),
-    # Light and heavy, from slower to faster than the cart itself, with 3 % of critical damping.
-    trials=tuple(
-        (mass, mass * omega**2, 0.06 * mass * omega)
-        for omega in (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3)
-        for mass in (0.02, 0.1)
+        EffectParameter(
+            "damping",
+            "c",
+            "input s/position",
+            scale="(stiffness * mass) ** 0.5",
+            typical=0.06 * 0.1 * 1.05,
+        ),
     ),
     fingerprint="One resonance more than there are carts, or one that is split.",
     deciding_run="A sweep through the extra resonance; then hold the suspect part by hand.",

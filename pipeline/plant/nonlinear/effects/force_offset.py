@@ -1,17 +1,23 @@
 """A constant force."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter, spring_force
-from pipeline.plant.nonlinear.effects.law import Force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 
 EFFECT = Effect(
     key="force_offset",
     title="A constant force",
     sentence="A tilted track, or a motor that pushes a little at zero input.",
     place="cart",
-    law=Force("F"),
+    law=ForceLaw("F"),
     parameters=(
-        Parameter(
-            "force", "F", "input", scale=spring_force, trials=(0.03,), signed=True, neutral=0.0
+        EffectParameter(
+            "force",
+            "F",
+            "input",
+            scale="stiffness * position",
+            typical=0.03,
+            signed=True,
+            neutral=0.0,
         ),
     ),
     fingerprint="The rest point is displaced by the same force in every run, whatever is held.",

@@ -1,24 +1,19 @@
 """Delay of the input."""
 
 from pipeline.plant.limits import MUCH_SHORTER
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Built
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import BuiltLaw
+from pipeline.words.math import parens, row
 
 EFFECT = Effect(
     key="input_delay",
     title="Delay of the input",
     sentence="The force comes later (or earlier) than the logged input says.",
     place="input",
-    law=Built("delay", r"u(t) \to u(t - T)"),
+    law=BuiltLaw("delay", row("u", parens("t"), "→", "u", parens("t", "−", "T"))),
     parameters=(
-        Parameter(
-            "delay",
-            "T",
-            "s",
-            scale=lambda s: s.sample_time,
-            trials=(0.3, 1.5),
-            signed=True,
-            neutral=0.0,
+        EffectParameter(
+            "delay", "T", "s", scale="sample_time", typical=1.5, signed=True, neutral=0.0
         ),
     ),
     fingerprint="Every motion starts late by the same time; free decays show nothing.",

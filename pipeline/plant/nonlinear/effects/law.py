@@ -14,13 +14,22 @@ from dataclasses import KW_ONLY, dataclass, field
 from math import atan2, hypot, inf
 from typing import Literal
 
-_QUANTITIES = {"x": "x", "v": "v", "d": "d", "rate": r"\dot d", "u": "u", "k": "k"}
-_GREEK = {"μ": r"\mu", "λ": r"\lambda", "φ": r"\phi", "π": r"\pi", "δ": r"\delta"}
-_HELD = 2.5e-3  # s; nonlinear forces are held over a step
+from pipeline.words.math import (
+    WIDE_SPACE,
+    Math,
+    Term,
+    dot,
+    function,
+    parens,
+    power,
+    row,
+    sub,
+    upright,
+)
 
 
 @dataclass(frozen=True)
-class Force:
+class ForceLaw:
     """A force on a cart, or the tension that a spring has more; smooth but for corners.
 
     Attributes
@@ -31,12 +40,12 @@ class Force:
 
     force: str
     _: KW_ONLY
-    step: float = _HELD
+    step: float = 2.5e-3
     on_motor: bool = False
 
 
 @dataclass(frozen=True)
-class Friction:
+class FrictionLaw:
     """Dry friction: its size while the cart slides; at rest it holds up to as much.
 
     Attributes
@@ -53,7 +62,7 @@ class Friction:
 
 
 @dataclass(frozen=True)
-class Hysteresis:
+class HysteresisLaw:
     """Dry friction with a state `z`, from -1 to 1, of its own: force and rate are linear in it."""
 
     force: str
@@ -63,7 +72,7 @@ class Hysteresis:
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactLaw:
     """A force past a position (or stretch), whose sign is the side; it may only push, or pull too.
 
     The simulators switch it at its very instant.
@@ -77,7 +86,7 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Input:
+class InputLaw:
     """What arrives of the input `u`."""
 
     arrives: str
@@ -85,15 +94,15 @@ class Input:
 
 
 @dataclass(frozen=True)
-class Built:
-    """A law with a state of its own, which the simulators have built in; its equation in TeX."""
+class BuiltLaw:
+    """A law with a state of its own, which the simulators have built in."""
 
     kind: Literal["hidden mass", "play", "delay", "lag", "reading"]
-    equation: str
+    formula: Math
     step: float = inf
 
 
-Law = Force | Friction | Hysteresis | Contact | Input | Built
+Law = ForceLaw | FrictionLaw | HysteresisLaw | ContactLaw | InputLaw | BuiltLaw
 
 
 @dataclass(frozen=True)
@@ -124,92 +133,93 @@ def names_in(text: str) -> set[str]:
     return {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
 
 
-def equation_of(law: Law, *, place: str, unseen: set[str]) -> str:
-    """Return the law as TeX, without the terms of `unseen` symbols."""
-    tex = _Tex(place=place, unseen=unseen)
-    before = "k d + " if place == "spring" else ""
+def formula_of(law: Law, *, place: str, unseen: set[str]) -> Math:
+    """Return the law as mathematics, without the terms of `unseen` symbols."""
+    written = _Formula(place=place, unseen=unseen)
+    before = ("k", "d", "+") if place == "spring" else ()
     match law:
-        case Built():
-            return law.equation
-        case Input():
-            return rf"u \to {tex(law.arrives)}"
-        case Force():
-            while_on = r" \text{ while } u \ne 0" if "on" in names_in(law.force) else ""
-            return f"f = {before}{tex(law.force)}{while_on}"
-        case Hysteresis():
-            return rf"f = {tex(law.force)}, \quad \dot z = {tex(law.rate)}"
-        case Contact():
-            never = "" if law.pulls else r", \text{ never pulling}"
-            return rf"f = {before}{tex(law.force)} \text{{ past }} {tex(law.past)}{never}"
-        case Friction():
-            size = tex(law.size)
-            size = rf"\left({size}\right)" if " + " in size or " - " in size else size
-            held = tex(law.at_rest or law.size)
-            return rf"f = -{size} \operatorname{{sign}} v, \quad |f| \le {held} \text{{ at rest}}"
+        case BuiltLaw():
+            return law.formula
+        case InputLaw():
+            return row("u", "→", *written(law.arrives))
+        case ForceLaw():
+            powered = (upright(" while "), "u", "≠", "0") if "on" in names_in(law.force) else ()
+            return row("f", "=", *before, *written(law.force), *powered)
+        case HysteresisLaw():
+            rate = (dot("z"), "=", *written(law.rate))
+            return row("f", "=", *written(law.force), ",", WIDE_SPACE, *rate)
+        case ContactLaw():
+            past = (upright(" past "), *written(law.past))
+            never = () if law.pulls else (",", upright(" never pulling"))
+            return row("f", "=", *before, *written(law.force), *past, *never)
+        case FrictionLaw():
+            slides = ("−", *written(law.size, least=_PRODUCT), *function("sign"), "v")
+            held = ("|", "f", "|", "≤", *written(law.at_rest or law.size), upright(" at rest"))
+            return row("f", "=", *slides, ",", WIDE_SPACE, *held)
 
 
-_SUM, _PRODUCT, _POWER, _ATOM = range(4)
+_SUM, _PRODUCT, _POWER, _ATOM = range(4)  # how firmly an operation binds
 
 
-class _Tex:
-    """Turns expressions into TeX."""
+class _Formula:
+    """Turns expressions into terms side by side."""
 
     def __init__(self, *, place: str, unseen: set[str]) -> None:
-        index = "_1" if place == "input" else ""
-        self._names = {**_QUANTITIES, "x": f"x{index}", "v": f"v{index}", **_GREEK}
+        on_cart_1 = {"x": sub("x", "1"), "v": sub("v", "1")} if place == "input" else {}
+        self._names: dict[str, Term] = {"rate": dot("d"), **on_cart_1}
         self._unseen = unseen | {"on"}
 
-    def __call__(self, text: str) -> str:
-        return self._term(ast.parse(text, mode="eval").body)
+    def __call__(self, text: str, *, least: int = _SUM) -> list[Term]:
+        return self._terms(ast.parse(text, mode="eval").body, least)
 
-    def _term(self, node: ast.expr, least: int = _SUM) -> str:
-        text, binds = self._bound(node)
-        return text if binds >= least else f"({text})"
+    def _terms(self, node: ast.expr, least: int = _SUM) -> list[Term]:
+        terms, binds = self._bound(node)
+        return terms if binds >= least else [parens(*terms)]
 
-    def _bound(self, node: ast.expr) -> tuple[str, int]:
+    def _bound(self, node: ast.expr) -> tuple[list[Term], int]:
         """Return an expression and how firmly it binds."""
         match node:
             case ast.Constant(value=value):
-                return str(value), _ATOM
+                return [str(value)], _ATOM
             case ast.Name(id=name):
-                return self._names.get(name, name), _ATOM
+                return [self._names.get(name, name)], _ATOM
             case ast.BinOp(left=left, op=ast.Add() | ast.Sub() as op, right=right):
                 if not self._seen(right):
                     return self._bound(left)
-                sign = "+" if isinstance(op, ast.Add) else "-"
-                return f"{self._term(left)} {sign} {self._term(right, _PRODUCT)}", _SUM
+                sign = "+" if isinstance(op, ast.Add) else "−"
+                return [*self._terms(left), sign, *self._terms(right, _PRODUCT)], _SUM
             case ast.BinOp(left=left, op=ast.Div(), right=right):
-                return f"{self._term(left, _PRODUCT)}/{self._term(right, _POWER)}", _PRODUCT
+                return [*self._terms(left, _PRODUCT), "/", *self._terms(right, _POWER)], _PRODUCT
             case ast.BinOp(left=left, op=ast.Pow(), right=right):
-                return f"{self._term(left, _ATOM)}^{self._term(right, _ATOM)}", _POWER
+                base, exponent = self._terms(left, _ATOM), self._terms(right, _ATOM)
+                return [power(base[0], exponent[0])], _POWER
             case ast.BinOp(op=ast.Mult()) | ast.UnaryOp():
                 return self._product(node)
             case ast.Call(func=ast.Name(id=name), args=arguments):
                 return self._call(name, arguments)
         raise ValueError(f"no part of a law: {ast.unparse(node)}")
 
-    def _product(self, node: ast.expr) -> tuple[str, int]:
+    def _product(self, node: ast.expr) -> tuple[list[Term], int]:
         factors: list[ast.expr] = []
         while isinstance(node, ast.BinOp) and isinstance(node.op, ast.Mult):
             factors.insert(0, node.right)
             node = node.left
         minus = isinstance(node, ast.UnaryOp)
         factors.insert(0, node.operand if isinstance(node, ast.UnaryOp) else node)
-        text = " ".join(self._term(factor, _PRODUCT) for factor in factors if self._seen(factor))
-        return (f"-{text}", _SUM) if minus else (text, _PRODUCT)
+        seen = [factor for factor in factors if self._seen(factor)]
+        terms = [term for factor in seen for term in self._terms(factor, _PRODUCT)]
+        return (["−", *terms], _SUM) if minus else (terms, _PRODUCT)
 
-    def _call(self, name: str, arguments: list[ast.expr]) -> tuple[str, int]:
-        texts = [self._term(argument) for argument in arguments]
+    def _call(self, name: str, arguments: list[ast.expr]) -> tuple[list[Term], int]:
+        first, *others = (self._terms(argument) for argument in arguments)
         if name == "abs":
-            return f"|{texts[0]}|", _ATOM
+            return ["|", *first, "|"], _ATOM
         if name == "exp":
-            return f"e^{{{texts[0]}}}", _ATOM
+            return [power("e", row(*first))], _ATOM
         if name == "sign":
-            return rf"\operatorname{{sign}} {self._term(arguments[0], _ATOM)} \cdot", _PRODUCT
-        command = (
-            rf"\{name}" if name in ("sin", "cos", "min", "max") else rf"\operatorname{{{name}}}"
-        )
-        return f"{command}({', '.join(texts)})", _ATOM
+            return [*function("sign"), *self._terms(arguments[0], _ATOM), "·"], _PRODUCT
+        inside = [*first, *(term for other in others for term in (",", *other))]
+        return [*function(name, parens(*inside))], _ATOM
 
     def _seen(self, node: ast.expr) -> bool:
         return not self._unseen & names_in(ast.unparse(node))

@@ -1,20 +1,18 @@
 """Presliding (Dahl) friction."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
 from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
-from pipeline.plant.nonlinear.effects.law import Hysteresis
+from pipeline.plant.nonlinear.effects.law import HysteresisLaw
 
 EFFECT = Effect(
     key="presliding_friction",
     title="Presliding (Dahl) friction",
     sentence="Dry friction that builds up like a spring over a short distance after each reversal.",
     place="cart",
-    law=Hysteresis("-F * z", rate="(v - abs(v) * z) / δ", step=2.3e-3),
+    law=HysteresisLaw("-F * z", rate="(v - abs(v) * z) / δ", step=2.3e-3),
     parameters=(
         FORCE,
-        Parameter(
-            "distance", "δ", "position", scale=lambda s: s.position, trials=(0.005, 0.02, 0.06)
-        ),
+        EffectParameter("distance", "δ", "position", scale="position", typical=0.02),
     ),
     fingerprint="The half period shortens as the amplitude falls, and the cart never quite stops "
     "dead: it rings stiffly about where it came to rest.",

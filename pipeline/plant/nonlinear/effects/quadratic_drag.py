@@ -1,21 +1,21 @@
 """Quadratic drag."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw
 
 EFFECT = Effect(
     key="quadratic_drag",
     title="Quadratic drag",
     sentence="Air or fluid resists with the square of the speed.",
     place="cart",
-    law=Force("-q * v * abs(v)"),
+    law=ForceLaw("-q * v * abs(v)"),
     parameters=(
-        Parameter(
+        EffectParameter(
             "coefficient",
             "q",
             "input s^2/position^2",
-            scale=lambda s: s.damping / s.velocity,
-            trials=(0.2, 1.0),
+            scale="damping / velocity",
+            typical=1.0,
             neutral=0.0,
         ),
     ),

@@ -1,16 +1,17 @@
 """A sensor with a scale of its own."""
 
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter
-from pipeline.plant.nonlinear.effects.law import Built, Growth
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import BuiltLaw, Growth
+from pipeline.words.math import row
 
 EFFECT = Effect(
     key="sensor_gain",
     title="A sensor with a scale of its own",
     sentence="One encoder reads more (or less) than the others for the same motion.",
     place="cart",
-    law=Built("reading", "y = g x"),
+    law=BuiltLaw("reading", row("y", "=", "g", "x")),
     growth=Growth(("e",), {"g": "1 + e"}, signed=True),
-    parameters=(Parameter("gain", "g", "", scale=lambda s: 1.0, trials=(1.03, 0.97), neutral=1.0),),
+    parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
     fingerprint="The carts' amplitudes are in a ratio that no chain of springs gives.",
     deciding_run="Move the carts by a ruler and read the encoders.",
     reference="statics of the chain",

@@ -1,23 +1,23 @@
 """Stiction (Stribeck friction)."""
 
 from pipeline.plant.limits import LEAST_SLIDING
-from pipeline.plant.nonlinear.effects.base import Effect, Parameter, spring_force
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
 from pipeline.plant.nonlinear.effects.coulomb_friction import FORCE
-from pipeline.plant.nonlinear.effects.law import Friction, Growth
+from pipeline.plant.nonlinear.effects.law import FrictionLaw, Growth
 
 EFFECT = Effect(
     key="stiction",
     title="Stiction (Stribeck friction)",
     sentence="Dry friction that holds more firmly at rest than it drags in motion.",
     place="cart",
-    law=Friction(
+    law=FrictionLaw(
         "F + (S - F) * exp(-(v / w)**2)", at_rest="S", beyond="coulomb_friction", step=1.2e-3
     ),
     growth=Growth(("E", "w"), {"S": "F + E"}),
     parameters=(
         FORCE,
-        Parameter("static_force", "S", "input", scale=spring_force, trials=(0.02, 0.06)),
-        Parameter("velocity", "w", "position/s", scale=lambda s: s.velocity, trials=(0.02, 0.1)),
+        EffectParameter("static_force", "S", "input", scale="stiffness * position", typical=0.06),
+        EffectParameter("velocity", "w", "position/s", scale="velocity", typical=0.1),
     ),
     fingerprint="The cart sticks at its turning points and breaks loose with a jerk; the last "
     "swings end abruptly.",

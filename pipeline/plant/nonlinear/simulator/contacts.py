@@ -35,33 +35,36 @@ def velocity(s, i, h):
 
 
 @jit
-def contact(which, cart, drive, n, motor):
+def contact(which, tables):
     """Return body, the other one or -1 (a wall), side, stiffness, damping and reach of a contact.
 
-    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap.
+    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap between cart 1 and
+    the motor, body n.
     """
+    n = tables.cart.shape[0]
     if which < n:
-        k, c, at = stop_of(cart, which)
+        k, c, at = stop_of(tables.cart, which)
         return which, -1, 1.0 if at > 0.0 else -1.0, k, c, abs(at)
-    side = 1.0 if which == 2 * n + 1 else -1.0
+    side, drive = 1.0 if which == 2 * n + 1 else -1.0, tables.drive
     k, c = drive[Drive.BACKLASH_CONTACT_STIFFNESS], drive[Drive.BACKLASH_CONTACT_DAMPING]
-    return motor, 0, side, k, c, 0.5 * drive[Drive.BACKLASH_GAP]
+    return n, 0, side, k, c, 0.5 * drive[Drive.BACKLASH_GAP]
 
 
 @jit
-def guard(which, active, cart, spring, drive, n, motor, s, h):
+def guard(which, active, tables, s, h):
     """Return how far past its switch a contact or slack is, h from now; positive: it switches.
 
     Switches n to 2n are springs, the others contacts, which begin where the bodies meet and push,
     and end where the push does.
     """
+    n = tables.cart.shape[0]
     if n <= which <= 2 * n:
         j = which - n
         reach = (position(s, j, h) if j < n else 0.0) - (position(s, j - 1, h) if j > 0 else 0.0)
-        _, at, _ = slack_of(spring, j)
+        _, at, _ = slack_of(tables.spring, j)
         beyond = reach - at if at >= 0.0 else at - reach
         return -beyond if active else beyond
-    body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
+    body, other, side, k, c, reach = contact(which, tables)
     x, v = position(s, body, h), velocity(s, body, h)
     if other >= 0:
         x -= position(s, other, h)
@@ -72,11 +75,12 @@ def guard(which, active, cart, spring, drive, n, motor, s, h):
 
 
 @jit
-def switch(which, sign, cart, spring, drive, n, motor, s, K, C):
+def switch(which, sign, tables, s, K, C):
     """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
+    n = tables.cart.shape[0]
     if n <= which <= 2 * n:
         j = which - n
-        more, at, _ = slack_of(spring, j)
+        more, at, _ = slack_of(tables.spring, j)
         k = sign * more
         tie(K, j, n, k)
         s[PAST, j] += sign
@@ -85,7 +89,7 @@ def switch(which, sign, cart, spring, drive, n, motor, s, K, C):
         if j > 0:
             s[FIX, j - 1] -= k * at
     else:
-        body, other, side, k, c, reach = contact(which, cart, drive, n, motor)
+        body, other, side, k, c, reach = contact(which, tables)
         pair(K, body, other, sign * k)
         pair(C, body, other, sign * c)
         s[FIX, body] += sign * k * side * reach

@@ -15,8 +15,9 @@ VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de
 Automatica 30 (1994), section 4.
 """
 
+from collections.abc import Sequence
 from math import ceil, exp, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,34 +25,101 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.columns import DRY, Cart, Drive, Spring
 from pipeline.plant.nonlinear.simulator.contacts import guard, switch
-from pipeline.plant.nonlinear.simulator.sensitivity import (
-    bend_presliding,
-    make_sensitivities,
-    restart,
-)
+from pipeline.plant.nonlinear.simulator.sensitivity import bend_presliding, make_lanes, restart
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
+from pipeline.plant.nonlinear.tables import Tables
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
     arriving, cart_matrix, reach_of, settling, slack_of, spring_matrix, stop_of,
 )  # fmt: skip
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, jit, pair, tie,
+    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, inlined, jit, pair, tie,
 )  # fmt: skip
 
 _SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
-_LONGEST_LINEAR = 4.5e-3  # s; springs, dampers and dry friction are exact at any step
 _CONTACT_REACH = 0.4  # omega h inside a contact
 _INSTANT = 1e-9  # s; times as near as this are one
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
+class Excitation(NamedTuple):
+    """What happens to a bench in one run.
+
+    `t` (samples,) are its times; `knots` and `command` (k,) the input, held from knot to knot, and
+    `held` (3, k) room for what arrives of it and its integrals. `free` (n,) tells which carts move,
+    `guided` (n, samples) how the others do. `shots` (shots + 1,) has the first sample of each piece
+    that starts afresh, and the number of samples. `refine` divides the step.
+    """
+
+    t: Array
+    knots: Array
+    command: Array
+    held: Array
+    free: NDArray[np.bool_]
+    guided: Array
+    shots: NDArray[np.int64]
+    refine: float
+
+
+class StartState(NamedTuple):
+    """How the bodies of one run start.
+
+    `x` and `v` (shots, n) are those of the carts at the start of each shot; or (shots, 2 n), where
+    those of their hidden masses relative to them follow, which the first shot takes and the later
+    ones carry over. `scatter` (n,) is a factor on all dry friction of a cart.
+    """
+
+    x: Array
+    v: Array
+    scatter: Array
+
+
+def describe_run(
+    t: Array,
+    command: Any,
+    *,
+    free: Any,
+    knots: Array | None = None,
+    shots: Any = None,
+    guided: Array | None = None,
+) -> Excitation:
+    """Return a run as the simulator takes it, arrays of any kind copied to its own.
+
+    `t` (samples,), `command` (k,), held from knot to knot, by default from sample to sample; `free`
+    (n,) which carts move; without `guided` (n, samples) the others stand still at zero. One shot.
+    """
+    t, free = _plain(t, np.float64), _plain(free, np.bool_)
+    command = _plain(command, np.float64)
+    return Excitation(
+        t=t,
+        knots=t if knots is None else _plain(knots, np.float64),
+        command=command,
+        held=np.zeros((3, command.size)),
+        free=free,
+        guided=np.zeros((free.size, t.size)) if guided is None else _plain(guided, np.float64),
+        shots=np.array([0, t.size] if shots is None else shots, dtype=np.int64),
+        refine=1.0,
+    )
+
+
+def _plain(array: Any, dtype: Any) -> Any:
+    """Return an array of the one kind the compiled function takes: whole, and writable.
+
+    For arrays that may not be written to, or for strides, numba compiles anew, for ten seconds.
+    """
+    array = np.asarray(array)
+    fits = array.dtype == dtype and array.flags.carray
+    return array if fits else np.array(array, dtype=dtype, order="C")
+
+
 @jit
-def _assemble(cart, spring, drive, free, s, K, C, parent, switches):
+def _assemble(tables, free, s, K, C, parent, switches):
     """Fill the linear matrices and the numbers of what switches.
 
     Returns how many bodies there are, the motor's row or -1, and how many switches.
     """
+    cart, spring, drive = tables.cart, tables.spring, tables.drive
     n = cart.shape[0]
     for i in range(n):
         s[INV, i] = 1.0 / cart[i, Cart.MASS] if free[i] else 0.0
@@ -92,9 +160,21 @@ def _assemble(cart, spring, drive, free, s, K, C, parent, switches):
     return N, motor, count
 
 
+def assemble(tables: Tables, free: NDArray[np.bool_]) -> Bodies:
+    """Return the bodies of one bench at rest at zero, no contact closed."""
+    n = len(tables.cart)
+    size = 2 * n + 1
+    s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
+    parent, numbers = np.full(size, -1), np.empty(2 * n + 3, dtype=np.int64)
+    N, motor, count = _assemble(tables, free, s, K, C, parent, numbers)
+    active = np.zeros(count, dtype=np.bool_)
+    return Bodies(n, N, motor, max(motor, 0), parent, s, K, C, numbers[:count], active)
+
+
 @jit
-def _integral(time, knots, held, at):
+def _integral(run, time, at):
     """Integrate the held input up to `time`, once and twice; `at` is the interval found last."""
+    knots, held = run.knots, run.held
     last = knots.size - 1
     while at < last and knots[at + 1] <= time:
         at += 1
@@ -106,8 +186,9 @@ def _integral(time, knots, held, at):
 
 
 @jit
-def _edge(now, end, delay, knots, held, at):
+def _edge(run, delay, now, end, at):
     """Return when, between `now` and `end`, the delayed input first jumps: or `end`."""
+    knots, held = run.knots, run.held
     while at < knots.size - 1 and knots[at + 1] + delay < end - _INSTANT:
         at += 1
         if knots[at] + delay > now + _INSTANT and held[0, at] != held[0, at - 1]:
@@ -115,100 +196,128 @@ def _edge(now, end, delay, knots, held, at):
     return end
 
 
-@jit
-def _simulate(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, guided, y, dy,
-    N, motor, parent, s, K, C, switches, active, held, lanes, T, phi, work,
-):  # fmt: skip
-    """Fill y (n, samples) with the readings of one run; False where the model diverged.
+@inlined
+def _steps(tables, bodies, refine):
+    """Return the longest step, and the longest inside a contact, s; the size of dry friction, of …
 
-    And dy (lanes, n, samples) with their derivatives.
+    … its presliding part, and where there are smooth forces.
     """
-    n = cart.shape[0]
     # Sums, of which flags are made: numba compiles a function anew for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
+    s, n, N, motor = bodies.s, bodies.n, bodies.N, bodies.motor
     for i in range(N):
         row = 0.0
         for j in range(N):
-            row += abs(K[i, j])
+            row += abs(bodies.K[i, j])
         fastest = max(fastest, row * s[INV, i])
     for i in range(n):
-        presliding += settling(cart, i, 0.0)[0]
+        presliding += settling(tables.cart, i, 0.0)[0]
         for column in DRY:
-            rubbing += cart[i, column]
-        contact = max(contact, stop_of(cart, i)[0] * s[INV, i])
+            rubbing += tables.cart[i, column]
+        contact = max(contact, stop_of(tables.cart, i)[0] * s[INV, i])
     for j in range(n + 1):
-        extra = slack_of(spring, j)[0]
+        extra = slack_of(tables.spring, j)[0]
         if extra > 0.0:
             # A spring that hardens past its gap is the faster one.
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
-    reach, smooth = reach_of(cart, spring, drive)
-    dry = rubbing > 0.0
-    longest = min(_LONGEST_LINEAR, reach, _SERIES_REACH / sqrt(fastest + 1e-12))
+    reach, smooth = reach_of(tables.cart, tables.spring, tables.drive)
+    # Springs, dampers and dry friction are exact at any step: 4.5 ms, at the most.
+    longest = min(4.5e-3, reach, _SERIES_REACH / sqrt(fastest + 1e-12))
     if motor >= 0:
         contact = max(
-            contact, drive[Drive.BACKLASH_CONTACT_STIFFNESS] * (s[INV, 0] + s[INV, motor])
+            contact,
+            tables.drive[Drive.BACKLASH_CONTACT_STIFFNESS] * (s[INV, 0] + s[INV, motor]),
         )
     longest /= refine
     contact_step = _CONTACT_REACH / sqrt(contact) / refine if contact > 0.0 else longest
-    for i in range(command.size):
-        held[0, i] = arriving(drive, command[i])
+    return longest, contact_step, rubbing, presliding, smooth
+
+
+@inlined
+def _start_shot(bodies, run, start, lanes, shot):
+    """Put the bodies where a shot starts."""
+    s, n, N, motor, parent = bodies.s, bodies.n, bodies.N, bodies.motor, bodies.parent
+    restart(bodies, lanes, shot, run.free)
+    for i in range(n):
+        if run.free[i]:
+            # Hidden masses and the motor keep their place relative to their cart.
+            for j in range(n, N):
+                if (parent[j] == i) or (j == motor and i == 0):
+                    s[X, j] += start.x[shot, i] - s[X, i]
+                    s[V, j] += start.v[shot, i] - s[V, i]
+            s[X, i], s[V, i] = start.x[shot, i], start.v[shot, i]
+            s[ACC, i] = 0.0
+    if shot == 0 and start.x.shape[1] > n:
+        for j in range(n, N):
+            if j != motor:
+                s[X, j] += start.x[shot, n + parent[j]]
+                s[V, j] += start.v[shot, n + parent[j]]
+
+
+@inlined
+def _bend(tables, bodies, lanes, scatter, u, smooth):
+    """Bend the presliding friction as far as it holds what acts on the carts at the start."""
+    s, n, N = bodies.s, bodies.n, bodies.N
+    for i in range(N):
+        s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
+    smooth_forces(tables, bodies, u, 0.0, smooth)
+    for i in range(n):
+        most, _, _ = settling(tables.cart, i, 0.0)
+        if most > 0.0:
+            net = s[FORCE, i] + (u if i == 0 else 0.0)
+            for j in range(N):
+                net -= bodies.K[i, j] * s[X, j]
+            s[Z, i] = min(max(net / (scatter[i] * most), -1.0), 1.0)
+            if abs(s[V, i]) > 0.0:
+                s[Z, i] = 1.0 if s[V, i] > 0.0 else -1.0
+            elif abs(s[Z, i]) < 1.0:
+                bend_presliding(bodies, lanes, i, most, scatter)
+
+
+@jit
+def _simulate(tables, bodies, run, start, lanes, y, dy):
+    """Fill y (n, samples) with the readings of one run; False where the model diverged.
+
+    And dy (lanes, n, samples) with their derivatives.
+    """
+    s, n = bodies.s, bodies.n
+    t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
+    delay = tables.drive[Drive.INPUT_DELAY_DELAY]
+    tau = tables.drive[Drive.ACTUATOR_LAG_TIME_CONSTANT]
+    longest, contact_step, rubbing, presliding, smooth = _steps(tables, bodies, run.refine)
+    dry = rubbing > 0.0
+    for i in range(run.command.size):
+        held[0, i] = arriving(tables.drive, run.command[i])
         if i > 0:
             span = knots[i] - knots[i - 1]
             held[1, i] = held[1, i - 1] + held[0, i - 1] * span
             held[2, i] = held[2, i - 1] + 0.5 * (held[1, i - 1] + held[1, i]) * span
     lagged = held[0, 0]
-    driven = motor if motor >= 0 else 0
+    driven = bodies.driven
     at = knots.size - 1
     powered = 0
 
-    for shot in range(starts.size - 1):
-        first, end = starts[shot], starts[shot + 1]
-        restart(lanes, T, shot, free, parent, motor, n, N)
-        for i in range(n):
-            if free[i]:
-                # Hidden masses and the motor keep their place relative to their cart.
-                for j in range(n, N):
-                    if (parent[j] == i) or (j == motor and i == 0):
-                        s[X, j] += x0[shot, i] - s[X, i]
-                        s[V, j] += v0[shot, i] - s[V, i]
-                s[X, i], s[V, i] = x0[shot, i], v0[shot, i]
-                s[ACC, i] = 0.0
-        if shot == 0 and x0.shape[1] > n:
-            for j in range(n, N):
-                if j != motor:
-                    s[X, j] += x0[shot, n + parent[j]]
-                    s[V, j] += v0[shot, n + parent[j]]
-        for e in range(switches.size):
+    for shot in range(run.shots.size - 1):
+        first, end = run.shots[shot], run.shots[shot + 1]
+        _start_shot(bodies, run, start, lanes, shot)
+        for e in range(bodies.switches.size):
             # The state is new: a contact may be open or closed from the start.
-            if guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0) > 0.0:
-                active[e] = not active[e]
-                sign = 1.0 if active[e] else -1.0
-                switch(switches[e], sign, cart, spring, drive, n, motor, s, K, C)
-        past, past2, at = _integral(t[first] - drive[Drive.INPUT_DELAY_DELAY], knots, held, at)
+            if guard(bodies.switches[e], bodies.active[e], tables, s, 0.0) > 0.0:
+                bodies.active[e] = not bodies.active[e]
+                sign = 1.0 if bodies.active[e] else -1.0
+                switch(bodies.switches[e], sign, tables, s, bodies.K, bodies.C)
+        past, past2, at = _integral(run, t[first] - delay, at)
         if shot == 0 and presliding > 0.0:
-            for i in range(N):
-                s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
-            smooth_forces(cart, spring, drive, driven, n, s, held[0, 0], 0.0, smooth)
-            for i in range(n):
-                most, _, _ = settling(cart, i, 0.0)
-                if most > 0.0:
-                    net = s[FORCE, i] + (held[0, 0] if i == 0 else 0.0)
-                    for j in range(N):
-                        net -= K[i, j] * s[X, j]
-                    s[Z, i] = min(max(net / (scatter[i] * most), -1.0), 1.0)
-                    if abs(s[V, i]) > 0.0:
-                        s[Z, i] = 1.0 if s[V, i] > 0.0 else -1.0
-                    elif abs(s[Z, i]) < 1.0:
-                        bend_presliding(lanes, T, s, K, most, scatter, i, n, N)
+            _bend(tables, bodies, lanes, start.scatter, held[0, 0], smooth)
         for sample in range(first, end):
             for i in range(n):
                 if not free[i]:
                     s[X, i] = guided[i, sample]
-                y[i, sample] = cart[i, Cart.SENSOR_GAIN_GAIN] * s[X, i]
+                gain = tables.cart[i, Cart.SENSOR_GAIN_GAIN]
+                y[i, sample] = gain * s[X, i]
                 for lane in range(dy.shape[0]):
-                    dy[lane, i, sample] = cart[i, Cart.SENSOR_GAIN_GAIN] * T[i, lane // 4, lane % 4]
+                    dy[lane, i, sample] = gain * lanes.T[i, lane // 4, lane % 4]
             if sample == end - 1:
                 break
             interval = t[sample + 1] - t[sample]
@@ -222,17 +331,15 @@ def _simulate(
                 h = whole
                 if (dry and s[V, driven] == 0.0) or now > upon - whole + _INSTANT:
                     # What friction holds is to feel the whole of it until the input jumps.
-                    h = _edge(now, upon, drive[Drive.INPUT_DELAY_DELAY], knots, held, at) - now
-                upto, upto2, at = _integral(
-                    now + h - drive[Drive.INPUT_DELAY_DELAY], knots, held, at
-                )
+                    h = _edge(run, delay, now, upon, at) - now
+                upto, upto2, at = _integral(run, now + h - delay, at)
                 mean = (upto - past) / h
                 # What comes early in the step moves the body further than its mean would.
                 early = upto2 - past2 - 0.5 * h * (past + upto)
                 past, past2 = upto, upto2
-                if drive[Drive.ACTUATOR_LAG_TIME_CONSTANT] > 0.0:
+                if tau > 0.0:
                     # Exact for the straight line that has the mean and the moment of the input.
-                    tau, slope = drive[Drive.ACTUATOR_LAG_TIME_CONSTANT], -12.0 * early / h**3
+                    slope = -12.0 * early / h**3
                     decay = exp(-h / tau)
                     fading = lagged - mean + slope * (0.5 * h + tau)
                     lagged = mean + slope * (0.5 * h - tau) + fading * decay
@@ -240,11 +347,9 @@ def _simulate(
                     early += fading * tau * (0.5 * h * (1.0 + decay) - tau * (1.0 - decay))
                 while powered < knots.size - 1 and knots[powered + 1] <= now + 0.5 * h:
                     powered += 1
-                on = 1.0 if command[powered] != 0.0 else 0.0
-                advance(
-                    cart, spring, drive, n, N, motor, s, K, C, scatter, mean, on, h, dry,
-                    smooth, switches, active, contact_step, lanes, T, phi, work,
-                )  # fmt: skip
+                on = 1.0 if run.command[powered] != 0.0 else 0.0
+                push = Push(mean, on, h, start.scatter, dry, smooth, contact_step)
+                advance(tables, bodies, push, lanes)
                 if not dry or s[V, driven] != 0.0:
                     s[X, driven] += early * s[INV, driven]
                 now += h
@@ -255,97 +360,36 @@ def _simulate(
     return True
 
 
-class Bodies(NamedTuple):
-    """Carts, motor and hidden masses before they move: tables of the simulator, and their size."""
-
-    N: int
-    motor: int  # its row, or -1
-    parent: NDArray[np.int64]  # the carts of hidden masses, or -1
-    state: Array
-    K: Array
-    C: Array
-    switches: NDArray[np.int64]  # the numbers of the contacts and slack springs there are
-    active: NDArray[np.bool_]
-
-
-def assemble(cart: Array, spring: Array, drive: Array, free: NDArray[np.bool_]) -> Bodies:
-    """Return the bodies of one bench at rest at zero, no contact closed."""
-    n = len(cart)
-    size = 2 * n + 1
-    s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
-    parent = np.full(size, -1)
-    numbers = np.empty(2 * n + 3, dtype=np.int64)
-    N, motor, count = _assemble(cart, spring, drive, free, s, K, C, parent, numbers)
-    switches = numbers[:count]
-    return Bodies(N, motor, parent, s, K, C, switches, np.zeros(count, dtype=np.bool_))
-
-
 NO_LANES = np.zeros((2, 0), dtype=np.int64)
 
 
-def simulate_batch(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, *, guided=None
-):
-    """Simulate many variants of one run.
+def simulate(
+    variants: Sequence[tuple[Tables, StartState]],
+    run: Excitation,
+    *,
+    of: NDArray[np.int64] = NO_LANES,
+) -> tuple[Array, Array]:
+    """Simulate variants of one run, the first with derivatives.
 
     Parameters
     ----------
-    cart, spring, drive : (b, n, 17), (b, n + 1, 5), (b, 12) tables, see `Cart`, `Spring`, `Drive`.
-    x0, v0 : (b, shots, n) positions and velocities of the carts at the start of each shot; or
-        (b, shots, 2 n), where those of their hidden masses relative to them follow, which the
-        first shot takes and the later ones carry over.
-    scatter : (b, n) factor on all dry friction of a cart.
-    free : (n,) which carts move.
-    t : (samples,) times; knots (k,), command (k,): the input, held from knot to knot.
-    starts : (shots + 1,) first sample of each shot, and the number of samples.
-    refine : divides the step.
-    guided : (n, samples) how the carts that are not free move; without, they stand still at zero.
-
-    Returns
-    -------
-    (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged.
-    """
-    return simulate_with_derivatives(
-        cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, NO_LANES,
-        guided=guided,
-    )[0]  # fmt: skip
-
-
-def simulate_with_derivatives(
-    cart, spring, drive, x0, v0, scatter, free, t, knots, command, starts, refine, of, *,
-    guided=None,
-):  # fmt: skip
-    """Simulate many variants of one run, as `simulate_batch` does, the first with derivatives.
-
-    Parameters
-    ----------
+    variants : b of them, each with what acts in it, and how it starts.
     of : (2, lanes) by what: a kind of `sensitivity`, and a cart or spring, from 0.
 
     Returns
     -------
-    (b, n, samples) readings, and (lanes, n, samples) derivatives of the first variant's.
+    (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged. And
+    (lanes, n, samples) derivatives of the first variant's.
     """
-    # numba compiles anew, for ten seconds, for arrays that may not be written to, or for strides.
-    guided = np.zeros((cart.shape[1], t.size)) if guided is None else guided
-    floats = (cart, spring, drive, x0, v0, scatter, t, knots, command, guided)
-    cart, spring, drive, x0, v0, scatter, t, knots, command, guided = (
-        _plain(array, np.float64) for array in floats
-    )
-    free, starts, of = _plain(free, np.bool_), _plain(starts, np.int64), _plain(of, np.int64)
-    y = np.empty((len(cart), cart.shape[1], t.size))
+    of = _plain(of, np.int64)
+    run = run._replace(held=np.zeros_like(run.held))  # threads may share a run
+    y = np.empty((len(variants), run.free.size, run.t.size))
     dy = derivatives = np.empty((of.shape[1], *y.shape[1:]))
-    run = free, t, knots, command, starts, float(refine), guided
-    for b in range(len(cart)):
-        bench, start = (cart[b], spring[b], drive[b]), (x0[b], v0[b], scatter[b])
-        bodies = assemble(*bench, free)
-        held, lanes = np.zeros((3, command.size)), make_sensitivities(of, bodies.N)
-        if not _simulate(*bench, *start, *run, y[b], dy, *bodies, held, *lanes):
+    for b, (tables, start) in enumerate(variants):
+        tables = Tables(*(_plain(table, np.float64) for table in tables))
+        start = StartState(*(_plain(array, np.float64) for array in start))
+        bodies = assemble(tables, run.free)
+        if not _simulate(tables, bodies, run, start, make_lanes(of, bodies.N), y[b], dy):
             y[b] = np.nan
         of, dy = NO_LANES, dy[:0]
     return y, derivatives
-
-
-def _plain(array, dtype):
-    """Return an array of the one kind the compiled function takes: whole, and writable."""
-    fits = array.dtype == dtype and array.flags.carray
-    return array if fits else np.array(array, dtype=dtype, order="C")

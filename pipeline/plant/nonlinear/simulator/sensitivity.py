@@ -13,8 +13,12 @@ Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000
 """
 
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
 
 # isort: off
 from pipeline.plant.nonlinear.simulator.laws import (
@@ -29,25 +33,32 @@ from pipeline.plant.nonlinear.simulator.state import (
 # What a lane is the derivative with respect to: the table's own number, of a cart or a spring; the
 # factor on a cart's dry friction; or its start (from n on, that of the hidden mass on it).
 BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range(6)
-_UNUSED = 6  # a lane that fills a block
 _BLOCK = 4  # lanes that a processor takes at once: the last axis
-_SAME = 1e-9  # relative; steps as near as this share their matrix
 
 
-def make_sensitivities(of, N):
-    """Return the lanes `of` (2, lanes: by what, of which), in whole blocks, and room for them.
+class Lanes(NamedTuple):
+    """Sensitivities of N bodies, and room to work in.
 
-    The rows of `T` (5 N + 2, blocks, 4) are, of N bodies: N positions, N velocities, N presliding
-    states; when the event comes that is now; a force; 2 N to work in. `phi` (2 N + 1, 2 N) takes
-    positions and velocities on; its last row keeps the step and the inverse masses it is for. The
-    last array is room to make it in.
+    `of` (2, lanes) tells by what each is, and of which cart or spring, from 0. The rows of `T`
+    (5 N + 2, blocks, 4) are N positions, N velocities, N presliding states; when the event comes
+    that is now; a force; 2 N to work in. `phi` (2 N + 1, 2 N) takes positions and velocities on;
+    its last row keeps the step and the inverse masses it is for. `work` is room to make it in.
     """
+
+    of: NDArray[np.int64]
+    T: Array
+    phi: Array
+    work: Array
+
+
+def make_lanes(of: NDArray[np.int64], N: int) -> Lanes:
+    """Return the lanes `of` (2, lanes: by what, of which) for N bodies, in whole blocks."""
     wanted = of.shape[1]
     blocks = (wanted + _BLOCK - 1) // _BLOCK
-    lanes = np.full((2, blocks * _BLOCK), _UNUSED)
-    lanes[:, :wanted] = of
+    padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # by nothing: it fills a block
+    padded[:, :wanted] = of
     T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
-    return lanes, T, phi, np.empty((7, N))
+    return Lanes(padded, T, phi, np.empty((7, N)))
 
 
 @jit
@@ -59,15 +70,16 @@ def _add(T, row, factor, other):
 
 
 @jit
-def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step):
+def carry(tables, bodies, push, lanes, whole, step):
     """Move the sensitivities on by `step`, before the state moves.
 
-    Forces were taken in the middle of the `whole` step; `push` is which body the motor
-    drives, the table of the drive, the input that arrives, and whether it is on, and where
-    there are smooth forces.
+    Forces were taken in the middle of the `whole` step.
     """
+    s, n, N, cart = bodies.s, bodies.n, bodies.N, tables.cart
+    T, phi, of = lanes.T, lanes.phi, lanes.of
     moved = 3 * N + 2
-    changed = abs(step - phi[2 * N, 0]) > _SAME * step
+    # Steps that differ by less share their matrix.
+    changed = abs(step - phi[2 * N, 0]) > 1e-9 * step
     for i in range(N):
         if s[TURNED, i] != 0.0:
             _add(T, N + i, s[BEFORE, i] - s[D2, i], 3 * N)
@@ -79,13 +91,13 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole
         s[HALF_V, i] = s[V, i] + 0.5 * step * s[D2, i]
         s[HALF_A, i] = s[D2, i] + 0.5 * step * s[D3, i]
     if changed:
-        _exponential(phi, work, s, K, C, N, step)
-    for lane in range(lanes.shape[1]):
-        if lanes[0, lane] > BY_FRICTION:
+        _exponential(bodies, lanes, step)
+    for lane in range(of.shape[1]):
+        if of[0, lane] > BY_FRICTION:
             continue
-        force = _force(lanes[0, lane], lanes[1, lane], s, n, spring)
+        force = _force(of[0, lane], of[1, lane], s, n, tables.spring)
         T[3 * N + 1, lane // _BLOCK, lane % _BLOCK] = force
-    _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, 0.5 * step)
+    _kick(tables, bodies, push, lanes, whole, 0.5 * step)
     for row in range(2 * N):
         for block in range(T.shape[1]):
             a = b = c = d = 0.0
@@ -111,12 +123,13 @@ def carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole
         for block in range(T.shape[1]):
             for q in range(_BLOCK):
                 T[row, block, q] = T[moved + row, block, q]
-    _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, 0.5 * step)
+    _kick(tables, bodies, push, lanes, whole, 0.5 * step)
 
 
 @jit
-def _exponential(phi, work, s, K, C, N, step):
+def _exponential(bodies, lanes, step):
     """Fill `phi`, column by column, by the series to sixth order."""
+    s, K, C, N, phi, work = bodies.s, bodies.K, bodies.C, bodies.N, lanes.phi, lanes.work
     for column in range(2 * N):
         for i in range(N):
             work[0, i] = 1.0 if column == i else 0.0
@@ -159,10 +172,13 @@ def _force(kind, at, s, n, spring):
 
 
 @jit
-def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
+def _kick(tables, bodies, push, lanes, whole, span):
     """Give the lanes the impulse of `span` s of their forces and of the nonlinear slopes."""
-    for lane in range(lanes.shape[1]):
-        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+    s, n, N, driven, T, of = bodies.s, bodies.n, bodies.N, bodies.driven, lanes.T, lanes.of
+    cart, drive, scatter = tables.cart, tables.drive, push.scatter
+    u, on, smooth = push.u, push.on, push.smooth
+    for lane in range(of.shape[1]):
+        kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK
         if kind > BY_FRICTION:
             continue
         pull = span * T[3 * N + 1, block, q]
@@ -170,20 +186,19 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
             T[N + at, block, q] += s[GRIP, at] * pull
         if kind == BY_STIFFNESS and at > 0:
             T[N + at - 1, block, q] -= s[GRIP, at - 1] * pull
-    driven, drive, u, on, smooth = push
     if smooth & ON_DRIVE:
         by_x, by_v = motor_slopes(drive, s[MID_X, driven], s[MID_V, driven], u, on)
-        _bend(T, s, N, driven, driven, span, by_x, by_v)
+        _bend(T, bodies, driven, driven, span, by_x, by_v)
         by_x, by_v = drive_slopes(drive, s[MID_X, 0], s[MID_V, 0], u, on)
-        _bend(T, s, N, 0, 0, span, by_x, by_v)
+        _bend(T, bodies, 0, 0, span, by_x, by_v)
     for j in range(n + 1 if smooth & ON_SPRINGS else 0):
         d, rate = stretch(s, MID_X, j, n), stretch(s, MID_V, j, n)
-        by_d, by_rate = spring_slopes(spring, j, d, rate)
+        by_d, by_rate = spring_slopes(tables.spring, j, d, rate)
         for body, near in ((j, j - 1), (j - 1, j)):
             if 0 <= body < n:
-                _bend(T, s, N, body, body, span, -by_d, -by_rate)
+                _bend(T, bodies, body, body, span, -by_d, -by_rate)
                 if 0 <= near < n:
-                    _bend(T, s, N, body, near, span, by_d, by_rate)
+                    _bend(T, bodies, body, near, span, by_d, by_rate)
     for i in range(n):
         by_x = by_v = 0.0
         if smooth & ON_CARTS:
@@ -194,7 +209,7 @@ def _kick(lanes, T, s, N, n, cart, spring, scatter, push, whole, span):
         if most > 0.0:
             by_v -= scatter[i] * most * _settled(cart, i, s, target, s[DECAY, i], 0.5 * whole)
             _add(T, N + i, -s[GRIP, i] * span * scatter[i] * most * s[DECAY, i], 2 * N + i)
-        _bend(T, s, N, i, i, span, by_x, by_v)
+        _bend(T, bodies, i, i, span, by_x, by_v)
 
 
 @jit
@@ -205,8 +220,9 @@ def _settled(cart, i, s, target, decay, span):
 
 
 @jit
-def _bend(T, s, N, body, by, span, by_x, by_v):
+def _bend(T, bodies, body, by, span, by_x, by_v):
     """Give the lanes of a body the impulse of a force with slopes by the state of one."""
+    s, N = bodies.s, bodies.N
     if by_x != 0.0:
         _add(T, N + body, s[GRIP, body] * span * by_x, by)
     if by_v != 0.0:
@@ -224,11 +240,12 @@ def stop(T, s, N, i):
 
 
 @jit
-def meet(T, s, N, body, other, stiffness, damping):
+def meet(T, bodies, body, other, stiffness, damping):
     """Note that a contact of a body, with another or (-1) a wall, begins or ends now: when.
 
     It ends where its push, of stiffness and damping, does; it begins (damping 0) where they touch.
     """
+    s, N = bodies.s, bodies.N
     rate = stiffness * s[V, body] + damping * s[ACC, body]
     if other >= 0:
         rate -= stiffness * s[V, other] + damping * s[ACC, other]
@@ -243,10 +260,13 @@ def meet(T, s, N, body, other, stiffness, damping):
 
 
 @jit
-def restart(lanes, T, shot, free, parent, motor, n, N):
+def restart(bodies, lanes, shot, free):
     """Let the sensitivities begin anew where a shot does."""
-    for lane in range(lanes.shape[1]):
-        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+    n, N, motor, parent, T, of = (
+        bodies.n, bodies.N, bodies.motor, bodies.parent, lanes.T, lanes.of
+    )  # fmt: skip
+    for lane in range(of.shape[1]):
+        kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK
         for first, by in ((0, BY_POSITION), (N, BY_VELOCITY)):
             for i in range(n):
                 if not free[i]:
@@ -261,13 +281,14 @@ def restart(lanes, T, shot, free, parent, motor, n, N):
 
 
 @jit
-def bend_presliding(lanes, T, s, K, most, scatter, i, n, N):
+def bend_presliding(bodies, lanes, i, most, scatter):
     """Start the presliding state of cart i where the others' sensitivities bend it."""
-    for lane in range(lanes.shape[1]):
-        kind, at, block, q = lanes[0, lane], lanes[1, lane], lane // _BLOCK, lane % _BLOCK
+    s, n, N, T, of = bodies.s, bodies.n, bodies.N, lanes.T, lanes.of
+    for lane in range(of.shape[1]):
+        kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK
         net = 0.0
         for j in range(N):
-            net -= K[i, j] * T[j, block, q]
+            net -= bodies.K[i, j] * T[j, block, q]
         if kind == BY_STIFFNESS and (at == i or at == i + 1):
             net += stretch(s, X, at, n) * (1.0 if at == i + 1 else -1.0)
         T[2 * N + i, block, q] = net / (scatter[i] * most)

@@ -1,13 +1,16 @@
-"""What the compiled functions share: the rows of the state, and the compiler.
+"""What the compiled functions share: the structures they take, and the compiler.
 
-The compiled functions index flat tables: numba cannot see dataclasses. It looks only at a
-function's own file to see whether what it has stored is out of date: who changes a file of this
-folder removes its `__pycache__`.
+Structures are tuples with names, which numba compiles to what their fields alone would be. It
+looks only at a function's own file to see whether what it has stored is out of date: who changes a
+file of this folder removes its `__pycache__`.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from numba import njit
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
 
 # Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
 # state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
@@ -18,6 +21,45 @@ from numba import njit
 X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
 RUB, BEFORE, TURNED, PAST, HALF_X, HALF_V, HALF_A = range(17, 24)
 ROWS = 24
+
+
+class Bodies(NamedTuple):
+    """Carts, motor and hidden masses: the linear part of the plant, and the state of all that acts.
+
+    `n` are the carts, `N` all bodies; `motor` is the motor's row or -1, `driven` that of the body
+    which the input pushes. `parent` has the carts of hidden masses, or -1. `s` is the table of the
+    state; `K` and `C` are the linear matrices, closed contacts included. `switches` are the numbers
+    of the contacts and slack springs there are, see `guard`, `active` which are closed.
+    """
+
+    n: int
+    N: int
+    motor: int
+    driven: int
+    parent: NDArray
+    s: Array
+    K: Array
+    C: Array
+    switches: NDArray
+    active: NDArray
+
+
+class Push(NamedTuple):
+    """What acts on the bodies during a step of `h` s.
+
+    `u` is the input that arrives, its mean over the step; `on` whether the drive is powered;
+    `scatter` (n,) a factor on all dry friction of a cart. `dry` tells whether there is any,
+    `smooth` where there are smooth forces, `contact_step` how long a step may be inside a contact.
+    """
+
+    u: float
+    on: float
+    h: float
+    scatter: Array
+    dry: bool
+    smooth: int
+    contact_step: float
+
 
 _OPTIONS: dict[str, Any] = {
     "cache": True,

@@ -21,17 +21,18 @@ _MOST_EVENTS = 12  # in one substep; more would be chatter
 
 
 @inlined
-def smooth_forces(cart, spring, drive, driven, n, s, u, on, smooth):
+def smooth_forces(tables, bodies, u, on, smooth):
     """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
+    s, n, driven, drive = bodies.s, bodies.n, bodies.driven, tables.drive
     if smooth & ON_CARTS:
         for i in range(n):
-            s[FORCE, i] += cart_force(cart, i, s[MID_X, i], s[MID_V, i], u)
+            s[FORCE, i] += cart_force(tables.cart, i, s[MID_X, i], s[MID_V, i], u)
     if smooth & ON_DRIVE:
         s[FORCE, driven] += motor_force(drive, s[MID_X, driven], s[MID_V, driven], u, on)
         s[FORCE, 0] += drive_force(drive, s[MID_X, 0], s[MID_V, 0], u, on)
     if smooth & ON_SPRINGS:
         for j in range(n + 1):
-            f = spring_force(spring, j, stretch(s, MID_X, j, n), stretch(s, MID_V, j, n))
+            f = spring_force(tables.spring, j, stretch(s, MID_X, j, n), stretch(s, MID_V, j, n))
             if j < n:
                 s[FORCE, j] -= f
             if j > 0:
@@ -39,8 +40,9 @@ def smooth_forces(cart, spring, drive, driven, n, s, u, on, smooth):
 
 
 @inlined
-def rub(cart, s, K, C, scatter, u, n, N, step):
+def rub(cart, bodies, push, step):
     """Add dry friction to the forces; a cart that it holds gets no inverse mass."""
+    s, n, scatter, u = bodies.s, bodies.n, push.scatter, push.u
     for i in range(n):
         s[RUB, i] = 0.0
         most, target, pace = settling(cart, i, s[MID_V, i])
@@ -60,8 +62,8 @@ def rub(cart, s, K, C, scatter, u, n, N, step):
             s[SIDE, i] = 1.0 if s[V, i] > 0.0 else -1.0
         else:
             net = s[FORCE, i] + scatter[i] * s[RUB, i]
-            for j in range(N):
-                net -= K[i, j] * s[X, j] + C[i, j] * s[V, j]
+            for j in range(bodies.N):
+                net -= bodies.K[i, j] * s[X, j] + bodies.C[i, j] * s[V, j]
             if abs(net) <= scatter[i] * size:
                 s[GRIP, i] = 0.0
                 continue
@@ -118,19 +120,19 @@ def first_stop(s, n, step, none):
 
 
 @inlined
-def first_switch(switches, active, cart, spring, drive, n, motor, s, step, none):
+def first_switch(tables, bodies, step, none):
     """Return when, within the step, the first contact or slack switches, and which: or `none`."""
-    switching = none
+    switching, switches, active, s = none, bodies.switches, bodies.active, bodies.s
     for e in range(switches.size):
-        end = guard(switches[e], active[e], cart, spring, drive, n, motor, s, step)
+        end = guard(switches[e], active[e], tables, s, step)
         if end > 0.0:
             low, high = 0.0, step
-            g_low = guard(switches[e], active[e], cart, spring, drive, n, motor, s, 0.0)
+            g_low = guard(switches[e], active[e], tables, s, 0.0)
             g_low, g_high = min(g_low, -1e-300), end
             # The root by the Illinois method, taken on its far side.
             for _ in range(8):
                 guess = low + (high - low) * g_low / (g_low - g_high)
-                value = guard(switches[e], active[e], cart, spring, drive, n, motor, s, guess)
+                value = guard(switches[e], active[e], tables, s, guess)
                 if value > 0.0:
                     high, g_high, g_low = guess, value, 0.5 * g_low
                 else:
@@ -141,16 +143,14 @@ def first_switch(switches, active, cart, spring, drive, n, motor, s, step, none)
 
 
 @inlined
-def advance(
-    cart, spring, drive, n, N, motor, s, K, C, scatter, u, on, h, dry, smooth, switches,
-    active, contact_step, lanes, T, phi, work,
-):  # fmt: skip
-    """Advance x, v and the presliding state z by h, from friction event to friction event.
+def advance(tables, bodies, push, lanes):
+    """Advance x, v and the presliding state z by a step, from friction event to friction event.
 
-    Sensitivities go along, see `make_sensitivities`.
+    Sensitivities go along, see `make_lanes`.
     """
-    driven = motor if motor >= 0 else 0
-    left = h
+    s, K, C, n, N = bodies.s, bodies.K, bodies.C, bodies.n, bodies.N
+    switches, active = bodies.switches, bodies.active
+    left = push.h
     events = 0
     none = N + switches.size  # no body's number, and no switch's
     while left > 1e-12:
@@ -158,17 +158,17 @@ def advance(
         for e in range(switches.size):
             # Inside a stiff contact the series needs shorter steps.
             if active[e] and not n <= switches[e] <= 2 * n:
-                step = min(step, contact_step)
+                step = min(step, push.contact_step)
         for i in range(N):
             s[MID_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[ACC, i])
             s[MID_V, i] = s[V, i] + 0.5 * step * s[ACC, i]
             s[FORCE, i] = s[FIX, i]
             s[GRIP, i] = s[INV, i]
-        if smooth:
-            smooth_forces(cart, spring, drive, driven, n, s, u, on, smooth)
-        s[FORCE, driven] += u
-        if dry:
-            rub(cart, s, K, C, scatter, u, n, N, step)
+        if push.smooth:
+            smooth_forces(tables, bodies, push.u, push.on, push.smooth)
+        s[FORCE, bodies.driven] += push.u
+        if push.dry:
+            rub(tables.cart, bodies, push, step)
         # The usual sizes as constants: the compiler then unrolls the loops.
         if N == 1:
             taylor(s, K, C, np.int64(1))
@@ -180,41 +180,38 @@ def advance(
             taylor(s, K, C, N)
         whole = step
         stopping = switching = none
-        if dry and events < _MOST_EVENTS:
+        if push.dry and events < _MOST_EVENTS:
             step, stopping = first_stop(s, n, step, none)
         if events < _MOST_EVENTS:
-            step, switching = first_switch(
-                switches, active, cart, spring, drive, n, motor, s, step, none
-            )
+            step, switching = first_switch(tables, bodies, step, none)
             if switching != none:
                 stopping = none
-        if lanes.size > 0:
-            push = driven, drive, u, on, smooth
-            carry(lanes, T, phi, work, s, K, C, N, n, cart, spring, scatter, push, whole, step)
+        if lanes.of.size > 0:
+            carry(tables, bodies, push, lanes, whole, step)
         for i in range(N):
             s[X, i], s[V, i] = position(s, i, step), velocity(s, i, step)
             s[ACC, i] = s[D2, i] + step * (s[D3, i] + 0.5 * step * s[D4, i])
-        if dry:
+        if push.dry:
             for i in range(n):
-                most, target, pace = settling(cart, i, s[MID_V, i])
+                most, target, pace = settling(tables.cart, i, s[MID_V, i])
                 if most > 0.0:
                     decay = s[DECAY, i] * s[DECAY, i] if step == whole else exp(-pace * step)
                     s[Z, i] = target + (s[Z, i] - target) * decay
                 if s[SIDE, i] != 0.0 and s[SIDE, i] * s[V, i] < 0.0:
                     s[V, i] = 0.0
         if stopping != none:
-            stop(T, s, N, stopping)
+            stop(lanes.T, s, N, stopping)
             s[V, stopping] = 0.0
             s[ACC, stopping] = 0.0
             events += 1
         if switching != none:
             which, ends = switches[switching], 1.0 if active[switching] else 0.0
             if not n <= which <= 2 * n:
-                body, other, _, k, c, _ = contact(which, cart, drive, n, motor)
-                meet(T, s, N, body, other, k, ends * c)
+                body, other, _, k, c, _ = contact(which, tables)
+                meet(lanes.T, bodies, body, other, k, ends * c)
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
-            phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
-            switch(which, sign, cart, spring, drive, n, motor, s, K, C)
+            lanes.phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
+            switch(which, sign, tables, s, K, C)
             events += 1
         left -= step

@@ -1,0 +1,222 @@
+"""What a recording asks of the bench: commands and limits in the bench's own counts."""
+
+from dataclasses import dataclass, replace
+
+from pipeline.bench.protocol.messages import (
+    FULL_SCALE,
+    ChirpEnd,
+    Command,
+    Description,
+    PidGains,
+    Reading,
+    Start,
+    StateGains,
+    Tone,
+    Wave,
+)
+from pipeline.bench.protocol.waves import target_at
+from pipeline.errors import ConfigError, HardwareError
+from pipeline.experiments.gains import (
+    CountScales,
+    Table,
+    bench_gains,
+    bench_scales,
+    controller_table,
+)
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.submission import Submission, System
+from pipeline.workflow import analyse
+
+
+@dataclass(frozen=True, kw_only=True)
+class Order:
+    """A recording in the bench's counts.
+
+    Attributes
+    ----------
+    commands : to send, the start last.
+    scales : of the counts; `input_unit`, `position_unit` are theirs.
+    most_duty, most_counts : what no line may pass, duty and encoder counts.
+    """
+
+    recording: Recording
+    commands: tuple[Command, ...]
+    scales: CountScales
+    input_unit: str
+    position_unit: str
+    most_duty: float
+    most_counts: float
+
+    def rest(self) -> "Order":
+        """Return the order to do nothing while the carts settle, with the limits of this one."""
+        settle = self.recording.settle
+        return replace(
+            self,
+            recording=self.recording.model_copy(update={"controller": None}),
+            commands=(Start(wave=Wave.DELTA, frequency=1 / settle, amplitude=0),),
+        )
+
+    def strays(self, reading: Reading, *, period: float) -> bool:
+        """Tell whether the bench follows another target than it was told, as after a changed digit.
+
+        An edge may come a `period` (ms) early or late; a target may be rounded either way.
+        """
+        start = self.commands[-1]
+        assert isinstance(start, Start)
+        end = next((c.frequency for c in self.commands if isinstance(c, ChirpEnd)), None)
+        tones = tuple(c for c in self.commands if isinstance(c, Tone) and c.harmonic)
+
+        def target(ms: float) -> int:
+            return target_at(start, max(0.0, 1e-3 * ms), chirp_end=end, tones=tones)
+
+        if abs(reading.target - target(reading.ms)) <= 1:
+            return False
+        near = [target(reading.ms + shift) for shift in (-period, 0.0, period)]
+        return not min(near) - 1 <= reading.target <= max(near) + 1
+
+    def drives_off(self, reading: Reading, *, before: Reading) -> bool:
+        """Tell whether the motor gets another duty than the target, which in open loop is its duty.
+
+        An edge may act a line later.
+        """
+        if self.recording.controller is not None:
+            return False
+        near = [min(max(r.target, -FULL_SCALE), FULL_SCALE) for r in (before, reading)]
+        return not min(near) - 1 <= reading.duty <= max(near) + 1
+
+    def passed(self, reading: Reading, *, carts: int) -> str:
+        """Return what a line passes the limits by, or ""."""
+        if abs(reading.duty) > self.most_duty:
+            found, most = (abs(self.scales.input) * n for n in (reading.duty, self.most_duty))
+            return f"the input was {found:.4g} {self.input_unit}, the limit is {most:.4g}"
+        return self.too_far(reading, carts=carts)
+
+    def too_far(self, reading: Reading, *, carts: int) -> str:
+        """Return which cart is further from its zero than the limit, or ""."""
+        for cart, count in enumerate(reading.counts[:carts], start=1):
+            if abs(count) > self.most_counts:
+                found, most = (self.scales.position * n for n in (count, self.most_counts))
+                return (
+                    f"cart {cart} was {found:.4g} {self.position_unit} from its zero, "
+                    f"the limit is {most:.4g}"
+                )
+        return ""
+
+
+def order_on(
+    recording: Recording, plan: Plan, submission: Submission, bench: Description
+) -> tuple[Order, Table | None]:
+    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
+    system = submission.system
+    scales = CountScales(
+        input=system.input.per_count or bench.input_per_count,
+        position=system.position.per_count or bench.position_per_count,
+    )
+    gains: PidGains | StateGains | None = None
+    table: Table | None = None
+    if recording.controller is not None:
+        analysis = analyse(submission)
+        scales = bench_scales(submission, bench=bench, analysis=analysis)
+        gains = bench_gains(
+            recording, submission=submission, analysis=analysis, bench=bench, limits=plan.limits
+        )
+        cart = recording.controller.cart
+        table = dict(controller_table(gains, cart=cart, scales=scales, carts=system.carts))
+    order = make_order(
+        recording, limits=plan.limits, scales=scales, system=system, bench=bench, gains=gains
+    )
+    return order, table
+
+
+def make_order(
+    recording: Recording,
+    *,
+    limits: PlanLimits,
+    scales: CountScales,
+    system: System,
+    bench: Description,
+    gains: PidGains | StateGains | None = None,
+) -> Order:
+    """Turn a recording into commands, its amplitude into counts; `gains` close its loop.
+
+    Raises
+    ------
+    ConfigError : the amplitude passes the limits or full scale, or is less than half a count.
+    HardwareError : the bench does not know the wave or the controller.
+    """
+    amplitude = _count_amplitude(recording, limits=limits, scales=scales, system=system)
+    commands = _list_commands(recording, bench=bench, gains=gains, amplitude=amplitude)
+    return Order(
+        recording=recording,
+        commands=tuple(commands),
+        scales=scales,
+        input_unit=system.input.unit,
+        position_unit=system.position.unit,
+        most_duty=limits.input / abs(scales.input) + 0.5,  # amplitudes are rounded
+        most_counts=limits.travel / abs(scales.position),
+    )
+
+
+def _count_amplitude(
+    recording: Recording, *, limits: PlanLimits, scales: CountScales, system: System
+) -> int:
+    """Return the amplitude in counts: of the duty, in closed loop of the encoder."""
+    closed = recording.controller is not None
+    limit, unit, per_count = (
+        (limits.travel, system.position.unit, scales.position)
+        if closed
+        else (limits.input, system.input.unit, abs(scales.input))
+    )
+    where = f"plan.toml: amplitude {recording.amplitude:g} {unit}"
+    if abs(recording.amplitude) > limit:
+        raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
+    full = FULL_SCALE * per_count
+    if not closed and abs(recording.amplitude) > full + 0.5 * per_count:
+        raise ConfigError(f"{where} is more than the bench can give: {full:g} {unit}; lower it")
+    amplitude = round(recording.amplitude / per_count)
+    if recording.amplitude and not amplitude:
+        raise ConfigError(
+            f"{where} is less than half a count of the bench ({per_count:g} {unit}); raise it"
+        )
+    return amplitude
+
+
+def _list_commands(
+    recording: Recording,
+    *,
+    bench: Description,
+    gains: PidGains | StateGains | None,
+    amplitude: int,
+) -> list[Command]:
+    """Return what a bench is told of a recording, in order."""
+    commands: list[Command] = []
+    if gains is not None:
+        if isinstance(gains, StateGains):
+            _check_known("f", "state feedback", bench)
+        # A byte that is lost takes the gains with it: then none act, not those of an earlier run.
+        commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
+    if recording.wave == "chirp":
+        _check_known("c", "chirp", bench)
+        if recording.frequency_end is not None:
+            commands.append(ChirpEnd(frequency=recording.frequency_end))
+    if recording.wave == "multisine":
+        _check_known("m", "multisine", bench)
+        commands += [Tone(harmonic=0), *recording.sines]
+    commands.append(
+        Start(
+            wave=Wave[recording.wave.upper()],
+            encoder=min(recording.controller.cart, 2) if recording.controller else None,
+            frequency=recording.frequency,
+            amplitude=amplitude,
+            cycles=recording.cycles,
+        )
+    )
+    return commands
+
+
+def _check_known(letter: str, name: str, bench: Description) -> None:
+    if letter not in bench.commands:
+        raise HardwareError(
+            f"the bench {bench.name!r} knows no {name}; take its table out of plan.toml or "
+            "change it"
+        )

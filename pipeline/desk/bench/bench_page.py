@@ -1,0 +1,204 @@
+"""The bench's room: plan, acquire, explore, watch. What runs is decided where it is acquired."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from markupsafe import Markup
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.bench.live.live_page import live_view
+from pipeline.desk.ask import Ask
+from pipeline.desk.bench.plan_rows import plan_ids, read_plan
+from pipeline.desk.bench.ports import list_ports, read_port
+from pipeline.desk.benches import BenchSession
+from pipeline.desk.served_files import serve_file
+from pipeline.desk.typed import read_number, read_whole_number
+from pipeline.errors import ConfigError, PipelineError
+from pipeline.experiments.by_hand import (
+    KINDS,
+    NEEDED,
+    TYPED,
+    WantedRecording,
+    add_recording,
+    make_recording,
+)
+from pipeline.experiments.exploring.error_goal import read_error_goal
+from pipeline.experiments.goal import WORST
+from pipeline.experiments.plan import Recording
+from pipeline.experiments.propose import current_plan
+from pipeline.names import read_name
+from pipeline.report.exploration.diary import NAME as DIARY
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import outside
+from pipeline.words.text import with_symbols
+
+_KINDS = (("step", "Step"), ("sweep", "Sweep"), ("sine", "Dwell"), ("decay", "Decay"))
+_TYPED = ("kind", "amplitude", "frequency", "frequency_end", "seconds", "cart", "goal")
+
+
+def show(ask: Ask) -> Response:
+    """Show the plan and the forms, or the session that is under way."""
+    return _show_page(ask)
+
+
+def plan(ask: Ask) -> Response:
+    """Have a plan made, or added to."""
+    _note_plan(ask)
+    ask.start("propose_recordings", title="The plan", stock=bool(ask.text("stock")))
+    return ask.back(ask.here)
+
+
+def acquire(ask: Ask) -> Response:
+    """Begin to acquire what is ticked; all of the plan where nothing is."""
+    only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
+    port = read_port(ask)
+    _note_plan(ask)
+    ask.desk.benches.start(ask.folder(), port=port, only=only)
+    return ask.back(ask.here)
+
+
+def explore(ask: Ask) -> Response:
+    """Begin to explore."""
+    error = read_number(ask.text("error"), name="to within ± %", above=0, below=100)
+    minutes = read_number(ask.text("minutes"), name="minutes", above=0, below=10_000)
+    until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
+    read_error_goal(until)  # what is none is said before anything begins
+    port = read_port(ask)
+    _note_plan(ask)
+    ask.desk.benches.start(ask.folder(), port=port, explore=(until, limit))
+    return ask.back(ask.here)
+
+
+def add(ask: Ask) -> Response:
+    """Put a recording into the plan; an exploration that is under way makes it next."""
+    folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
+    try:
+        before = plan_ids(folder)
+        new = add_recording(folder, _read_recording(typed, load_submission(folder)))
+    except PipelineError as error:
+        return _show_page(ask, status=422, typed=typed, refused=str(error))
+    ask.desk.benches.planned[folder] = before
+    return ask.back(ask.here, f"{new.id} is in the plan.")
+
+
+def weigh(ask: Ask) -> Response:
+    """Show what a recording would bring, and what the program would choose."""
+    folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
+    try:
+        wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
+        goal = typed["goal"] or WORST
+        found = ask.desk.workers.do(
+            "weigh_recording", folder=str(folder), recording=wanted, goal=goal
+        )
+    except PipelineError as error:
+        return _show_page(ask, status=422, typed=typed, refused=str(error))
+    goal = typed["goal"]
+    words = f"the {read_name(goal).words}" if goal else with_symbols(found["words"])
+    return _show_page(
+        ask, typed=typed, weighed={**found, "words": words, "bars": _scale_bars(found)}
+    )
+
+
+def show_diary(ask: Ask) -> Response:
+    """Return the diary of the last exploration, which runs no script but its own."""
+    return serve_file(ask.folder(), DIARY)
+
+
+def press(ask: Ask) -> Response:
+    """Pass on a button; one of a page without scripts leads back to it."""
+    session = _find_session(ask)
+    if session.ended.is_set():
+        raise HTTPException(404, "the session is over")
+    status = session.press(ask.text("wish"), ask.text("number"))
+    return ask.back(ask.here) if ask.text("plain") else Response(status_code=status)
+
+
+async def stream(ask: Ask) -> Response:
+    """Pass on the news of the session; one that ended while its page was on the way says so."""
+    return _find_session(ask).stream()
+
+
+def _show_page(
+    ask: Ask,
+    *,
+    status: int = 200,
+    typed: Mapping[str, str] = {},
+    refused: str = "",
+    weighed: Mapping[str, Any] | None = None,
+) -> Response:
+    """Show the room.
+
+    Parameters
+    ----------
+    typed : of a recording that somebody wants.
+    refused : why that is none.
+    weighed : what it would bring.
+    """
+    folder = ask.folder()
+    session = ask.desk.benches.of(folder)
+    running = session if session and not session.ended.is_set() else None
+    kind = typed.get("kind") or ask.query("kind")
+    return ask.page(
+        "bench",
+        status=status,
+        title=f"{folder.name} at the bench",
+        session=session,
+        asks=running and not running.is_shown,
+        live=Markup(live_view()) if running and running.is_shown else "",
+        ports=list_ports(ask),
+        has_report=outside(folder, "report/report.html") is None,
+        kinds=_KINDS,
+        kind=kind if kind in KINDS else KINDS[0],
+        kind_asked=bool(ask.query("kind")),
+        diary=outside(folder, DIARY) is None,
+        typed={name: typed.get(name, "") for name in _TYPED},
+        refused=refused,
+        weighed=weighed,
+        **read_plan(folder, session=session, before=ask.desk.benches.planned.get(folder)),
+    )
+
+
+def _note_plan(ask: Ask) -> None:
+    """Keep what the plan has now: what it has beyond that later is new."""
+    ask.desk.benches.planned[ask.folder()] = plan_ids(ask.folder())
+
+
+def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recording:
+    """Return the recording that was typed."""
+    if typed["kind"] not in KINDS:
+        raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
+    kind = KINDS[KINDS.index(typed["kind"])]
+    if blank := [TYPED.get(key, key) for key in NEEDED[kind] if not typed[key].strip()]:
+        raise ConfigError(f"{' and '.join(blank)}: what is it to be? The field is empty")
+    carts = submission.system.carts
+    wanted = WantedRecording(
+        kind=kind,
+        seconds=read_number(typed["seconds"], name="how long"),
+        amplitude=read_number(typed["amplitude"], name="amplitude"),
+        frequency=read_number(typed["frequency"], name="frequency"),
+        frequency_end=read_number(typed["frequency_end"], name="to") or None,
+        cart=read_whole_number(typed["cart"] or "1", name="cart", least=1, most=carts),
+    )
+    return make_recording(wanted, plan=current_plan(submission), submission=submission)
+
+
+def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the three errors as they are shown: in percent, as error bars on one scale."""
+    rows = {
+        "now": found["now"],
+        "after yours": found["proposed"],
+        "after the program's": found["best"],
+    }
+    largest, half = max(rows.values()), 140.0  # of the largest bar's length, points
+    return [
+        {"of": of, "percent": f"{100 * error:.2g}", "half": round(half * error / largest, 1)}
+        for of, error in rows.items()
+    ]
+
+
+def _find_session(ask: Ask) -> BenchSession:
+    session = ask.desk.benches.of(ask.folder())
+    if session is None:
+        raise HTTPException(404, "no session was begun here")
+    return session

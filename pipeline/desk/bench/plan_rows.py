@@ -1,0 +1,97 @@
+"""The plan of a folder as its page shows it: what is done, what is next, what is new, and why."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.desk.benches import BenchSession
+from pipeline.errors import PipelineError
+from pipeline.experiments.plan import Plan
+from pipeline.experiments.plan_file import load_plan, plan_path
+from pipeline.experiments.plan_words import session_time, time_words, what_words
+from pipeline.names import parameter_names, read_name
+from pipeline.submission import Submission, load_submission
+from pipeline.submission.load import NAME, outside
+
+
+def plan_ids(folder: Path) -> frozenset[str] | None:
+    """Return the ids in the plan of a folder; None if there is no plan that can be read."""
+    try:
+        submission = load_submission(folder)
+        if plan_path(submission).exists():
+            return frozenset(one.id for one in load_plan(submission).recordings)
+    except PipelineError:
+        pass
+    return None
+
+
+def read_plan(
+    folder: Path, *, session: BenchSession | None, before: Collection[str] | None
+) -> dict[str, Any]:
+    """Return the plan, what can be wanted of it, and what is wrong with what is there.
+
+    Parameters
+    ----------
+    session : the last one in the folder, which knows why a run ended early.
+    before : ids that the plan had before it last grew; None: all have been there.
+    """
+    found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
+    found |= {"carts": 0, "recorded": 0}
+    if not (folder / NAME).exists():
+        return found
+    try:
+        submission = load_submission(folder)
+        system = submission.system
+        names = parameter_names(system.carts, rigid=not system.bench.tied)
+        found |= {
+            "sound": True,
+            "carts": system.carts,
+            "recorded": len(submission.experiments),
+            "units": {"input": system.input.unit, "position": system.position.unit},
+            "parameters": [(name, f"the {read_name(name).words}") for name in names],
+        }
+        if not plan_path(submission).exists():
+            return found
+        plan = load_plan(submission)
+    except PipelineError as error:
+        return found | {"sound": False, "wrong": str(error)}
+    why = _why_again(session)
+    return found | _describe(plan, submission, why=why, before=before)
+
+
+def _describe(
+    plan: Plan,
+    submission: Submission,
+    *,
+    why: Mapping[str, str],
+    before: Collection[str] | None,
+) -> dict[str, Any]:
+    """Return a row for each recording, and how long those that are left take."""
+    done = {experiment.id for experiment in submission.experiments}
+    left = [recording for recording in plan.recordings if recording.id not in done]
+    following = left[0].id if left else ""
+    rows = [
+        {
+            "id": one.id,
+            "what": what_words(one, submission),
+            "done": one.id in done,
+            "next": one.id == following,
+            "new": before is not None and one.id not in before,
+            "why": "" if one.id in done else why.get(one.id, _find_partial(submission, one.id)),
+        }
+        for one in plan.recordings
+    ]
+    return {"rows": rows, "left": time_words(session_time(left)) if left else ""}
+
+
+def _why_again(session: BenchSession | None) -> dict[str, str]:
+    """Return by id why a run of the last session is wanted again."""
+    plan = session.snapshot().get("plan", ()) if session else ()
+    return {entry["id"]: f"It ended early: {entry['why']}." for entry in plan if entry["why"]}
+
+
+def _find_partial(submission: Submission, name: str) -> str:
+    """Return that an earlier run ended early; "" if none did."""
+    file = f"data/{name}.partial.txt"
+    is_there = outside(submission.folder, file) is None
+    return f"An earlier run ended early; what it recorded is in {file}." if is_there else ""

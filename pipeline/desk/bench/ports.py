@@ -1,0 +1,90 @@
+"""The ports that a bench may be at: plugged in, virtual, and the one used last in a folder."""
+
+import json
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from pipeline.bench.host.serial_line import port_names
+from pipeline.desk.ask import Ask
+from pipeline.desk.ending import find_log
+from pipeline.errors import ConfigError
+from pipeline.output import write_file
+from pipeline.simulated.emulator.announce import running_benches
+
+_KEPT = 200  # folders whose port is remembered
+
+
+@dataclass(frozen=True, kw_only=True)
+class Port:
+    """A port to choose.
+
+    Attributes
+    ----------
+    name : what is there, as far as anybody knows.
+    """
+
+    address: str
+    name: str
+
+
+def list_ports(ask: Ask) -> list[Port]:
+    """Return the ports that somebody may record at, the likeliest first.
+
+    That is the one used last in this folder if it is still there, then what is plugged in, then
+    virtual benches of this computer. On a lab server it is only what the list of users names.
+    """
+    used = _read_memory().get(str(ask.folder()), "")
+    if ask.user.owns:
+        plugged = [Port(address=name.partition(" (")[0], name=name) for name in port_names()]
+        virtual = [
+            Port(address=one.address, name=f"virtual bench {one.name} ({one.address})")
+            for one in running_benches()
+        ]
+        # A port of which the system knows nothing is seldom one with a bench.
+        unknown = [port for port in plugged if port.name == port.address]
+        found = [port for port in plugged if port not in unknown] + virtual + unknown
+    else:
+        found = [Port(address=at, name=at) for at in ask.user.ports]
+    if used and ask.user.owns and used not in [port.address for port in found]:
+        found.append(Port(address=used, name=f"{used} (used last, not found now)"))
+        return found
+    return sorted(found, key=lambda port: port.address != used)
+
+
+def read_port(ask: Ask) -> str:
+    """Return the port that was typed, else the one that was chosen; it is remembered.
+
+    Raises
+    ------
+    ConfigError : the form has no port, or one that is not listed for this person.
+    """
+    port = ask.text("other") or ask.text("port")
+    if not port:
+        raise ConfigError("choose the port of the bench, or type one such as COM3 or /dev/ttyACM0")
+    if not ask.user.owns and port not in ask.user.ports:
+        raise ConfigError(f"{port}: is not listed for you; there are {', '.join(ask.user.ports)}")
+    _remember(ask.folder(), port)
+    return port
+
+
+def _remember(folder: Path, port: str) -> None:
+    ports = {at: used for at, used in _read_memory().items() if at != str(folder)}
+    kept = dict(list(ports.items())[1 - _KEPT :]) | {str(folder): port}
+    with suppress(OSError):  # a home that nobody may write to: it is chosen again next time
+        write_file(_find_memory(), json.dumps(kept, indent=1), private=True)
+
+
+def _read_memory() -> dict[str, str]:
+    """Return the port used last in each folder, in the order of use."""
+    try:
+        read = json.loads(_find_memory().read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    pairs: Sequence[tuple[object, object]] = list(read.items()) if isinstance(read, dict) else []
+    return {str(folder): str(port) for folder, port in pairs}
+
+
+def _find_memory() -> Path:
+    return find_log().with_suffix(".ports.json")

@@ -1,0 +1,110 @@
+"""What is done with a whole class: graded again, written, changed from a table, exported."""
+
+import zipfile
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import get_args
+
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.grades.class_table import may_release, open_book, read_class
+from pipeline.desk.grades.team_page import sign
+from pipeline.desk.scratch import scratch_folder
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.override import read_wishes
+from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.export import export
+from pipeline.words.numbers import count
+
+
+def take_table(ask: Ask) -> Response:
+    """Change points as a table says, all of it or nothing."""
+    shown = read_class(ask)
+    by = sign(ask)
+    with scratch_folder() as scratch:
+        table = _store_upload(ask, "table", scratch / "the table")
+        if table is None:
+            raise ConfigError("choose a file first")
+        wishes = read_wishes(table)
+    teams = {name: team.submission for name, team in shown.teams.items()}
+    meant = []
+    for wish in wishes:
+        if wish.submission not in teams:
+            raise ConfigError(f"line {wish.line}: no submission of this class is called so")
+        meant.append(replace(wish, submission=teams[wish.submission]))
+    done = open_book(ask).change_all(meant, by=by)
+    said = f"{count(done.teams, 'change')} imported"
+    if unchanged := len(meant) - done.teams:
+        said += f", {unchanged} were the same already"
+    return ask.back(ask.here, f"{said}.")
+
+
+def release(ask: Ask) -> Response:
+    """Let students with accounts read their feedback, or no longer."""
+    if not may_release(ask):
+        raise HTTPException(403, "when students read their feedback, the instructor decides")
+    released = ask.text("do") == "release"
+    open_book(ask).release(released, by=sign(ask))
+    said = "Students can read their feedback." if released else "Students cannot read it any more."
+    return ask.back(f"{ask.here}#work", said)
+
+
+def export_class(ask: Ask) -> Response:
+    """Return the grades as a learning platform imports them: a table, or a zip with remarks."""
+    platform = next((one for one in get_args(Platform) if one == ask.text("lms")), None)
+    if platform is None:
+        raise HTTPException(400, "there is no such platform")
+    with scratch_folder() as scratch:
+        roster = _store_upload(ask, "roster", scratch / "roster.csv")
+        out = scratch / "export"
+        done = export(open_book(ask), platform, out, title=ask.text("title") or None, roster=roster)
+        if len(done.files) == 1 and not done.remarks:
+            return _download(done.files[0].read_bytes(), done.files[0].name, kind="text/csv")
+        packed = BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file in done.files:
+                archive.write(file, file.relative_to(out).as_posix())
+            if done.remarks:  # they name students, which a page need not
+                archive.writestr(
+                    "remarks.txt", "".join(f"{remark.text}\n" for remark in done.remarks)
+                )
+    return _download(packed.getvalue(), f"{platform}.zip", kind="application/zip")
+
+
+def regrade(ask: Ask) -> Response:
+    """Have the class graded again: what is as it was is not."""
+    shown = read_class(ask)
+    if not ask.user.owns:
+        raise HTTPException(403, "folders of this computer are named by its owner only")
+    folder = ask.folder()
+    typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness")}
+    if not typed["paths"] or not typed["rubric"]:
+        raise ConfigError("name the submissions and the rubric")
+    ask.desk.books.asked[folder] = typed
+    ask.start(
+        "regrade_class",
+        title="Grading",
+        paths=typed["paths"].splitlines(),
+        rubric=typed["rubric"],
+        lateness=typed["lateness"],
+        anonymous=shown.rubric.anonymous,
+    )
+    return ask.back(ask.here + "#work")
+
+
+def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:
+    """Write an uploaded file to a path; None where there is none."""
+    sent = ask.form.get(name)
+    if not isinstance(sent, UploadFile) or not sent.filename:
+        return None
+    path.write_bytes(sent.file.read())  # the guard let no more than a form's bytes pass
+    return path
+
+
+def _download(content: bytes, name: str, *, kind: str) -> Response:
+    headers = {"Content-Disposition": f'attachment; filename="{name}"'}
+    return Response(content, media_type=kind, headers=headers)

@@ -1,0 +1,212 @@
+"""A class at the desk: the table, who changed what, what is drawn of it."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.books import Class
+from pipeline.desk.grades.filters import Filter
+from pipeline.desk.served_files import show_drawing, show_own_page
+from pipeline.desk.users import name_place
+from pipeline.grading.grade import CODES
+from pipeline.grading.gradebook.history import to_the_second
+from pipeline.grading.gradebook.open_book import Listing
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.publish.anonymous import STRANGER, anonymise
+from pipeline.grading.publish.class_page import class_page
+from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.outputs import doubles_of
+from pipeline.grading.similarity.clusters import find_clusters, renamed
+from pipeline.grading.words import WORDS, points_text
+from pipeline.report.figures.grading import distribution_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.render.html import render_drawing
+from pipeline.words.text import capital
+
+_ROWS = 50  # of a page
+_MOST_NEWS = 8
+_MOST_SETS = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class Counted:
+    """A remark or a criterion, and how many teams have it or lost points there."""
+
+    key: str
+    title: str
+    many: int
+
+
+def read_class(ask: Ask) -> Class:
+    """Return the class that the address is about."""
+    return ask.desk.books.of(ask.grades())
+
+
+def open_book(ask: Ask) -> RequestBook:
+    """Return the gradebook that the address is about."""
+    return ask.desk.books.book(ask.grades())
+
+
+def find_team(shown: Class, name: str) -> Listing:
+    """Return a team by the name that is shown."""
+    team = shown.teams.get(name)
+    if team is None:
+        raise HTTPException(404, "no submission of this class is called so")
+    return team
+
+
+def find_signature(ask: Ask) -> str:
+    """Return the name under which somebody changes points, "" where it is not known yet."""
+    return ask.user.name or ask.desk.books.signed
+
+
+def may_release(ask: Ask) -> bool:
+    """Whether somebody decides when students read their feedback."""
+    return ask.user.role in ("instructor", "owner")
+
+
+def show(ask: Ask) -> Response:
+    """Show the class, a page of it."""
+    shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
+    chosen = wanted.chosen(shown)
+    pages = max(1, -(-len(chosen) // _ROWS))
+    page = min(max(_read_number(ask, "page"), 1), pages)
+    graded = sorted(t.line.points for t in shown.teams.values() if t.line.status == "graded")
+    titles = {asked.id: capital(asked.title or asked.id) for asked in shown.rubric.criteria}
+    unseen = (name for name, team in shown.teams.items() if not team.seen)
+    return ask.page(
+        "grades",
+        title=shown.rubric.title or name_place(ask.grades()),
+        teams=chosen[_ROWS * (page - 1) : _ROWS * page],
+        points=points_text,
+        found=len(chosen),
+        total=len(shown.teams),
+        failed=sum(team.line.status == "failed" for team in shown.teams.values()),
+        words=WORDS,
+        titles=titles,
+        next=next(unseen, ""),
+        flags=count_flags(shown),
+        lost=count_lost(shown, titles),
+        sets=open_book(ask).changed_together()[:_MOST_SETS],
+        seen=sum(bool(team.seen) for team in shown.teams.values()),
+        median=points_text(graded[len(graded) // 2]) if graded else "",
+        out_of=points_text(shown.rubric.out_of),
+        named=shown.names is None,
+        fields=wanted.fields(shown),
+        wanted=wanted,
+        page=page,
+        pages=pages,
+        to_page=lambda number: f"?{urlencode({'page': number})}&{wanted.query}",
+        drawn="-".join(map(str, shown.state)),
+        news=list_news(ask, shown, since=shown.state[1]),
+        asked=ask.desk.books.asked.get(ask.grades(), {}),
+        n_requests=open_book(ask).n_waiting(),
+        released=open_book(ask).released,
+        may_release=may_release(ask),
+    )
+
+
+def count_flags(shown: Class) -> list[Counted]:
+    """Return the remarks of a class, the most common first."""
+    found = Counter(code for team in shown.teams.values() for code in team.line.codes)
+    common = sorted(found, key=lambda code: (-found[code], CODES.index(code)))
+    titles = {code: capital(WORDS.text(f"title_{code}")) for code in common}
+    return [Counted(key=code, title=titles[code], many=found[code]) for code in common]
+
+
+def count_lost(shown: Class, titles: Mapping[str, str]) -> list[Counted]:
+    """Return the criteria in which points were lost, those of most teams first."""
+    found = [Counted(key=k, title=titles[k], many=len(v)) for k, v in shown.lost.items() if v]
+    return sorted(found, key=lambda one: -one.many)
+
+
+def show_news(ask: Ask) -> Response:
+    """Tell which points were changed since a page was shown; nothing where nothing is new."""
+    shown = read_class(ask)
+    since, told = (_read_number(ask, name) for name in ("since", "told"))
+    answer = ask.page("news", title="", news=list_news(ask, shown, since=since))
+    if shown.state[1] == told:
+        answer.headers["HX-Reswap"] = "none"
+    return answer
+
+
+def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
+    """Return what a page tells of changes after one of a number."""
+    changes, told = [], shown.state[1]
+    about = ask.query("of")
+    if told != since:
+        of_name = {team.submission: name for name, team in shown.teams.items()}
+        titles = {asked.id: asked.title for asked in shown.rubric.criteria}
+        for submission, override in open_book(ask).changes_since(since):
+            name = of_name.get(submission, STRANGER)
+            given = "as graded" if override.points is None else points_text(override.points)
+            what = titles.get(override.criterion) or override.criterion
+            at = to_the_second(override.at)
+            text = f"{what}: {given}, by {override.by}: {override.why} ({at})"
+            changes.append({"name": name, "text": text, "mine": name == about})
+    more = len(changes) - _MOST_NEWS
+    return {"since": since, "told": told, "changes": changes[::-1][:_MOST_NEWS],
+            "more": max(more, 0), "of": about}  # fmt: skip
+
+
+def _read_number(ask: Ask, name: str) -> int:
+    text = ask.query(name)
+    return int(text) if text.isdecimal() and len(text) < 16 else 0
+
+
+# --------------------------------------------------------------------- what is drawn
+
+
+def draw_distribution(ask: Ask) -> Response:
+    """Draw how many submissions have how many points."""
+    return show_drawing(ask.desk.books.drawn(ask.grades(), "distribution", _distribution))
+
+
+def _distribution(shown: Class) -> str:
+    points = [t.line.points for t in shown.teams.values() if t.line.status == "graded"]
+    with drawing():
+        figure = distribution_figure(points, out_of=shown.rubric.out_of)
+        alt = "Histogram of the points."
+        return render_drawing(plain_svg(to_svg(figure, name="distribution", alt=alt)))
+
+
+def show_class_page(ask: Ask) -> Response:
+    """Show the class page as `cartlab grade` writes it, of the gradebook as it is now."""
+    book = open_book(ask)
+
+    def draw(shown: Class) -> str:
+        teams = shown.teams.values()
+        own = {team.submission: team for team in teams}
+        flags = {name: one.shared for name, one in sorted(own.items()) if one.shared}
+        clusters = find_clusters(flags)
+        if shown.names is not None:
+            clusters = renamed(clusters, shown.names, other=STRANGER)
+        doubles = doubles_of(
+            book,
+            {name: one.line.authors for name, one in own.items()},
+            gradings={name: one.grading for name, one in own.items()},
+            names=shown.names,
+        )
+        lines = [team.line for team in teams]
+        return class_page(lines, rubric=shown.rubric, doubles=doubles, clusters=clusters)
+
+    return show_own_page(ask.desk.books.drawn(ask.grades(), "class", draw))
+
+
+def show_feedback(ask: Ask) -> Response:
+    """Show what a team reads, as it is now."""
+    shown = read_class(ask)
+    team = find_team(shown, ask.request.path_params["name"])
+    book = open_book(ask)
+    entry = book.entry(team.submission)
+    grade = entry.grade if shown.names is None else anonymise(entry.grade, shown.names)
+    figures = book.figures(entry)
+    page = feedback_page(grade, rubric=shown.rubric, figures=figures, name=grade.submission)
+    return show_own_page(page)

@@ -1,0 +1,150 @@
+"""The requests of a class for another look: those that wait, with a form for the answer."""
+
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.books import Class
+from pipeline.desk.grades.class_table import find_signature, find_team, open_book, read_class
+from pipeline.desk.grades.team_page import sign
+from pipeline.desk.request_steps import describe_steps
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.open_book import Conflict
+from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.gradebook.request_book import Queued
+from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import points_text
+from pipeline.words.numbers import NOTHING
+
+_MOST_STEPS = 20  # points to choose from; where the rubric's steps are finer they are typed
+
+
+def show(ask: Ask) -> Response:
+    """Show the queue, of the class or of one team."""
+    return _show_page(ask)
+
+
+def act(ask: Ask) -> Response:
+    """Answer a request, or reopen it; what somebody else answered meanwhile is shown."""
+    shown = read_class(ask)
+    team = find_team(shown, ask.text("team"))
+    book, name, what = open_book(ask), team.submission, ask.text("do")
+    criterion, seen, by = ask.text("criterion"), ask.text("seen"), sign(ask)
+    try:
+        if what == "reopen":
+            book.reopen(name, criterion, by=by, seen=seen)
+            said = "Reopened: the team may ask once more."
+        elif what == "answer":
+            points = _read_points(ask.text("points"))
+            book.answer(name, criterion, points, text=ask.text("text"), by=by, seen=seen)
+            said = f"Answered: {team.line.submission}, {criterion}."
+        else:
+            raise HTTPException(400, "there is no such button")
+    except Conflict as conflict:
+        return _show_conflict(ask, shown, conflict)
+    except ConfigError as error:
+        return _show_page(ask, wrong=str(error), status=422)
+    return ask.back(_write_address(ask, ask.query("of")), said)
+
+
+def _read_points(typed: str) -> float | None:
+    """Return the points that were chosen, None where they stay."""
+    if not typed:
+        return None
+    points = read_points(typed)
+    if points is None:
+        raise RequestRefused("the points are a number; leave the field empty and they stay")
+    return points
+
+
+def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
+    shown, of = read_class(ask), ask.query("of")
+    book = open_book(ask)
+    queue = book.queue(find_team(shown, of).submission if of else "")
+    called = {team.submission: name for name, team in shown.teams.items()}
+    waiting, settled = (
+        [_describe(ask, one, shown, called[one.entry.submission], wrong=wrong) for one in listed]
+        for listed in (queue.waiting, queue.settled)
+    )
+    return ask.page(
+        "again",
+        status=status,
+        title="Another look",
+        of=of,
+        own=_write_address(ask, of),
+        waiting=waiting,
+        settled=settled,
+        n_waiting=queue.n_waiting,
+        n_settled=queue.n_settled,
+        signature=find_signature(ask),
+        most=MOST_LETTERS,
+        wrong="" if any(one["wrong"] for one in (*waiting, *settled)) else wrong,
+    )
+
+
+def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) -> dict[str, Any]:
+    """Return a request as the page shows it."""
+    rubric, request = shown.rubric, queued.request
+    asked = next((c for c in rubric.criteria if c.id == request.criterion), None)
+    own = next((c for c in queued.entry.grade.criteria if c.id == request.criterion), None)
+    hidden = {} if shown.names is None else {"team": name, "submission": queued.entry.submission}
+    place = {"of": name, "criterion": request.criterion}
+    failed = wrong and (ask.text("team"), ask.text("criterion")) == (name, request.criterion)
+    return {
+        "team": name,
+        "criterion": request.criterion,
+        "title": asked.title or asked.id if asked else request.criterion,
+        "points": points_text(own.points) if own else NOTHING,
+        "out_of": points_text(asked.points) if asked else NOTHING,
+        "address": f"{ask.here}team?{urlencode(place)}#chosen",
+        "steps": describe_steps(request.events, **hidden),
+        "state": request.state,
+        "version": queued.version,
+        "choices": _list_points(asked.points, rubric) if asked else None,
+        "typed": ask.text("points") if failed else "",
+        "text": ask.text("text") if failed else "",
+        "wrong": wrong if failed else "",
+    }
+
+
+def _list_points(most: float, rubric: Rubric) -> list[str]:
+    """Return the points that a criterion can have, none where they are too many to choose from."""
+    n = round(most / rubric.step)
+    if n > _MOST_STEPS:
+        return []
+    steps = [k * rubric.step for k in range(n + 1) if k * rubric.step < most]
+    return [points_text(points) for points in (*steps, most)]
+
+
+def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
+    """Show what somebody wrote beside what it is now; nothing was changed."""
+    name, criterion = ask.text("team"), ask.text("criterion")
+    queue = open_book(ask).queue(shown.teams[name].submission)
+    queued = next(
+        (q for q in (*queue.waiting, *queue.settled) if q.request.criterion == criterion), None
+    )
+    points, last = NOTHING, conflict.now
+    if queued is not None:
+        own = next((c for c in queued.entry.grade.criteria if c.id == criterion), None)
+        points = points_text(own.points) if own else NOTHING
+    answer = queued.request.events[-1] if queued and queued.request.state == "answered" else None
+    why = answer.text if answer else last.why if last else "as graded"
+    by = answer.by if answer else last.by if last else "cartlab"
+    typed = ask.text("points") or "as they are"
+    return ask.page(
+        "conflict",
+        status=409,
+        title=f"{name}: {criterion}",
+        typed={"points": typed, "why": ask.text("text"), "by": find_signature(ask)},
+        now={"points": points, "why": why, "by": by},
+        back=_write_address(ask, ask.query("of")),
+    )
+
+
+def _write_address(ask: Ask, of: str) -> str:
+    """Return the address of the queue, of the class or of one team."""
+    return f"{ask.here}again" + (f"?{urlencode({'of': of})}" if of else "")

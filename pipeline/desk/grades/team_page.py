@@ -1,0 +1,268 @@
+"""A team at the desk: its points beside the evidence, and what a person decides about them."""
+
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.books import Class
+from pipeline.desk.grades.class_table import (
+    find_signature,
+    find_team,
+    list_news,
+    open_book,
+    read_class,
+)
+from pipeline.desk.grades.criteria import (
+    Item,
+    describe_criterion,
+    describe_flag,
+    find_remarks,
+    list_items,
+    show_figures,
+)
+from pipeline.desk.grades.filters import Filter
+from pipeline.desk.served_files import show_drawing
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Flag, Grade
+from pipeline.grading.gradebook.history import event_words, to_the_second
+from pipeline.grading.gradebook.open_book import Conflict, Listing, TeamNow
+from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.publish.anonymous import anonymise, renamed_events
+from pipeline.grading.publish.class_page import feedback_link
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.words import WORDS, points_text
+from pipeline.report.figures.svg import plain_svg
+from pipeline.report.render.html import render_drawing
+
+_POINTS = "points"  # the place of the page where points are changed
+
+
+def show(ask: Ask) -> Response:
+    """Show a team."""
+    return _show_page(ask)
+
+
+def act(ask: Ask) -> Response:
+    """Do what a button says: sign, accept, take the mark back, change points, undo."""
+    shown = read_class(ask)
+    team = find_team(shown, ask.query("of"))
+    book, name, what = open_book(ask), team.submission, ask.text("do")
+    by = sign(ask)
+    if what in ("accept", "unsee"):
+        book.mark(name, by=by, seen=what == "accept")
+    if what in ("sign", "unsee"):
+        return ask.back(write_address(ask, team.line.submission))
+    if what == "accept":
+        wanted = Filter.read(ask.request.query_params)
+        after = wanted.beside(shown, team.line.submission)[1]
+        to = write_address(ask, after) if after else f"{ask.here}?{wanted.query}"
+        return ask.back(to, f"{team.line.submission}: accepted.")
+    criterion, seen = ask.text("criterion"), ask.text("seen")
+    try:
+        if what == "undo":
+            book.undo(name, criterion, by=by, seen=seen)
+        elif what == "change":
+            points = read_points(ask.text("other") or ask.text("points"))
+            book.change(name, criterion, points, why=ask.text("why"), by=by, seen=seen)
+        else:
+            raise HTTPException(400, "there is no such button")
+    except Conflict as conflict:
+        return _show_conflict(ask, shown, team, conflict)
+    except ConfigError as error:
+        text = str(error).replace(" (--why)", "").replace(" (--by)", "")
+        return _show_page(ask, wrong=text, status=422)
+    to = write_address(ask, team.line.submission, criterion=criterion)
+    done = "Undone." if what == "undo" else "Saved."
+    return ask.back(f"{to}#chosen", done, place=_POINTS)
+
+
+def show_figure(ask: Ask) -> Response:
+    """Show one of a team's figures."""
+    team = find_team(read_class(ask), ask.query("of"))
+    book = open_book(ask)
+    drawn = dict(book.figures(book.entry(team.submission)))
+    name = ask.query("figure")
+    if name not in drawn:
+        raise HTTPException(404, "there is no such figure")
+    return show_drawing(render_drawing(plain_svg(drawn[name])))
+
+
+def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
+    shown = read_class(ask)
+    team = find_team(shown, ask.query("of"))
+    book, name = open_book(ask), team.line.submission
+    now = book.team(team.submission)
+    grade = now.entry.grade if shown.names is None else anonymise(now.entry.grade, shown.names)
+    events = now.events
+    if shown.names is not None:
+        events = renamed_events(events, team.submission, name)
+    wanted = Filter.read(ask.request.query_params)
+    before, after = wanted.beside(shown, name)
+    items = list_items(grade, now)
+    chosen = _find_chosen(ask, items, now.rubric)
+    return ask.page(
+        "team",
+        status=status,
+        title=name,
+        back=f"{ask.here}?{wanted.query}",
+        own=write_address(ask, name),
+        before=write_address(ask, before) if before else "",
+        after=write_address(ask, after) if after else "",
+        feedback=ask.here + feedback_link(name),
+        grade=grade,
+        points=points_text,
+        seen=now.seen,
+        items=_link_items(ask, name, items, chosen),
+        doubts=sum(item.doubt for item in items),
+        events=[(to_the_second(event.at), event_words(event)) for event in reversed(events)],
+        news=list_news(ask, shown, since=shown.state[1]),
+        signature=find_signature(ask),
+        requests=book.request_states(team.submission),
+        requests_at=f"{ask.here}again?{urlencode({'of': name})}",
+        **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
+    )
+
+
+def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
+    """Return the criterion or remark that the address or the form is about.
+
+    Else the first to look at; of a team with none, the first that has a figure.
+    """
+    criterion = ask.text("criterion") or ask.query("criterion")
+    for wanted, is_remark in ((criterion, False), (ask.query("remark"), True)):
+        for item in items:
+            if wanted == item.id and is_remark == item.is_remark:
+                return item
+    shown = {asked.id for asked in rubric.criteria if asked.check == "final"}
+    first = [item for item in items if item.id in shown or item.doubt]
+    return first[0] if first else items[0]
+
+
+def _link_items(
+    ask: Ask, name: str, items: Sequence[Item], chosen: Item
+) -> list[tuple[Item, str, str]]:
+    """Return each line of the list with its address and its key."""
+    at = items.index(chosen)
+    keys = {at - 1: "k", at + 1: "j"}
+    return [
+        (item, write_address(ask, name, **{"remark" if item.is_remark else "criterion": item.id}),
+         keys.get(number, ""))
+        for number, item in enumerate(items)
+    ]  # fmt: skip
+
+
+def _show_chosen(
+    ask: Ask, shown: Class, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
+) -> dict[str, Any]:
+    """Return what the page shows beside the list: the chosen criterion or remark, its evidence."""
+    name, drawn = grade.submission, open_book(ask).figures(now.entry)
+    asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
+    if chosen.is_remark or asked is None:
+        asked, one, flags = None, None, [flag for flag in grade.flags if flag.code == chosen.id]
+    else:
+        typed = {key: ask.text(key) for key in ("points", "other", "why")} if wrong else {}
+        one = describe_criterion(asked, grade, now, typed={**typed, "wrong": wrong})
+        flags = find_remarks(grade, asked, now.rubric)
+    own = next((c for c in grade.criteria if asked and c.id == asked.id), None)
+    figures = show_figures(drawn, asked, own, first=ask.query("figure")) if asked else []
+    reasons = open_book(ask).reasons().get(asked.id, [])[:30] if asked else []
+    return {
+        "one": one,
+        "chosen": chosen,
+        "flags": [
+            describe_flag(flag, grade.units) | {"others": _link_others(ask, shown, flag)}
+            for flag in flags
+        ],
+        "together": _link_together(ask, shown, grade, one, flags) if one else [],
+        "figures": _link_figures(ask, name, figures, chosen),
+        "others": _link_figures(ask, name, show_figures(drawn, None, None), chosen),
+        "reasons": reasons,
+        "usual": (one and one["own_reason"]) or next(iter(reasons), ""),
+    }
+
+
+def _link_figures(
+    ask: Ask, name: str, figures: Sequence[dict[str, str]], chosen: Item
+) -> list[dict[str, str]]:
+    """Return figures with their address, and that of the page with each first."""
+    found = []
+    for figure in figures:
+        own = {"of": name, "figure": figure["file"]}
+        choose = write_address(ask, name, criterion=chosen.id, figure=figure["file"])
+        address = f"{ask.here}figure?{urlencode(own)}"
+        found.append(figure | {"address": address, "choose": choose})
+    return found
+
+
+def _link_others(ask: Ask, shown: Class, flag: Flag) -> list[tuple[str, str]]:
+    """Return who shares a recording, with the address of those that are in the class."""
+    names = flag.evidence.get("submissions", ()) if flag.code == "shared_data" else ()
+    return [(name, write_address(ask, name) if name in shown.teams else "") for name in names]
+
+
+def _link_together(
+    ask: Ask, shown: Class, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
+) -> list[tuple[str, str]]:
+    """Return where the same can be done for all who have the same remark, and what it is called."""
+    lost = one["id"] if one["lost"] else ""
+    codes = dict.fromkeys(flag.code for flag in flags)
+    sets = [(Filter(flag=code, lost=lost), WORDS.text(f"title_{code}")) for code in codes]
+    if lost and not sets:
+        sets = [(Filter(lost=lost), "points lost here")]
+    found = []
+    for wanted, title in sets:
+        many = len(wanted.chosen(shown))
+        if many > 1:
+            about = {"criterion": one["id"], "of": grade.submission}
+            if one["by_hand"]:  # what was decided for this team is offered for all
+                about |= {"points": one["points"], "why": one["own_reason"]}
+            address = f"{ask.here}together?{urlencode(about)}&{wanted.query}"
+            found.append((address, f"Apply to the {many} teams with {title}"))
+    return found
+
+
+def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) -> Response:
+    """Show what somebody typed beside what it is now; nothing was changed."""
+    now = open_book(ask).team(team.submission)
+    criterion = ask.text("criterion")
+    titles = {asked.id: asked.title for asked in now.rubric.criteria}
+    own = next((c for c in now.entry.grade.criteria if c.id == criterion), None)
+    undoing = ask.text("do") == "undo"
+    return ask.page(
+        "conflict",
+        status=409,
+        title=f"{team.line.submission}: {titles.get(criterion) or criterion}",
+        typed={
+            "points": "undo" if undoing else ask.text("other") or ask.text("points"),
+            "why": ask.text("why"),
+            "by": find_signature(ask),
+        },
+        now={
+            "points": points_text(own.points) if own else "not judged",
+            "why": conflict.now.why if conflict.now else "as graded",
+            "by": conflict.now.by if conflict.now else "cartlab",
+        },
+        # With a fragment it would be this page, not loaded.
+        back=write_address(ask, team.line.submission, criterion=criterion),
+    )
+
+
+def sign(ask: Ask) -> str:
+    """Return who changes something: whom the proxy names, else what is typed, once."""
+    if ask.user.name:
+        return ask.user.name
+    typed = ask.text("by") or ask.desk.books.signed
+    if not typed:
+        raise ConfigError("say who you are first: what is changed by hand has a name to it")
+    ask.desk.books.signed = typed
+    return typed
+
+
+def write_address(ask: Ask, name: str, **more: str) -> str:
+    """Return the address of a team, from which next and previous go on as before."""
+    wanted = Filter.read(ask.request.query_params).query
+    return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")

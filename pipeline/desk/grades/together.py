@@ -1,0 +1,242 @@
+"""The same points or comment for several teams: looked through first, then all of it or nothing."""
+
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.books import Class
+from pipeline.desk.grades.class_table import find_signature, open_book, read_class
+from pipeline.desk.grades.criteria import point_steps
+from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.team_page import sign, write_address
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.open_book import Conflict, Tried
+from pipeline.grading.gradebook.override import WantedPoints, read_points
+from pipeline.grading.publish.anonymous import STRANGER
+from pipeline.grading.publish.feedback import sentence
+from pipeline.grading.rubric import Criterion
+from pipeline.grading.words import WORDS, points_text
+from pipeline.words.numbers import count
+from pipeline.words.text import capital, with_symbols
+
+_SAME = "same"  # points: as they are, with a comment
+_DONE = "together"  # the place of a page that tells what was done
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A team of the list: ticked or not, as it is and as it would be.
+
+    Attributes
+    ----------
+    version : of the criterion; moved: somebody changed it after the list was shown.
+    now, after : points of the criterion.
+    said : the message of the criterion now.
+    """
+
+    name: str
+    address: str
+    ticked: bool
+    version: str
+    moved: bool
+    now: str
+    after: str
+    total_now: str
+    total_after: str
+    said: str
+
+
+def show(ask: Ask) -> Response:
+    """Show the teams with their points now and after."""
+    return _show_page(ask)
+
+
+def apply(ask: Ask) -> Response:
+    """Change all ticked teams, or take back what was changed in one go."""
+    if ask.text("do") == "undo":
+        return _undo(ask)
+    shown, by = read_class(ask), sign(ask)
+    asked = _find_criterion(ask, shown)
+    ticked = ask.form.getlist("team")
+    try:
+        if not ticked:
+            raise ConfigError("tick at least one team")
+        typed = _read_typed(ask)
+        wishes = [_wish(ask, shown, asked, str(name), typed=typed) for name in ticked]
+        done = open_book(ask).change_all(wishes, by=by)
+    except Conflict:
+        text = "Some of these teams were changed after this list was shown. Nothing was changed."
+        return _show_page(ask, wrong=text, status=409)
+    except ConfigError as error:
+        text = capital(str(error).replace(" (--why)", "").replace(" (--by)", ""))
+        return _show_page(ask, wrong=f"{text}. Nothing was changed.", status=422)
+    said = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
+    if unchanged := len(wishes) - done.teams:
+        said += f" {unchanged} had the same already."
+    return ask.back(_address(ask, done=done.at if done.teams else ""), said, place=_DONE)
+
+
+def _undo(ask: Ask) -> Response:
+    """Take back one go; what somebody changed since stays, and is named."""
+    shown = read_class(ask)
+    undone = open_book(ask).undo_all(ask.text("set"), by=sign(ask))
+    said = f"{count(undone.back, 'team')} taken back."
+    if undone.kept:
+        names = {team.submission: name for name, team in shown.teams.items()}
+        kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
+        said += f" Changed since, so as before: {kept}."
+    if not ask.query("criterion"):  # from the list on the class page
+        return ask.back(f"{ask.here}#sets", said, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
+
+
+def _address(ask: Ask, *, done: str) -> str:
+    """Return the address of the page after something was done, which offers to undo that."""
+    kept = {key: ask.query(key) for key in ("criterion", "of")} | {"done": done}
+    wanted = Filter.read(ask.request.query_params).query
+    return f"{ask.here}together?{urlencode({k: v for k, v in kept.items() if v})}&{wanted}"
+
+
+def _find_criterion(ask: Ask, shown: Class) -> Criterion:
+    """Return the criterion of the address."""
+    for asked in shown.rubric.criteria:
+        if asked.id == ask.query("criterion"):
+            return asked
+    raise HTTPException(404, "the rubric has no such criterion")
+
+
+def _read_typed(ask: Ask) -> str:
+    """Return the points as typed or chosen."""
+    return ask.text("other") or ask.text("points") or _SAME
+
+
+def _wish(ask: Ask, shown: Class, asked: Criterion, name: str, *, typed: str) -> WantedPoints:
+    """Return what the form asks for one team.
+
+    Raises
+    ------
+    ConfigError : the team is not in the class, or the points are not a number it can have.
+    """
+    if name not in shown.teams:
+        raise ConfigError("a team is not in the class any more")
+    team = shown.teams[name]
+    if typed == _SAME:
+        judged = team.line.judged.get(asked.id)
+        if judged is None:
+            raise ConfigError(f"{name}: was never judged here, so a comment needs points")
+        points = judged["points"]
+    else:
+        points = read_points(typed)
+        if points is not None and not 0 <= points <= asked.points:
+            raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
+    return WantedPoints(
+        submission=team.submission,
+        criterion=asked.id,
+        points=points,
+        why=ask.text("why"),
+        seen=ask.text(f"seen.{name}"),
+    )
+
+
+def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
+    shown = read_class(ask)
+    asked = _find_criterion(ask, shown)
+    wanted = Filter.read(ask.request.query_params)
+    typed = _read_typed(ask)
+    try:
+        rows = _list_rows(ask, shown, asked, typed=typed)
+    except ConfigError as error:
+        wrong, status = wrong or f"{capital(str(error))}.", 422
+        rows = _list_rows(ask, shown, asked, typed=_SAME)
+    steps = [points_text(p) for p in point_steps(asked.points, step=shown.rubric.step)]
+    team = ask.query("of")
+    return ask.page(
+        "together",
+        status=status,
+        title=_name_set(wanted),
+        action=_address(ask, done=""),
+        done=ask.query("done"),
+        criterion=capital(asked.title or asked.id),
+        out_of=points_text(asked.points),
+        steps=steps,
+        chosen=typed if typed in (*steps, _SAME) else "",
+        other="" if typed in (*steps, _SAME) else typed,
+        why=ask.text("why"),
+        usual=next(iter(open_book(ask).reasons().get(asked.id, [])), ""),
+        rows=rows,
+        ticked=sum(row.ticked for row in rows),
+        wrong=wrong,
+        signature=find_signature(ask),
+        back=_back(ask, team, asked) if team in shown.teams else f"{ask.here}?{wanted.query}",
+        team=team if team in shown.teams else "",
+        wider=_widen(ask, shown, wanted),
+    )
+
+
+def _back(ask: Ask, team: str, asked: Criterion) -> str:
+    return f"{ask.here}team?{urlencode({'of': team, 'criterion': asked.id})}"
+
+
+def _name_set(wanted: Filter) -> str:
+    """Return what a filtered list is called."""
+    if wanted.flag:
+        return capital(WORDS.text(f"title_{wanted.flag}"))
+    return "Points lost" if wanted.lost else "Several teams"
+
+
+def _widen(ask: Ask, shown: Class, wanted: Filter) -> tuple[str, int] | None:
+    """Return where all with the remark are, and how many; None where they are here already."""
+    if not (wanted.flag and wanted.lost):
+        return None
+    wide = Filter(flag=wanted.flag)
+    many = len(wide.chosen(shown))
+    if many == len(wanted.chosen(shown)):
+        return None
+    about = {key: ask.query(key) for key in ("criterion", "of") if ask.query(key)}
+    return f"{ask.here}together?{urlencode(about)}&{wide.query}", many
+
+
+def _list_rows(ask: Ask, shown: Class, asked: Criterion, *, typed: str) -> list[Row]:
+    """Return the teams of the list, those that the form names too, as they are and would be."""
+    sent = ask.sent.getlist("team")
+    names = [team.line.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
+    names += [str(name) for name in sent if name in shown.teams and name not in names]
+    if ask.query("done"):  # nothing is wished any more
+        names = []
+    if typed == _SAME:  # what was never judged has no points to keep
+        names = [name for name in names if asked.id in shown.teams[name].line.judged]
+    wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
+    tried = {one.submission: one for one in open_book(ask).try_all(wishes)}
+    began = ask.text("listed") == "1"
+    rows = []
+    for name in names:
+        one = tried.get(shown.teams[name].submission)
+        if one is not None:
+            ticked = name in sent if began else True
+            rows.append(_row(ask, name, one, asked=asked, ticked=ticked))
+    return rows
+
+
+def _row(ask: Ask, name: str, one: Tried, *, asked: Criterion, ticked: bool) -> Row:
+    def own(grade: Any) -> str:
+        found = (points_text(c.points) for c in grade.criteria if c.id == asked.id)
+        return next(found, "not judged")
+
+    sent = ask.text(f"seen.{name}")
+    messages = (sentence(c.message) for c in one.now.criteria if c.id == asked.id)
+    return Row(
+        name=name,
+        address=write_address(ask, name, criterion=asked.id),
+        ticked=ticked,
+        version=one.version,
+        moved=ask.request.method == "POST" and bool(sent) and sent != one.version,
+        now=own(one.now),
+        after=own(one.after),
+        total_now=points_text(one.now.points),
+        total_after=points_text(one.after.points),
+        said=with_symbols(next(messages, "")),
+    )

@@ -1,0 +1,180 @@
+"""The instructor's room: exercises with what is hidden in them, solutions, the catalogue."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlencode
+
+from starlette.exceptions import HTTPException
+from starlette.responses import RedirectResponse, Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.exercises import SLIDE
+from pipeline.desk.served_files import show_drawing
+from pipeline.desk.typed import read_path, read_whole_number
+from pipeline.errors import ConfigError
+from pipeline.output import new_folder
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.report.effects.catalogue import catalogue_data
+from pipeline.submission.load import NAME, outside
+from pipeline.words.math import to_text
+
+_SHOWN_ON = "throne-2dof"  # the smallest with a spring between two carts
+
+
+def show(ask: Ask) -> Response:
+    """Show the form as it is filled in, with a picture of every effect that is chosen."""
+    sent = ask.request.query_params
+    bench, found = _look_at_exercise(ask)
+    pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
+    return ask.page(
+        "exercises",
+        title="Exercises",
+        presets=sorted(PRESETS),
+        catalogue=CATALOGUE,
+        bench=bench,
+        found=found,
+        shown=list(zip(found["effects"], pictures, strict=True)),
+        chosen=[one["key"] for one in found["effects"]],
+        slide=SLIDE,
+        out=sent.get("out", str(_free_folder(ask.user.workshop or ask.desk.root))),
+        folders=sent.get("folders", "1"),
+        seed=sent.get("seed", "0"),
+        reported=bool(sent.get("reported")),
+    )
+
+
+def draw(ask: Ask) -> Response:
+    """Draw what an effect does."""
+    svg = ask.desk.workers.do("draw_effect", bench=_read_bench(ask), hide=ask.text("hide"))
+    return show_drawing(svg)
+
+
+def make(ask: Ask) -> Response:
+    """Have the exercise made, or a class of them."""
+    bench, found = _look_at_exercise(ask)
+    if found["wrong"]:
+        raise ConfigError(found["wrong"])
+    out = _read_folder(ask)
+    if not out.parent.is_dir():
+        raise ConfigError(f"{out}: there is no folder {out.parent} to make it in")
+    folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
+    seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
+    ask.desk.jobs.start(
+        "make_exercises",
+        title="The exercise",
+        place=new_folder(out),
+        bench=bench,
+        hide=[one["hide"] for one in found["effects"]],
+        out=str(out),
+        seeds=list(range(seed, seed + folders)),
+        reported=bool(ask.text("reported")),
+    )
+    return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
+
+
+def show_made(ask: Ask) -> Response:
+    """Show how far an exercise is; once it is made, what was made."""
+    out = _read_folder(ask)
+    job = ask.desk.jobs.of(out)
+    if job is None or job.asked[0] != "make_exercises":
+        raise HTTPException(404, "no exercise was made there")
+    given = job.asked[1]
+    # Named as the job names them; one that was stopped has made the first few.
+    folders = [out] if len(given["seeds"]) == 1 else sorted(out.glob("*/"))
+    made = [
+        (folder, seed)
+        for folder, seed in zip(folders, given["seeds"], strict=False)
+        if (folder / NAME).is_file()
+    ]
+    what: dict[str, Any] = {"told": [], "files": [], "records": []}
+    if job.over and made:
+        bench, hide = given["bench"], given["hide"]
+        what = ask.desk.workers.do(
+            "describe_exercise", bench=bench, hide=hide, folder=str(made[0][0])
+        )
+    return ask.page(
+        "made",
+        title=f"Exercise {out.name}",
+        out=out,
+        job=job,
+        made=made,
+        bench=given["bench"],
+        **what,
+    )
+
+
+def stop(ask: Ask) -> Response:
+    """Stop the making."""
+    out = _read_folder(ask)
+    ask.stop(out)
+    return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
+
+
+def show_solution(ask: Ask) -> Response:
+    """Show the reference of a folder, or how far it is."""
+    folder = ask.folder()
+    return ask.page(
+        "solution",
+        title=f"Solution of {folder.name}",
+        there=outside(folder, "solution/solution.html") is None,
+    )
+
+
+def show_catalogue(ask: Ask) -> Response:
+    """Show what a bench may do beyond the linear chain."""
+    bench = {"preset": _SHOWN_ON}
+    entries = [
+        entry
+        | {
+            "law": to_text(effect.formula),
+            "picture": _write_picture_url(bench, effect.key),
+        }
+        for effect, entry in zip(CATALOGUE, catalogue_data(CATALOGUE), strict=True)
+    ]
+    return ask.page("effects", title="What a bench may do beyond the linear chain", entries=entries)
+
+
+def _free_folder(root: Path) -> Path:
+    """Return a folder for an exercise that is not there yet."""
+    names = ("exercise", *(f"exercise-{number}" for number in range(2, 1_000)))
+    return next(root / name for name in names if not (root / name).exists())
+
+
+def _look_at_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
+    """Return the bench of a form, and what its worker says of it and of the effects."""
+    bench = _read_bench(ask)
+    known = {effect.key: effect for effect in CATALOGUE}
+    chosen = [
+        {
+            "key": key,
+            "place": ask.text(f"{key}.place"),
+            "sizes": {
+                name: {
+                    part: ask.text(f"{key}.{name}.{part}")
+                    for part in ("value", "usual", "slide", "was")
+                }
+                for name in known[key].names
+            },
+        }
+        for key in dict.fromkeys(ask.sent.getlist("effect"))
+        if isinstance(key, str) and key in known
+    ]
+    return bench, ask.desk.workers.do("look_at_exercise", bench=bench, chosen=chosen)
+
+
+def _read_bench(ask: Ask) -> dict[str, str]:
+    bench = {name: ask.text(name) for name in ("preset", "m", "c", "k")}
+    if "preset" not in ask.sent:
+        bench["preset"] = _SHOWN_ON
+    return bench
+
+
+def _write_picture_url(bench: Mapping[str, str], hide: str) -> str:
+    return f"/exercises/picture.svg?{urlencode({**bench, 'hide': hide})}"
+
+
+def _read_folder(ask: Ask) -> Path:
+    wanted = "name a folder for the exercise, not there yet or empty"
+    return read_path(ask.text("out"), wanted=wanted, inside=ask.user.workshop)

@@ -1,0 +1,126 @@
+"""The rubric editor: the numbers as a form beside the text; what is wrong is not saved."""
+
+from pathlib import Path
+from urllib.parse import urlencode
+
+from starlette.responses import RedirectResponse, Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.instructor.rubric_shelf import (
+    free_name,
+    own_rubrics,
+    shipped_names,
+    shipped_rubrics,
+    work_folder,
+)
+from pipeline.desk.instructor.rubric_typed import TypedRubric, read_typed, typed_rubric
+from pipeline.desk.typed import read_path
+from pipeline.desk.users import name_place
+from pipeline.errors import ConfigError
+from pipeline.grading.rubric_file import rubric_source
+from pipeline.grading.rubric_text import rubric_text
+from pipeline.grading.words import WORDS, points_text
+from pipeline.output import write_file
+from pipeline.resources import RUBRICS
+from pipeline.submission.edit import text_digest
+
+_NEW = "new"  # what a form has seen of a file that is not there
+
+
+def show(ask: Ask) -> Response:
+    """Show a rubric: a file, or a shipped one to begin with; or which there are."""
+    start = ask.text("start")
+    if not start and not ask.text("file"):
+        return ask.page(
+            "rubrics",
+            title="Rubrics",
+            shipped=shipped_rubrics(),
+            own=own_rubrics(ask.user),
+            points=points_text,
+        )
+    path = read_rubric_path(ask)
+    if path.exists():
+        text = rubric_source(path)
+        return show_editor(ask, path, typed_rubric(text, {}), seen=text_digest(text))
+    text = rubric_source(RUBRICS / f"{start}.toml") if start in shipped_names() else ""
+    return show_editor(ask, path, typed_rubric(text, {}), seen=_NEW)
+
+
+def check(ask: Ask) -> Response:
+    """Show what is wrong with what is typed; nothing is written."""
+    return show_editor(ask, read_rubric_path(ask), read_typed(ask.form), seen=ask.text("seen"))
+
+
+def save(ask: Ask) -> Response:
+    """Write a rubric that is valid over the file that was shown, and over no other."""
+    path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
+    now = rubric_source(path) if path.exists() else None
+    if seen != (_NEW if now is None else text_digest(now)):
+        return show_editor(ask, path, typed, seen=seen, now=now or "", status=409)
+    if typed.rubric is None:
+        return show_editor(ask, path, typed, seen=seen, status=422)
+    write_file(path, typed.text)
+    query = urlencode({"file": path, "saved": 1})
+    return RedirectResponse(f"/rubric/?{query}", status_code=303)
+
+
+def show_editor(
+    ask: Ask,
+    path: Path,
+    typed: TypedRubric,
+    *,
+    seen: str,
+    now: str | None = None,
+    status: int = 200,
+) -> Response:
+    """Show the editor; where the file was changed meanwhile, with what it is `now`."""
+    saved = "saved" in ask.request.query_params
+    return ask.page(
+        "rubric",
+        status=status,
+        title=path.name,
+        file=path,
+        typed=typed,
+        form=typed.form,
+        seen=seen,
+        is_new=seen == _NEW,
+        now=now,
+        asks=rubric_text(typed.rubric) if typed.rubric else "",
+        saved=saved,
+        classes=[(n, name_place(place)) for n, place in enumerate(ask.user.gradebooks)],
+        graded=_classes_of(ask, path) if saved else [],
+        points=points_text,
+        words=WORDS,
+    )
+
+
+def _classes_of(ask: Ask, path: Path) -> list[tuple[int, str, dict[str, str]]]:
+    """Return the open classes that a rubric's file is for, with what was graded again last."""
+    found = []
+    for n, place in enumerate(ask.user.gradebooks):
+        try:
+            assignment = ask.desk.books.book(place).assignment
+        except ConfigError:  # nothing is graded there yet, or it is gone
+            continue
+        if assignment == path.stem and isinstance(place, Path):
+            found.append((n, name_place(place), ask.desk.books.asked.get(place, {})))
+    return found
+
+
+def read_rubric_path(ask: Ask) -> Path:
+    """Return the file that is named; where a page names none, one to begin with.
+
+    Raises
+    ------
+    ConfigError : it is no TOML file of a folder that is there, or one that they may not enter.
+    """
+    typed = ask.text("file")
+    if not typed and ask.request.method == "GET":
+        typed = free_name(work_folder(ask.user))
+    wanted = "name the file of the rubric, such as rubric.toml"
+    path = read_path(typed, wanted=wanted, inside=ask.user.workshop)
+    if path.suffix != ".toml":
+        raise ConfigError(f"{path}: a rubric is a .toml file")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{path}: there is no folder {path.parent}")
+    return path

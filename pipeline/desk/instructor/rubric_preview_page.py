@@ -1,0 +1,96 @@
+"""The preview page: a graded class under a rubric that is not saved yet."""
+
+import re
+from typing import Any
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.instructor.rubric_editor import read_rubric_path, show_editor
+from pipeline.desk.instructor.rubric_typed import read_typed
+from pipeline.desk.served_files import show_drawing
+from pipeline.desk.users import Place, name_place
+from pipeline.grading.words import points_text
+from pipeline.report.figures.grading import two_distributions_figure
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import plain_svg, to_svg
+from pipeline.report.render.html import render_drawing
+
+_BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # of an address: "0.2.5.1"
+_ROWS = 30  # that are not folded
+
+
+def preview(ask: Ask) -> Response:
+    """Show what is typed on a class; nothing is written."""
+    path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
+    if typed.rubric is None:
+        return show_editor(ask, path, typed, seen=seen, status=422)
+    number, place = _find_class(ask)
+    found = ask.desk.workers.do("preview_rubric", folder=str(place), text=typed.text)
+    teams = _named(ask, place, found["teams"])
+    changed = [team for team in teams if team["criteria"] or team["gain"] or team["late"]]
+    had, has = ([team[key] for team in teams] for key in ("before", "after"))
+    return ask.page(
+        "rubric_preview",
+        title=f"{path.name}: preview",
+        file=path,
+        text=typed.text,
+        seen=seen,
+        number=number,
+        called=name_place(place),
+        found=found,
+        teams=teams,
+        first=changed[:_ROWS],
+        rest=changed[_ROWS:],
+        changed=len(changed),
+        means=[points_text(sum(one) / len(one)) for one in (had, has) if one],
+        drawn="&".join(
+            f"{key}={'.'.join(map(str, found[f'bars_{key}']))}" for key in ("before", "after")
+        ),
+        points=points_text,
+        criteria={c.id: c.title or c.id for c in typed.rubric.criteria},
+        is_of=found["assignment"] == path.stem,
+    )
+
+
+def draw_preview(ask: Ask) -> Response:
+    """Draw two distributions, of which the address has the bars."""
+    before, after = (_read_bars(ask.query(key)) for key in ("before", "after"))
+    if len(before) != len(after):
+        raise HTTPException(404, "there is no such drawing")
+    with drawing():
+        figure = two_distributions_figure(before, after)
+        alt = "Histograms of the points, before and after."
+        return show_drawing(
+            render_drawing(plain_svg(to_svg(figure, name="distributions", alt=alt)))
+        )
+
+
+def _read_bars(text: str) -> list[int]:
+    if not _BARS.fullmatch(text):
+        raise HTTPException(404, "there is no such drawing")
+    return [int(part) for part in text.split(".")]
+
+
+def _find_class(ask: Ask) -> tuple[int, Place]:
+    typed = ask.text("class")
+    books = ask.user.gradebooks
+    if not typed.isascii() or not typed.isdecimal() or len(typed) > 6 or int(typed) >= len(books):
+        raise HTTPException(404, "this class is not open at the desk")
+    return int(typed), books[int(typed)]
+
+
+def _named(ask: Ask, place: Place, teams: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the changes under the names that the class is shown by, the largest first."""
+    names = ask.desk.books.of(place).names
+    shown = [
+        team
+        | {
+            "name": team["submission"] if names is None else names[team["submission"]],
+            "gain": round(team["after"] - team["before"], 6),
+            "late": team["late_before"] != team["late_after"],
+        }
+        for team in teams
+    ]
+    return sorted(shown, key=lambda team: (-abs(team["gain"]), team["name"]))

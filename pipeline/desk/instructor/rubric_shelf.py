@@ -1,0 +1,98 @@
+"""The rubrics that one may begin with: the shipped ones, and those that lie in a folder."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from pipeline.desk.browse import find_root
+from pipeline.desk.users import User
+from pipeline.errors import ConfigError
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric_file import parse_rubric, rubric_source
+from pipeline.resources import RUBRICS
+
+_MOST = 40  # files that are listed
+_LOOKED_AT = 2_000  # TOML files of a folder
+_MARK = "[[criteria]]"
+_START = 200_000  # characters in which that must stand
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShelvedRubric:
+    """A rubric to begin with or to open; `rubric` None: there is a mistake in it."""
+
+    name: str
+    path: Path
+    rubric: Rubric | None
+
+
+def shipped_names() -> list[str]:
+    """Return the names of the shipped rubrics."""
+    return sorted(path.stem for path in RUBRICS.glob("*.toml"))
+
+
+def shipped_rubrics() -> list[ShelvedRubric]:
+    """Return the shipped rubrics."""
+    found = (_shelved(RUBRICS / f"{name}.toml", name) for name in shipped_names())
+    return [one for one in found if one is not None]
+
+
+def own_rubrics(user: User) -> list[ShelvedRubric]:
+    """Return the rubrics that lie in a user's workshop, or where an owner works."""
+    found: dict[Path, ShelvedRubric] = {}
+    for root in _roots(user):
+        for path in _toml_files(root):
+            shelved = _shelved(path, path.relative_to(root).as_posix())
+            if shelved is not None and len(found) < _MOST:
+                found.setdefault(path.resolve(), shelved)
+    return list(found.values())
+
+
+def free_name(folder: Path) -> str:
+    """Return a name that no file of a folder has: `rubric.toml`, `rubric-2.toml`, …"""
+    names = ("rubric.toml", *(f"rubric-{n}.toml" for n in range(2, 1000)))
+    return next((name for name in names if not (folder / name).exists()), "rubric.toml")
+
+
+def work_folder(user: User) -> Path:
+    """Return the folder in which a rubric without one is made."""
+    return user.workshop or find_root()
+
+
+def _roots(user: User) -> Sequence[Path]:
+    if user.workshop:
+        return (user.workshop,)
+    places = (place for place in (*user.gradebooks, *user.folders) if isinstance(place, Path))
+    return tuple(dict.fromkeys([find_root(), *(place.parent for place in places)]))
+
+
+def _toml_files(root: Path) -> Iterator[Path]:
+    """Yield the TOML files of a folder and of those directly in it."""
+    for pattern in ("*.toml", "*/*.toml"):
+        try:
+            found = sorted(islice(root.glob(pattern), _LOOKED_AT))
+        except OSError:
+            continue
+        for path in found:
+            hidden = any(part.startswith(".") for part in path.relative_to(root).parts)
+            shipped = path.resolve().parent == RUBRICS.resolve()
+            if hidden or shipped or not path.is_file():
+                continue
+            if path.resolve().is_relative_to(root.resolve()):
+                yield path
+
+
+def _shelved(path: Path, name: str) -> ShelvedRubric | None:
+    """Return a file as a rubric; None where it is none."""
+    try:
+        text = rubric_source(path)
+    except ConfigError:
+        return None
+    if _MARK not in text[:_START]:
+        return None
+    try:
+        rubric = parse_rubric(text, where=path.name)
+    except ConfigError:
+        rubric = None
+    return ShelvedRubric(name=name, path=path, rubric=rubric)

@@ -1,0 +1,145 @@
+"""A rubric as it comes back from the page: its text, with the numbers of the form put in."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from starlette.datastructures import FormData
+
+from pipeline.errors import ConfigError
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric_file import InvalidRubric, key_lines, parse_rubric
+from pipeline.grading.rubric_form import (
+    RubricForm,
+    WrongFields,
+    changed_fields,
+    rubric_form,
+    with_values,
+)
+
+_AROUND = 2  # lines shown before and after one that is wrong
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mistake:
+    """What is wrong with a line of a rubric; line 0 is all of it."""
+
+    line: int
+    what: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class TypedRubric:
+    """What somebody typed.
+
+    Attributes
+    ----------
+    text : as it would be saved, with the numbers of the form in it.
+    edited : as the editor shows it: without those numbers where they cannot be put in.
+    rubric : None where something is wrong.
+    form : the numbers of the edited text; None where that is wrong itself.
+    typed : by name, the numbers of the form that are not in the edited text.
+    wrong : by name, what is wrong with a number of the form.
+    """
+
+    text: str
+    edited: str
+    rubric: Rubric | None
+    mistakes: Sequence[Mistake]
+    form: RubricForm | None
+    typed: Mapping[str, str]
+    wrong: Mapping[str, str]
+
+    @property
+    def shown(self) -> str:
+        """The numbers that the page shows, by which it tells later which of them were changed."""
+        if self.form is None:
+            return json.dumps(dict.fromkeys(self.typed, ""))
+        return json.dumps({field.name: field.value for field in self.form.fields()})
+
+    @property
+    def excerpts(self) -> list[list[tuple[int, str, list[str]]]]:
+        """The lines around each mistake: number, text, what is wrong with it."""
+        lines = self.text.split("\n")
+        near = {
+            n
+            for one in self.mistakes
+            for n in range(one.line - _AROUND, one.line + _AROUND + 1)
+            if one.line and 0 < n <= len(lines)
+        }
+        found: list[list[tuple[int, str, list[str]]]] = []
+        for n in sorted(near):
+            if not found or found[-1][-1][0] != n - 1:
+                found.append([])
+            what = [one.what for one in self.mistakes if one.line == n]
+            found[-1].append((n, lines[n - 1], what))
+        return found
+
+
+def read_typed(sent: FormData) -> TypedRubric:
+    """Return what a page of the editor sent."""
+    edited = _read_text(sent)
+    return typed_rubric(edited, _changed(sent))
+
+
+def typed_rubric(edited: str, typed: Mapping[str, str]) -> TypedRubric:
+    """Return the text of a rubric with numbers of the form put in, as far as that can be done."""
+    rubric, mistakes = _parsed(edited)
+    if rubric is None:
+        return TypedRubric(text=edited, edited=edited, rubric=None, mistakes=mistakes, form=None,
+                           typed=typed, wrong={})  # fmt: skip
+    form = rubric_form(rubric)
+    try:
+        text = with_values(edited, changed_fields(form, typed))
+    except ConfigError as error:
+        problems = error.problems if isinstance(error, WrongFields) else {"": str(error)}
+        told = [
+            Mistake(line=0, what=f"{name}: {what}" if name else what)
+            for name, what in problems.items()
+        ]
+        return TypedRubric(text=edited, edited=edited, rubric=None, mistakes=told, form=form,
+                           typed=typed, wrong=problems)  # fmt: skip
+    rubric, mistakes = _parsed(text)
+    if rubric is None:
+        return TypedRubric(text=text, edited=edited, rubric=None, mistakes=mistakes, form=form,
+                           typed=typed, wrong=_by_field(text, mistakes, form))  # fmt: skip
+    return TypedRubric(text=text, edited=text, rubric=rubric, mistakes=(),
+                       form=rubric_form(rubric), typed={}, wrong={})  # fmt: skip
+
+
+def _parsed(text: str) -> tuple[Rubric | None, list[Mistake]]:
+    if not text.strip():
+        return None, []
+    try:
+        return parse_rubric(text, where="rubric"), []
+    except InvalidRubric as error:
+        return None, [Mistake(line=line, what=what) for line, what in error.problems]
+
+
+def _by_field(text: str, mistakes: Sequence[Mistake], form: RubricForm) -> dict[str, str]:
+    """Return where to look, by the name of each field whose line is wrong."""
+    at = {one.line for one in mistakes}
+    lines = {path: line for line, path in key_lines(text) if line in at}
+    known = {field.name: lines.get(field.key) for field in form.fields()}
+    return {name: f"see line {line}" for name, line in known.items() if line is not None}
+
+
+def _changed(sent: FormData) -> dict[str, str]:
+    """Return the numbers of the form that are not as the page showed them."""
+    try:
+        shown = json.loads(str(sent.get("shown") or "{}"))
+    except ValueError:
+        shown = {}
+    known = shown.items() if isinstance(shown, dict) else ()
+    return {
+        name: typed.strip()
+        for name, value in known
+        if isinstance(typed := sent.get(name), str) and typed.strip() != value
+    }
+
+
+def _read_text(sent: FormData) -> str:
+    """Return the text as a file has it: forms end lines in their own way."""
+    text = sent.get("text")
+    plain = text.replace("\r\n", "\n") if isinstance(text, str) else ""
+    return plain.rstrip() + "\n"

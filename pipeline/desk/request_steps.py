@@ -1,0 +1,48 @@
+"""The steps of a request for another look, as students and TAs read them."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pipeline.grading.gradebook.history import to_the_second
+from pipeline.grading.gradebook.requests import RequestEvent, hide_people
+from pipeline.grading.words import points_text
+
+_HEADS = {"asked": "asked", "answered": "answered", "reopened": "reopened it: ask once more"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShownStep:
+    """One step: who did what, when, and in which words."""
+
+    head: str
+    at: str
+    text: str
+
+
+def describe_steps(
+    events: Iterable[RequestEvent], *, team: str = "", submission: str = ""
+) -> list[ShownStep]:
+    """Return the steps of a request, oldest first.
+
+    Parameters
+    ----------
+    team : the name that stands in for a submission whose students may not be named.
+    submission : the real name then, which is hidden as the students' are.
+    """
+    shown = []
+    for event in events:
+        hidden = team and event.what == "asked"
+        by = team if hidden else event.by
+        head = f"{by} {_HEADS[event.what]}"
+        if event.what == "answered":
+            head = f"{head}: {_describe_points(event.points)}"
+        people = (submission, *event.authors, event.by * bool(hidden))
+        text = hide_people(event.text, people) if team else event.text
+        shown.append(ShownStep(head=head, at=to_the_second(event.at), text=text))
+    return shown
+
+
+def _describe_points(points: float | None) -> str:
+    if points is None:
+        return "the points stay"
+    return f"{points_text(points)} {'point' if points == 1 else 'points'}"

@@ -1,0 +1,65 @@
+"""The line at the top of every page: the desk, what is open, and where one is."""
+
+from dataclasses import dataclass
+
+from pipeline.desk.books import Books
+from pipeline.desk.users import Place, User, name_place
+
+_BESIDE = 3  # other open places that have a link on every page; the first page lists all
+_OF_FOLDERS = ("student", "bench", "solution")
+_WHOLE = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Room:
+    """A link of the line.
+
+    Attributes
+    ----------
+    beside : it is another place than the one shown; a phone has no space for it.
+    """
+
+    address: str
+    name: str
+    beside: bool = False
+
+
+def list_rooms(user: User, path: str, books: Books) -> list[Room]:
+    """Return the links for somebody who looks at an address, of their own rooms only."""
+    room, _, rest = path.strip("/").partition("/")
+    shown = rest.partition("/")[0]
+    found = [Room(address="/", name="Desk")]
+    for n, place in _latest(user.folders, shown if room in _OF_FOLDERS else ""):
+        is_here = room in _OF_FOLDERS and shown == str(n)
+        found.append(Room(address=f"/student/{n}/", name=name_place(place), beside=not is_here))
+        if is_here and user.may("bench"):
+            found.append(Room(address=f"/bench/{n}/", name="Bench"))
+        if is_here and room == "solution":
+            found.append(Room(address=f"/solution/{n}/", name="Solution"))
+    if room in _WHOLE and user.may(room):
+        found.append(Room(address=f"/{room}/", name=_WHOLE[room]))
+    for n, place in _latest(user.gradebooks, shown if room == "grades" else ""):
+        is_here = room == "grades" and shown == str(n)
+        waiting = books.n_waiting(place)
+        name = name_place(place) + (f" ({waiting} asked)" if waiting else "")
+        found.append(Room(address=f"/grades/{n}/", name=name, beside=not is_here))
+    return found + list_feedback(user)
+
+
+def list_feedback(user: User) -> list[Room]:
+    """Return the links to the grades that are a student's own."""
+    if len(user.grades) == 1:
+        return [Room(address="/feedback/0/", name="Feedback")]
+    return [
+        Room(
+            address=f"/feedback/{n}/",
+            name=f"{own.assignment or name_place(own.gradebook)}: feedback",
+        )
+        for n, own in enumerate(user.grades)
+    ]
+
+
+def _latest(places: list[Place] | list, shown: str) -> list[tuple[int, Place]]:
+    """Return the places that were opened last, and the one that is shown."""
+    last = len(places) - _BESIDE
+    return [(n, place) for n, place in enumerate(places) if n >= last or str(n) == shown]

@@ -1,0 +1,75 @@
+"""Files that are shown as they lie in a folder, each under the strictest policy that shows it."""
+
+from pathlib import Path, PurePosixPath
+
+from starlette.exceptions import HTTPException
+from starlette.responses import FileResponse, Response
+
+from pipeline.desk.ask import Ask
+from pipeline.report.render.html import every_hash
+from pipeline.resources import TEMPLATES
+from pipeline.submission.load import outside
+
+# A page of a folder is a stranger's here: of an origin of its own, so that it sees no cookie and
+# asks nothing of the desk; it runs the scripts that the report brings, and no others.
+_STRANGE_PAGE = (
+    "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; "
+    "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
+)
+# Pages of our own making, whole: their one script is known by its hash.
+_OWN_PAGE = (
+    "default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:; "
+    "font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+_INERT = "sandbox; default-src 'none'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+_KINDS = {
+    ".html": "text/html",
+    ".pdf": "application/pdf",
+    ".svg": "image/svg+xml",
+    ".json": "application/json",
+}
+_OWN_KINDS = {".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
+_STATIC = {
+    "report.css": "report.css",
+    "desk.css": "desk/desk.css",
+    "desk.js": "desk/desk.js",
+    "live.css": "live.css",
+    "live.js": "live.js",
+    "grades.js": "desk/grades.js",
+    "htmx.js": "desk/htmx.min.js",
+    "icon.svg": "desk/icon.svg",
+}
+
+
+def serve_file(folder: Path, name: str) -> Response:
+    """Return a file that lies in a folder, not one that a link there leads to elsewhere."""
+    kind = _KINDS.get(PurePosixPath(name).suffix)
+    if kind is None or outside(folder, name) is not None:
+        raise HTTPException(404, "there is no such file")
+    policy = _allow_own_scripts(_STRANGE_PAGE) if kind == "text/html" else _INERT
+    headers = {} if kind == "application/pdf" else {"Content-Security-Policy": policy}
+    return FileResponse(folder / name, media_type=kind, headers=headers)
+
+
+def show_own_page(text: str) -> Response:
+    """Return a page of our own making."""
+    headers = {"Content-Security-Policy": _allow_own_scripts(_OWN_PAGE)}
+    return Response(text, media_type="text/html", headers=headers)
+
+
+def show_drawing(svg: str) -> Response:
+    """Return a drawing, which runs nothing wherever it is opened."""
+    return Response(svg, media_type="image/svg+xml", headers={"Content-Security-Policy": _INERT})
+
+
+def _allow_own_scripts(policy: str) -> str:
+    return policy.format(hashes=" ".join(f"'{one}'" for one in every_hash()))
+
+
+def serve_static(ask: Ask) -> Response:
+    """Return a style sheet or script of the desk."""
+    name = ask.request.path_params["name"]
+    if name not in _STATIC:
+        raise HTTPException(404, "there is no such file")
+    kind = _OWN_KINDS[PurePosixPath(name).suffix]
+    return Response((TEMPLATES / _STATIC[name]).read_bytes(), media_type=kind)

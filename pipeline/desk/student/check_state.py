@@ -1,0 +1,31 @@
+"""How the check of one's own numbers stands."""
+
+from pathlib import Path
+
+from pipeline.desk.student.way import Stands
+from pipeline.errors import SubmissionError
+from pipeline.grading.self_check.log import find_basis, read_answers
+from pipeline.submission import Submission, load_submission
+
+
+def tell_state(folder: Path) -> Stands:
+    """Return the state of the check and a word for it: done, needs, old or none."""
+    submission, problems = load_if_sound(folder)
+    try:
+        answers = read_answers(folder)
+    except SubmissionError:
+        return "needs", "cannot be read"
+    if problems or not answers or submission is None:
+        return "none", "not asked yet"
+    last = answers[-1]
+    if last.basis != find_basis(submission):
+        return "old", "changed since"
+    return ("needs", "some disagree") if last.disagree else ("done", "all agree")
+
+
+def load_if_sound(folder: Path) -> tuple[Submission | None, list[str]]:
+    """Return the submission, None with what is wrong with it where it is not valid."""
+    try:
+        return load_submission(folder), []
+    except SubmissionError as error:
+        return None, [str(error)]

@@ -1,0 +1,137 @@
+"""What the program is not sure of, as questions beside their fields that one click answers."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from pipeline.desk.student.form import Answer, Field
+from pipeline.ingest.columns import is_known, position_units
+from pipeline.ingest.fill import unit_doubt
+from pipeline.words.numbers import listing
+
+NO_DOUBTS: Mapping[str, Any] = {"system": {}, "springs": (), "experiments": ()}
+
+
+def ask_doubts(
+    fields: Iterable[Field],
+    *,
+    fractions: Sequence[str],
+    doubts: Mapping[str, Any],
+    told: Mapping[str, Any],
+) -> tuple[Field, ...]:
+    """Return the fields of the set-up, each with what is not sure of it and how to answer.
+
+    Parameters
+    ----------
+    fractions : the files in which positions are no whole numbers.
+    doubts : what stands marked in the file; see `list_doubts` of the desk's tasks.
+    told : what a report of the files as they are now assumed and found contradicted.
+    """
+    return tuple(
+        replace(field, asked=asked, answers=answers) if asked else field
+        for field in fields
+        for asked, answers in [_ask(field, fractions=fractions, doubts=doubts, told=told)]
+    )
+
+
+def _ask(
+    field: Field, *, fractions: Sequence[str], doubts: Mapping[str, Any], told: Mapping[str, Any]
+) -> tuple[str, tuple[Answer, ...]]:
+    if field.path == "system.position.unit" and (
+        doubt := unit_doubt(field.value or "count", fractions=fractions)
+    ):
+        known = is_known(field.value or "count", position_units())
+        return doubt, (Answer(label="Use cm", value="cm"),) if known else ()
+    if field.path == "system.springs" and "springs" in doubts["system"]:
+        return doubts["system"]["springs"], _list_springs(field, doubts["springs"])
+    wrong = [one for one in told["contradicted"] if one["key"] == field.path]
+    if wrong and (answers := _contradict(field, wrong)):
+        return "; ".join(_name(one, one["why"]) for one in wrong), answers
+    taken = [one for one in told["assumed"] if one["key"] == field.path]
+    if any(one["support"] == "open" for one in taken) and (answers := _confirm(field, taken)):
+        said = listing(list(dict.fromkeys(_name(one, one["taken"]) for one in taken)))
+        return f"not stated, and nothing tells it; taken as {said}", answers
+    return "", ()
+
+
+def _name(one: Mapping[str, str], said: str) -> str:
+    return f"{one['about']}: {said}" if one["about"] else said
+
+
+def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:
+    """Return every way in which the springs that nothing tells may be there (numbers from 1)."""
+    if not unknown:
+        return (Answer(label="It is as ticked", value=field.value),)
+    places = [number - 1 for number in unknown]
+    if len(places) == 1:
+        (place,) = places
+        return (
+            Answer(label="There is one", value=_with(field, {place: True})),
+            Answer(label="No spring here", value=_with(field, {place: False})),
+        )
+    only = [
+        Answer(
+            label=f"Only {field.names[place]}",
+            value=_with(field, {other: other == place for other in places}),
+        )
+        for place in places
+    ]
+    return (
+        Answer(label="All of them", value=_with(field, dict.fromkeys(places, True))),
+        *only,
+        Answer(label="None of them", value=_with(field, dict.fromkeys(places, False))),
+    )
+
+
+def _contradict(field: Field, wrong: Sequence[Mapping[str, Any]]) -> tuple[Answer, ...]:
+    """Return how to take back what the data contradict."""
+    if field.path == "system.springs":
+        gone = {field.names.index(one["about"]): False for one in wrong if one["value"] is True
+                and one["about"] in field.names}  # fmt: skip
+        return (Answer(label="No spring here", value=_with(field, gone)),) if gone else ()
+    if field.path == "system.input.sign":
+        return (_turn(wrong[0]["value"]),)
+    return ()
+
+
+def _confirm(field: Field, taken: Sequence[Mapping[str, Any]]) -> tuple[Answer, ...]:
+    """Return how to state what was taken."""
+    if field.path == "system.springs":
+        return (Answer(label="All are there", value=field.value),)
+    if field.path == "system.input.sign":
+        sign = taken[0]["value"]
+        return Answer(label="It is right", value=f"{sign:.0f}"), _turn(sign)
+    if field.path in ("system.position.unit", "system.input.unit"):
+        unit = taken[0]["taken"]
+        return (Answer(label=f"It is {unit}", value=unit),)
+    return ()
+
+
+def _turn(sign: float) -> Answer:
+    return Answer(label="Turn the sign", value=f"{-sign:.0f}")
+
+
+def _with(field: Field, flags: Mapping[int, bool]) -> str:
+    """Return the flags of a field, as they are typed, with some of them set."""
+    every = [flags.get(place, on) for place, on in enumerate(field.on)]
+    return " ".join("true" if on else "false" for on in every)
+
+
+def ask_held(field: Field, hardly: Sequence[int], carts: Sequence[int]) -> Field:
+    """Return the field of free carts with the question whether some were held.
+
+    Parameters
+    ----------
+    hardly : the carts that hardly move; `carts` : those that are taken as free.
+    """
+    others = [cart for cart in carts if cart not in hardly]
+    which = listing([str(cart) for cart in hardly])
+    number = "s" if len(hardly) > 1 else ""
+    return replace(
+        field,
+        asked=f"cart{number} {which} hardly move{'' if number else 's'}",
+        answers=(
+            Answer(label="It was held", value=", ".join(map(str, others))),
+            Answer(label="It was free", value=", ".join(map(str, carts))),
+        ),
+    )

@@ -1,0 +1,148 @@
+"""A student's own feedback at the desk, and what they ask to have looked at again."""
+
+from typing import Any
+
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.evidence import show_evidence
+from pipeline.desk.request_steps import describe_steps
+from pipeline.desk.served_files import show_own_page
+from pipeline.desk.users import OwnGrade
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Criterion, Grade
+from pipeline.grading.gradebook.request_book import OwnFeedback, RequestBook, points_lost
+from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.publish.anonymous import anonymise
+from pipeline.grading.publish.feedback import TONES, feedback_page
+from pipeline.grading.words import WORDS, points_text
+from pipeline.words.numbers import NOTHING
+
+
+def show(ask: Ask) -> Response:
+    """Show the points, then each criterion with what became of the requests."""
+    return _show_page(ask)
+
+
+def send(ask: Ask) -> Response:
+    """Ask for another look at a criterion; a reason that is refused stays as typed."""
+    own, criterion, why = _find_own(ask), ask.text("criterion"), ask.text("why")
+    try:
+        book = _open_book(ask)
+        book.ask(own.submission, criterion, why=why, by=ask.user.name, assignment=own.assignment)
+    except RequestRefused as refused:
+        return _show_page(ask, refused={criterion: (why, str(refused))}, status=422)
+    except ConfigError:
+        raise ConfigError(_UNREADABLE) from None
+    return ask.back(f"{ask.here}#criterion-{criterion}", "Sent. The answer will be on this page.")
+
+
+def show_whole(ask: Ask) -> Response:
+    """Show the page that the team reads, with its figures."""
+    own, found = _find_own(ask), _read(ask)
+    if found is None:
+        raise HTTPException(404, "your feedback is not out")
+    figures = _open_book(ask).figures(found.entry)
+    grade = _hide_others(found, own)
+    page = feedback_page(grade, rubric=found.rubric, figures=figures, name=own.submission)
+    return show_own_page(page)
+
+
+_UNREADABLE = "your grade cannot be read now; tell your instructor"
+
+
+def _find_own(ask: Ask) -> OwnGrade:
+    """Return the grade that the address is about: of others' there is none."""
+    number = ask.request.path_params["n"]
+    if number >= len(ask.user.grades):
+        raise HTTPException(404, "there is nothing here that is yours to see")
+    return ask.user.grades[number]
+
+
+def _open_book(ask: Ask) -> RequestBook:
+    return ask.desk.books.book(_find_own(ask).gradebook)
+
+
+def _read(ask: Ask) -> OwnFeedback | None:
+    """Return the feedback, None while it is not out.
+
+    Raises
+    ------
+    ConfigError : it cannot be read; why is not for students, as it may name places of the server.
+    """
+    own = _find_own(ask)
+    try:
+        return _open_book(ask).own_feedback(own.submission, assignment=own.assignment)
+    except ConfigError:
+        raise ConfigError(_UNREADABLE) from None
+
+
+def _hide_others(found: OwnFeedback, own: OwnGrade) -> Grade:
+    """Return the grade; that of an anonymous class names nobody else."""
+    grade = found.entry.grade
+    return anonymise(grade, {own.submission: own.submission}) if found.rubric.anonymous else grade
+
+
+def _show_page(
+    ask: Ask, *, refused: dict[str, tuple[str, str]] | None = None, status: int = 200
+) -> Response:
+    own, found = _find_own(ask), _read(ask)
+    if found is None:
+        return ask.page(
+            "feedback", status=status, title="Feedback", submission=own.submission, found=None
+        )
+    grade = _hide_others(found, own)
+    criteria = _describe_criteria(found, grade, refused=refused or {})
+    return ask.page(
+        "feedback",
+        status=status,
+        title=found.rubric.title or "Feedback",
+        submission=own.submission,
+        found=found,
+        grade=grade,
+        points=points_text,
+        lost=[one for one in criteria if one["lost"]],
+        kept=[one for one in criteria if not one["lost"]],
+        n_waiting=sum(request.state == "asked" for request in found.requests.values()),
+        n_answered=sum(request.state == "answered" for request in found.requests.values()),
+        most=MOST_LETTERS,
+    )
+
+
+def _describe_criteria(
+    found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]]
+) -> list[dict[str, Any]]:
+    """Return every criterion of the rubric, those that were never judged too."""
+    judged = {criterion.id: criterion for criterion in grade.criteria}
+    lost = points_lost(grade, found.rubric)
+    described = []
+    for asked in found.rubric.criteria:
+        request = found.requests.get(asked.id)
+        typed, wrong = refused.get(asked.id, ("", ""))
+        described.append(
+            {
+                "id": asked.id,
+                "title": asked.title or asked.id,
+                "out_of": points_text(asked.points),
+                **_describe_judged(judged.get(asked.id), asked.check, grade),
+                "lost": asked.id in lost or request is not None,
+                "request": request,
+                "steps": describe_steps(request.events if request else ()),
+                "may_ask": asked.id in lost and (request is None or request.state == "reopened"),
+                "typed": typed,
+                "wrong": wrong,
+            }
+        )
+    return described
+
+
+def _describe_judged(own: Criterion | None, check: str, grade: Grade) -> dict[str, Any]:
+    if own is None:
+        return {"points": NOTHING, "outcome": "not judged", "tone": "quiet", "evidence": ""}
+    return {
+        "points": points_text(own.points),
+        "outcome": WORDS.text(f"outcome_{own.outcome}"),
+        "tone": TONES[own.outcome],
+        "evidence": show_evidence(own, check, grade.units),
+    }

@@ -1,0 +1,96 @@
+"""The report in the student's room, on a page; and its questions, answered in `notes.md`."""
+
+from collections.abc import Mapping
+
+from starlette.responses import Response
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.last_report import NOTES, read_notes, read_told
+from pipeline.desk.student.room import look_around
+from pipeline.errors import SubmissionError
+from pipeline.lock import turn_in
+from pipeline.output import write_file
+from pipeline.report.sections.answers import with_answer, written_answer
+from pipeline.submission.edit import text_digest
+from pipeline.submission.load import MAX_NOTES_BYTES, outside
+
+
+def show(ask: Ask) -> Response:
+    """Show the report, which fills the window below the way."""
+    folder = ask.folder()
+    return ask.page(
+        "report",
+        title=f"Report of {folder.name}",
+        room=look_around(ask),
+        there=outside(folder, "report/report.html") is None,
+    )
+
+
+def show_questions(ask: Ask) -> Response:
+    """Show what the report asks, each question with the answer that there is."""
+    return _show_questions(ask)
+
+
+def answer(ask: Ask) -> Response:
+    """Write the answer to a question into `notes.md`; what cannot be is shown as typed."""
+    folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
+    try:
+        with turn_in(folder):
+            notes = read_notes(folder)
+            if ask.text("seen") != text_digest(notes):
+                return ask.page(
+                    "outdated",
+                    status=409,
+                    title=f"{NOTES} was changed meanwhile",
+                    name=NOTES,
+                    text=notes,
+                    changed=[(f"Answer to {id_}", words, "")],
+                    had="You typed",
+                    back=f"{ask.here}questions",
+                )
+            if id_ not in [one["id"] for one in read_told(folder)["questions"]]:
+                raise SubmissionError(f"the report asks nothing called {id_!r}")
+            new = with_answer(notes, id_, words)
+            if len(new.encode()) > MAX_NOTES_BYTES:
+                raise SubmissionError(f"{NOTES} would have more than {MAX_NOTES_BYTES:,} bytes")
+            write_file(folder / NOTES, new)
+    except SubmissionError as error:
+        return _show_questions(ask, status=422, refused={id_: (words, str(error))})
+    place = f"question-{id_}"
+    return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
+
+
+def _show_questions(
+    ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]] = {}
+) -> Response:
+    """Show the questions.
+
+    Parameters
+    ----------
+    refused : by question, an answer as it was typed, and why it was not written.
+    """
+    folder = ask.folder()
+    said = read_told(folder)
+    problems, notes = [why for _, why in refused.values()], ""
+    try:
+        notes = read_notes(folder)
+    except SubmissionError as error:
+        problems = [str(error)]
+    questions, known = [], [one["id"] for one in said["questions"]]
+    others = [
+        {"id": id_, "section": "", "text": f"Answer to {id_}"}
+        for id_ in refused
+        if id_ not in known
+    ]
+    for one in [*said["questions"], *others]:
+        words, why = refused.get(one["id"]) or (written_answer(notes, one["id"]), "")
+        questions.append({**one, "answer": words, "wrong": why})
+    return ask.page(
+        "questions",
+        status=status,
+        title=f"Questions to {folder.name}",
+        room=look_around(ask),
+        questions=questions,
+        problems=problems,
+        seen=text_digest(notes),
+    )

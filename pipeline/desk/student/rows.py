@@ -1,0 +1,200 @@
+"""The recordings of a submission as rows, grouped by kind: each with what needs a person."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.desk.ask import NOTHING_KNOWN, Ask
+from pipeline.desk.student.doubts import ask_held
+from pipeline.desk.student.form import Field, count_carts, fill_experiment, is_marked
+from pipeline.ingest.inspect import NO_CLOCK
+from pipeline.submission.load import list_experiments, posix, stated_columns
+from pipeline.submission.models import MOST_EXPERIMENTS
+from pipeline.words.numbers import by_note
+
+# In the order in which a bench is worked through; what has no table stands first, to be seen.
+_KINDS = (
+    ("", "Not understood"),
+    ("decay", "Decays"),
+    ("step", "Steps"),
+    ("sine", "Sine dwells"),
+    ("sweep", "Sweeps"),
+    ("closed_loop", "Closed loop"),
+    ("bode", "Tables of ratios"),
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """A data file, or a table whose file is not there.
+
+    Attributes
+    ----------
+    look : what the file is; see `look_at_file` of the desk's tasks.
+    index : of its table; None without one. `id` : of the experiment.
+    problems : why it needs a person; `remarks` : what is worth knowing.
+    """
+
+    file: str
+    look: Mapping[str, Any]
+    index: int | None
+    id: str = ""
+    fields: tuple[Field, ...] = ()
+    problems: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def kind(self) -> str:
+        """The kind of its table, "" without a known one."""
+        kind = next((f.value for f in self.fields if f.path.endswith(".kind")), "")
+        return kind if kind in dict(_KINDS) else ""
+
+    @property
+    def frequency(self) -> str:
+        """Of a dwell: as stated, else as found; Hz."""
+        stated = next((f.value for f in self.fields if f.path.endswith(".frequency")), "")
+        found = self.look["frequency"]
+        return stated or (f"{found:.3g}" if found and self.kind == "sine" else "")
+
+    @property
+    def needs_a_person(self) -> bool:
+        """Whether somebody has to look at it."""
+        return bool(self.problems) or any(f.wrong or f.asked for f in self.fields)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileGroup:
+    """The recordings of one kind."""
+
+    key: str
+    title: str
+    rows: tuple[Row, ...]
+
+    @property
+    def to_look_at(self) -> int:
+        """How many need a person."""
+        return sum(row.needs_a_person for row in self.rows)
+
+
+def group_rows(rows: Sequence[Row]) -> list[FileGroup]:
+    """Return the rows by kind."""
+    groups = [
+        FileGroup(key=kind or "unknown", title=title, rows=tuple(r for r in rows if r.kind == kind))
+        for kind, title in _KINDS
+    ]
+    return [group for group in groups if group.rows]
+
+
+def list_rows(
+    ask: Ask, folder: Path, document: Mapping[str, Any], *, doubts: Sequence[Sequence[str]]
+) -> list[Row]:
+    """Return a row for every data file, and for every table whose file is not there.
+
+    Parameters
+    ----------
+    doubts : what stands marked as unsure in each table.
+    """
+    # Further ones are what is wrong with the file.
+    listed = list_experiments(document)[:MOST_EXPERIMENTS]
+    places: dict[str, list[int]] = {}
+    for index, table in enumerate(listed):
+        places.setdefault(posix(str(table.get("file", ""))), []).append(index)
+    rows = []
+    for file, look in look_at_all(ask, folder, document).items():
+        for index in places.pop(file, []) or [None]:
+            if index is None:
+                rows.append(_describe_unknown(file, look))
+            else:
+                marked = doubts[index] if index < len(doubts) else ()
+                rows.append(_describe(document, file, look, index=index, marked=marked))
+    for file, indices in places.items():
+        for index in indices:
+            row = _describe(document, file, NOTHING_KNOWN, index=index, marked=())
+            rows.append(replace(row, problems=("there is no such file", *row.problems[1:])))
+    return rows
+
+
+def look_at_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return what each data file is, by name."""
+    known = {**document, "experiments": list_experiments(document)[:MOST_EXPERIMENTS]}
+    return ask.desk.looks(folder, lambda file: stated_columns(known, file))
+
+
+def _describe_unknown(file: str, look: Mapping[str, Any]) -> Row:
+    """Return the row of a file that has no table."""
+    if not look["format"]:
+        what = "it cannot be read; mend it, or set it aside"
+    elif look["kind"]:
+        what = f"a {look['kind'].replace('_', ' ')} that is not in submission.toml"
+    else:
+        what = "nothing tells what it is; say in the set-up what its columns are"
+    return Row(file=file, look=look, index=None, problems=(what, *look["remarks"]))
+
+
+def _describe(
+    document: Mapping[str, Any],
+    file: str,
+    look: Mapping[str, Any],
+    *,
+    index: int,
+    marked: Sequence[str],
+) -> Row:
+    table = list_experiments(document)[index]
+    carts = _free_carts(document, table)
+    fields = tuple(
+        _question(field, table, look, carts=carts, marked=marked)
+        for field in fill_experiment(document, index)
+    )
+    problems = [] if look["format"] else ["it cannot be read"]
+    problems += [f"state {need} below" for need in look["needs"] if need not in table]
+    if any(field.path.endswith("controller.type") and not field.value for field in fields):
+        problems.append("say what controller ran")
+    known = {said for cart, said in look["still"].items() if int(cart) not in carts}
+    if "sample_rate" in table:
+        known.add(NO_CLOCK)
+    return Row(
+        file=file,
+        look=look,
+        index=index,
+        id=str(table.get("id", "")),
+        fields=fields,
+        problems=tuple(problems),
+        remarks=tuple(one for one in look["remarks"] if one not in known),
+    )
+
+
+def _free_carts(document: Mapping[str, Any], table: Mapping[str, Any]) -> list[int]:
+    """Return the carts that a table says are free: all where it does not say."""
+    stated = table.get("carts")
+    if isinstance(stated, list):
+        return [cart for cart in stated if isinstance(cart, int)]
+    return list(range(1, count_carts(document) + 1))
+
+
+def _question(
+    field: Field,
+    table: Mapping[str, Any],
+    look: Mapping[str, Any],
+    *,
+    carts: Sequence[int],
+    marked: Sequence[str],
+) -> Field:
+    """Return a field with the question whether a cart was held, until the table says."""
+    if not field.path.endswith(".carts"):
+        return field
+    open_ = "carts" not in table or any(is_marked(said, marked) for said in look["unsure"])
+    hardly = [cart for cart in look["hardly"] if cart in carts]
+    return ask_held(field, hardly, carts) if open_ and hardly else field
+
+
+def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
+    """Return what there is to say of many files, each with its sentence that names them."""
+    told = [(row.file, said) for row in rows for said in row.remarks]
+    times = Counter(said for _, said in told)
+    many = [said for said, number in times.items() if number >= 3]  # said once, for all of them
+    return {
+        said: by_note((file.removeprefix("data/"), one) for file, one in told if one == said)[0]
+        for said in many
+    }

@@ -1,0 +1,232 @@
+"""The student's room: files, form, the zip. The folder on disk is the truth."""
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import tomlkit
+from starlette.datastructures import UploadFile
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from pipeline.desk import last_report
+from pipeline.desk.ask import Ask, Said
+from pipeline.desk.student.files import put_aside, take_uploads
+from pipeline.desk.student.form import (
+    Field,
+    clear_marks,
+    fill_experiment,
+    fill_form,
+    find_changes,
+    read_document,
+    read_value,
+    remove_experiment,
+    write_fields,
+)
+from pipeline.desk.student.handin import list_held, list_missing, pack
+from pipeline.desk.student.room import Room, look_around
+from pipeline.desk.student.rows import gather_remarks, group_rows, look_at_all
+from pipeline.desk.student.seeing import sees_check
+from pipeline.errors import SubmissionError
+from pipeline.lock import turn_in
+from pipeline.processes import Failed
+from pipeline.submission.edit import Outdated, edit_submission, submission_text
+from pipeline.submission.load import NAME, list_experiments, outside, posix
+from pipeline.words.numbers import by_note, count
+
+_FILES, _SET_UP = "files", "details"  # parts of pages, by their ids
+
+
+def show(ask: Ask) -> Response:
+    """Show the room as the folder is now."""
+    return _show_page(ask)
+
+
+def upload(ask: Ask) -> Response:
+    """Take files, and write down what they are."""
+    folder, items = ask.folder(), ask.form.getlist("files")
+    sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
+    said = take_uploads(sent, folder, workers=ask.desk.workers)
+    return _go_back(ask, [*said, *_fill_tables(ask, folder)], _FILES)
+
+
+def set_aside(ask: Ask) -> Response:
+    """Move a recording out of `data/` that no table names."""
+    folder, file = ask.folder(), ask.text("file")
+    if file not in ask.desk.workers.do("list_files", folder=str(folder)):
+        raise HTTPException(404, "there is no such recording")
+    with turn_in(folder):
+        document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
+        if any(posix(str(table.get("file", ""))) == file for table in list_experiments(document)):
+            raise SubmissionError(f"{file}: {NAME} names it; take it out there first")
+        said = put_aside(file, folder)
+    return _go_back(ask, [Said(said)], _FILES)
+
+
+def fill(ask: Ask) -> Response:
+    """Write the tables of files that have none."""
+    return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
+
+
+def save(ask: Ask) -> Response:
+    """Write the form into the file."""
+    fields = [field for group in fill_form(_read_shown(ask)) for field in group.fields]
+    changed = find_changes(fields, ask.form, ask.form.getlist)
+    return _edit(ask, lambda document: write_fields(document, changed), changed, place=_SET_UP)
+
+
+def save_experiment(ask: Ask) -> Response:
+    """Write one row of the table of files into its table, or take the table away."""
+    index = ask.request.path_params["index"]
+    if ask.text("remove"):
+        return _edit(ask, lambda document: remove_experiment(document, index), (), place=_FILES)
+    shown = _read_shown(ask)
+    changed = find_changes(fill_experiment(shown, index), ask.form, ask.form.getlist)
+    says_carts = any(field.path.endswith(".carts") for field in changed)
+    answered = _list_doubts(ask, shown, index) if says_carts else ()
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        write_fields(document, changed)
+        clear_marks(document, index, answered)
+
+    return _edit(ask, change, changed, place=_FILES)
+
+
+def start_hand_in(ask: Ask) -> Response:
+    """Have the report made anew where anything was changed since; show what is handed in."""
+    if not sees_check(ask) and last_report.find_state(ask.folder()) != "current":
+        ask.start("make_report", title="The report")
+    return ask.back(f"{ask.here}hand-in")
+
+
+def show_hand_in(ask: Ask) -> Response:
+    """Show what is done and what is not, what was assumed, and what the zip holds."""
+    folder, room = ask.folder(), look_around(ask)
+    keeps = list_missing(folder)
+    names = [] if keeps else list_held(folder, report=not sees_check(ask))
+    return ask.page(
+        "handin",
+        title=f"Hand in: {folder.name}",
+        room=room,
+        keeps=keeps,
+        files=[(name, (folder / name).stat().st_size) for name in names],
+        unanswered=last_report.list_unanswered(folder),
+        authors=_list_authors(room),
+    )
+
+
+def download_hand_in(ask: Ask) -> Response:
+    """Return the zip."""
+    name = f"{ask.folder().name}.zip"
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "-", name)  # other letters by RFC 5987, beside this
+    disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
+    headers = {"Content-Disposition": disposition}
+    made_of = last_report.stat_sources(ask.folder())
+    packed = pack(ask.folder(), report=not sees_check(ask))
+    ask.desk.handed[ask.folder()] = made_of
+    return Response(packed, media_type="application/zip", headers=headers)
+
+
+# ------------------------------------------------------------------------------- parts
+
+
+def _read_shown(ask: Ask) -> dict[str, Any]:
+    """Return the file that a form was filled in for: what differs from that was typed."""
+    text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
+    return read_document(submission_text(ask.folder()) if text is None else text)
+
+
+def _list_authors(room: Room) -> list[str]:
+    """Return who hands in, as they stand in the form."""
+    who = [f.value for group in room.groups for f in group.fields if f.path == "authors"]
+    return [line for value in who for line in value.splitlines() if line.strip()]
+
+
+def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[str]:
+    """Return what is not sure of the carts of an experiment."""
+    files = [posix(str(table.get("file", ""))) for table in list_experiments(document)]
+    looks = look_at_all(ask, ask.folder(), document)
+    return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
+
+
+def _fill_tables(ask: Ask, folder: Path) -> list[Said]:
+    """Have the tables of new files written; return what is to be said."""
+    try:
+        rows = ask.desk.workers.do("fill_tables", folder=str(folder))
+    except Failed as error:
+        return [Said(str(error), "refused")]
+    new = [row["file"] for row in rows if row["state"] in ("new", "completed")]
+    said = [Said(f"{count(len(new), 'file')} written into {NAME}.")] if new else []
+    without = [row for row in rows if row["state"] in ("copy", "refused")]
+    notes = by_note((row["file"], note) for row in without for note in row["remarks"])
+    return said + [Said(note, "refused") for note in notes]
+
+
+def _go_back(ask: Ask, said: Iterable[Said], place: str) -> Response:
+    """Return to where it was asked, and say there what was done."""
+    return ask.back(f"{ask.here}#{place}", *said, place=place)
+
+
+def _show_page(
+    ask: Ask,
+    *,
+    status: int = 200,
+    changed: Sequence[Field] = (),
+    error: SubmissionError | None = None,
+) -> Response:
+    """Show the room; with what was typed in place of what stands in the file, where it is wrong."""
+    folder, room = ask.folder(), look_around(ask, changed=changed, error=error)
+    named = [row.file for row in room.rows if row.index is not None]
+    return ask.page(
+        "student",
+        status=status,
+        title=folder.name,
+        room=room,
+        file_groups=group_rows(room.rows),
+        often=gather_remarks(room.rows),
+        not_read=ask.desk.workers.do("list_not_read", folder=str(folder), named=named),
+        keeps=list_missing(folder) if room.facts.sound else [],
+        gap=outside(folder, "gap/gap.html") is None,
+    )
+
+
+def _edit(
+    ask: Ask,
+    change: Callable[[tomlkit.TOMLDocument], None],
+    changed: Sequence[Field],
+    *,
+    place: str,
+) -> Response:
+    """Change the file; what would not be valid is shown as typed, what is outdated is refused.
+
+    Parameters
+    ----------
+    place : the part of the page where it was asked.
+    """
+    folder = ask.folder()
+    try:
+        edit_submission(folder, change, seen=ask.text("seen") or "nothing")
+    except Outdated as error:
+        return _show_outdated(ask, error.text, changed)
+    except SubmissionError as error:
+        return _show_page(ask, status=422, changed=changed, error=error)
+    return _go_back(ask, [Said("Saved.")], place)
+
+
+def _show_outdated(ask: Ask, text: str, changed: Sequence[Field]) -> Response:
+    """Show both versions: the file as it is now, and what was typed."""
+    now = read_document(text)
+    # Of a page older than all that is known, nobody can say what was typed in it.
+    known = ask.desk.shown(ask.text("seen"), to=ask.user.name) is not None
+    return ask.page(
+        "outdated",
+        status=409,
+        title=f"{NAME} was changed meanwhile",
+        name=NAME,
+        text=text,
+        changed=[(field.label, field.value, read_value(now, field)) for field in changed],
+        had="You typed" if known else "Your page had",
+        back=ask.here,
+    )

@@ -1,0 +1,117 @@
+"""A recording that a person wants, from the few numbers in which one says it."""
+
+from dataclasses import dataclass
+from math import ceil, floor
+from pathlib import Path
+from typing import Literal, get_args
+
+from pipeline.bench.protocol.messages import FREQUENCIES
+from pipeline.errors import ConfigError
+from pipeline.experiments.plan import Plan, Recording
+from pipeline.experiments.plan_file import add_recordings, recording_problems
+from pipeline.experiments.propose import EDGES, current_plan, let_go
+from pipeline.submission import Submission, load_submission
+
+RecordingKind = Literal["step", "sweep", "sine", "decay"]
+KINDS: tuple[RecordingKind, ...] = get_args(RecordingKind)
+
+_WAVES: dict[RecordingKind, Literal["square", "chirp", "sine"]] = {
+    "step": "square",
+    "sweep": "chirp",
+    "sine": "sine",
+}
+_SHORTEST = 1.0  # s
+# s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
+_LONGEST = 120.0
+_ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, whatever their product rounds to
+# The numbers that say what one of a kind is, as keys of plan.toml, and what else they are called.
+NEEDED: dict[RecordingKind, tuple[str, ...]] = {
+    "step": ("amplitude",),
+    "sweep": ("amplitude", "frequency", "frequency_end"),
+    "sine": ("amplitude", "frequency"),
+    "decay": (),
+}
+TYPED = {"frequency_end": "to"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WantedRecording:
+    """The few numbers in which a person says what to record.
+
+    Attributes
+    ----------
+    seconds : that it lasts, 1 to 120; made whole periods of a dwell or sweep.
+    amplitude : input units.
+    frequency, frequency_end : Hz, of a dwell, or from where to where a sweep goes.
+    cart : that is let go, of a decay.
+    """
+
+    kind: RecordingKind
+    seconds: float
+    amplitude: float = 0.0
+    frequency: float = 0.0
+    frequency_end: float | None = None
+    cart: int = 1
+
+
+def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
+    """Return the recording, all carts free unless one is let go; it rests as the plan's others do.
+
+    Raises
+    ------
+    ConfigError : it is no recording that the limits of the plan allow; says which number, and why.
+    """
+    kind, seconds = wanted.kind, wanted.seconds
+    everyone = tuple(range(1, submission.system.carts + 1))
+    low, high = FREQUENCIES
+    if not _SHORTEST <= seconds <= _LONGEST:
+        expected = f"{_SHORTEST:g} to {_LONGEST:g} s"
+        raise ConfigError(
+            f"how long: expected {expected}, found {seconds:g}; plan.toml takes longer ones"
+        )
+    named = {"frequency": wanted.frequency, "frequency_end": wanted.frequency_end or 0.0}
+    for key in [key for key in named if key in NEEDED[kind]]:
+        if not low <= named[key] <= high:
+            name = TYPED.get(key, key)
+            raise ConfigError(f"{name}: expected {low:g} to {high:g} Hz, found {named[key]:g}")
+    if kind == "decay":
+        made = let_go(wanted.cart, name=f"decay-{wanted.cart}", seconds=seconds)
+    else:
+        driven = [one.settle for one in plan.recordings if one.amplitude]
+        cycles = _count_periods(seconds, wanted.frequency) if kind != "step" else EDGES // 2
+        made = Recording(
+            id=f"{kind}-1",
+            kind=kind,
+            carts=everyone,
+            wave=_WAVES[kind],
+            amplitude=wanted.amplitude,
+            frequency=wanted.frequency if kind != "step" else cycles / seconds,
+            frequency_end=wanted.frequency_end if kind == "sweep" else None,
+            cycles=cycles,
+            settle=driven[-1] if driven else 5.0,  # s, where the plan has nothing to go by
+        )
+    for key, what in recording_problems(made, plan.limits, submission.system):
+        raise ConfigError(f"{TYPED.get(key, key)}: {what}")
+    return made
+
+
+def _count_periods(seconds: float, frequency: float) -> int:
+    """Return how many whole periods last so long or a little longer, or as long as may be."""
+    most = floor(_LONGEST * frequency * (1 + _ROUNDING))
+    if not most:
+        raise ConfigError(
+            f"frequency: expected at least {1 / _LONGEST:.2g} Hz, of which a period fits into "
+            f"{_LONGEST:g} s, found {frequency:g}"
+        )
+    return min(ceil(seconds * frequency * (1 - _ROUNDING)), most)
+
+
+def add_recording(folder: Path, recording: Recording) -> Recording:
+    """Put a recording at the end of a submission's plan; return it with the id it has there.
+
+    Raises
+    ------
+    ConfigError : the plan is broken; nothing is written then.
+    """
+    plan = current_plan(load_submission(folder))
+    return add_recordings(folder, [recording], otherwise=plan).recordings[-1]

@@ -1,0 +1,358 @@
+"""Which experiment tells two explanations apart: where they differ most, whatever either is fitted.
+
+T-optimal: what counts of the difference of two predictions is what is left of it when the other
+model's parameters, as far as all earlier records let them go, its start and the encoders' zeros
+have done what they can. Of several models each pair counts by the product of their probabilities,
+which bounds the expected fall of entropy.
+
+References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box,
+W. J. Hill, Technometrics 9 (1967), 57-71.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from math import ceil
+from typing import Literal
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import DataError, PipelineError
+from pipeline.experiments.information import sampled_input
+from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.experiments.propose import (
+    FURTHEST,
+    current_plan,
+    let_go,
+    rounded,
+    rounded_down,
+)
+from pipeline.gap.limits import CLOSE_BIC, THINNING
+from pipeline.gap.types import Gap, Prediction, Proposal
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.dwells import SETTLED, settling_wait
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.simulator import sensitivity
+from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
+from pipeline.submission import Submission
+
+Kind = Literal["step", "sweep"]
+Shape = Literal["square", "triangle", "chirp"]
+
+_PERIOD = 5e-3  # s from sample to sample, of which a cycle has some
+_PER_CYCLE, _BEYOND = 10, 2.0  # … and at least so many times the highest resonance is looked to
+_TIME = 12.0  # s of a record, about …
+_LONGEST = 4  # … and times that, where it would not settle the two that it tells apart best
+_STEP = 1e-3  # relative, of an effect's parameter for a difference
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
+_DECIDED = CLOSE_BIC * THINNING  # square sum that settles two
+_LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
+_SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Weighed:
+    """What a recording is worth, and the two models that it tells apart best, by how much."""
+
+    worth: tuple[float, float]
+    recording: Recording
+    pair: tuple[int, int]
+    told: float
+    t: Array
+    u: Array
+    predicted: Array
+
+
+def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
+    """Return the gap with a proposal within the limits of the submission's plan.
+
+    It resembles none of those it is to be `without`. Where none can be made, for a spoilt plan.toml
+    say, a note says why: the gap stays what it is.
+    """
+    try:
+        return with_proposal(gap, limits=current_plan(submission).limits, without=without)
+    except PipelineError as error:
+        return replace(gap, notes=(*gap.notes, f"no recording is proposed: {error}"))
+
+
+def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] = ()) -> Gap:
+    """Return the gap with the recording that tells its contenders apart best, if it has two.
+
+    Raises
+    ------
+    DataError : the carts never settle.
+    """
+    gap = replace(gap, proposal=None)
+    models = list(gap.contenders)
+    if len(models) < 2 or not all(model.chain.is_tied for model in models):
+        return gap
+    weight = np.array([one.weight for one in gap.contenders])
+    weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
+    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the one chosen, whatever the criterion prefers
+    if np.count_nonzero(weight) < 2:
+        return gap
+    sigma, pinned = _noise(gap), _pinned(gap)
+
+    def weighed(recording: Recording, height: float) -> _Weighed | None:
+        found = _tell_apart(models, recording, height, sigma=sigma, pinned=pinned)
+        if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
+            return None
+        told, t, u, predicted = found
+        counted = np.outer(weight, weight)
+        score = counted * told
+        i, j = divmod(int(np.argmax(score)), len(models))
+        return _Weighed(
+            # First as many pairs as can be are settled; then the further apart the better.
+            worth=(float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())),
+            recording=recording,
+            pair=(i, j),
+            told=float(told[i, j]),
+            t=t,
+            u=u,
+            predicted=predicted,
+        )
+
+    options = [
+        weighed(recording, height)
+        for recording, height in _candidates(models[0].chain, limits)
+        if not any(recording.resembles(other) for other in without)
+    ]
+    best = max((one for one in options if one), key=lambda one: one.worth, default=None)
+    if best is None or best.worth <= (0.0, 0.0):
+        return gap
+    if best.told < _DECIDED and not best.recording.release:
+        times = min(_LONGEST, ceil(_DECIDED / best.told))
+        longer = {"cycles": times * best.recording.cycles}
+        best = weighed(best.recording.model_copy(update=longer), 0.0) or best
+    return replace(gap, proposal=_propose(best, limits))
+
+
+def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
+    """Return a recording as a gap proposes it, with the cart on which the two differ most."""
+    one, other = best.pair
+    cart = int(np.argmax(np.abs(best.predicted[one] - best.predicted[other]).max(axis=1)))
+    return Proposal(
+        recording=best.recording.model_dump(mode="json", exclude_defaults=True),
+        limits=limits.model_dump(),
+        separation=float(np.sqrt(best.told / (best.t.size * len(best.recording.carts)))),
+        prediction=Prediction(
+            pair=best.pair, cart=cart + 1, t=best.t, u=best.u, positions=best.predicted[:, cart]
+        ),
+    )
+
+
+def _noise(gap: Gap) -> Array:
+    """Return the noise (n,) of each cart, from its runs: what the floor is a share of."""
+    floor = {(row.experiment, row.cart): row.noise_floor for row in gap.by_record}
+    found: dict[int, list[float]] = {}
+    for trace in gap.traces:
+        share = floor.get((trace.experiment, trace.cart), gap.noise_floor)
+        rms = float(np.sqrt(np.mean((trace.measured - trace.zero) ** 2)))
+        found.setdefault(trace.cart, []).append(share * rms)
+    typical = float(np.median(np.concatenate(list(found.values()))))
+    n = gap.linear.chain.n
+    return np.array([np.median(found.get(cart, [typical])) for cart in range(1, n + 1)])
+
+
+def _pinned(gap: Gap) -> Array:
+    """Return how far the records still let each parameter of the chain go, as `_predict` has it."""
+    chain = gap.model.chain
+    return np.array(
+        [
+            # Each standard error is of one explanation: a parameter may be off by three.
+            3.0 * gap.chain_std.get(f"{letter}_{i + 1}", np.inf)
+            for letter, values in (("m", chain.m), ("c", chain.c), ("k", chain.k))
+            for i in np.flatnonzero(values).tolist()
+        ]
+    )
+
+
+# ------------------------------------------------------------------------- what is weighed
+
+
+def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
+    """Steps to either side, triangles and chirps in several sizes, each cart let go at heights.
+
+    With each the height (position units) at which its cart is let go, 0 where none is.
+    """
+    resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    everyone = tuple(range(1, chain.n + 1))
+    slow, low, high, fastest = (
+        rounded(float(f))
+        for f in (
+            1.5 / _TIME,
+            0.5 * resonances[0],
+            1.3 * resonances[-1],
+            max(_BEYOND * resonances[-1], 1 / (_PER_CYCLE * _PERIOD)),
+        )
+    )
+    waves: tuple[tuple[Shape, Kind, float, float | None], ...] = (
+        ("square", "step", slow, None),
+        ("square", "sweep", rounded(float(resonances[0])), None),
+        ("triangle", "sweep", slow, None),
+        ("triangle", "sweep", rounded(float(resonances[0])), None),
+        ("chirp", "sweep", low, high),
+        # Carts move little up there, under all that the motor gives: what is late or soft shows.
+        ("chirp", "sweep", high, fastest),
+        ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
+    )
+    for wave, kind, f, end in waves:
+        whole = Recording(
+            id=f"apart-{wave}",
+            kind=kind,
+            carts=everyone,
+            wave=wave,
+            amplitude=1.0,
+            frequency=f,
+            frequency_end=end,
+            cycles=ceil(_TIME * f),
+            settle=settle,
+            aim="gap",
+        )
+        t, u = sampled_input(whole, period=_PERIOD)
+        reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
+        largest = min(FURTHEST * limits.travel / reach, limits.input)
+        # Laws differ in how they grow with the motion.
+        for size in (1.0, 0.5, 0.2):
+            for sign in (1, -1) if wave == "square" else (1,):
+                amplitude = sign * rounded_down(size * largest)
+                yield whole.model_copy(update={"amplitude": amplitude}), 0.0
+    for cart in everyone:
+        if chain.k[cart - 1] + chain.k[cart] <= 0:
+            continue
+        for share in (0.6, 0.2):  # of the travel limit, from where a hand lets go
+            height = rounded(share * limits.travel)
+            release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
+            note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
+            yield release.model_copy(update={"note": note, "aim": "gap"}), height
+
+
+def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
+    """Return the sweep through the resonances that swings the carts as far as they may go."""
+    every = (recording for recording, _ in _candidates(chain, limits))
+    return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
+
+
+# ------------------------------------------------------------------------- how far apart
+
+
+def _tell_apart(
+    models: Sequence[AugmentedChain],
+    recording: Recording,
+    height: float,
+    *,
+    sigma: Array,
+    pinned: Array,
+) -> tuple[Array, Array, Array, Array] | None:
+    """Return (models, models) what separates each two, times, input and predictions.
+
+    A separation is the square sum over the noise that neither model can take up; None where the
+    motion of a model cannot be had.
+    """
+    t, u = sampled_input(recording, period=_PERIOD)
+    u = recording.amplitude * u
+    x0 = height * np.eye(sigma.size)[recording.release - 1] if recording.release else None
+    try:
+        moved = [_predict(model, t, u, recording, x0) for model in models]
+    except DataError:
+        return None
+    predicted = np.array([x for x, _ in moved])
+    free = [cart - 1 for cart in recording.carts]
+    told = np.zeros((len(models), len(models)))
+    for i, j in combinations(range(len(models)), 2):
+        if not u.any() and _need_input(models[i], models[j]):
+            continue
+        difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
+        told[i, j] = min(
+            _left(difference, (by / sigma[:, None])[:, free], pinned)
+            for _, by in (moved[i], moved[j])
+        )
+    return told, t, u, predicted
+
+
+def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
+    """Do two models differ in nothing but what acts on an input, a lag for a delay, say?
+
+    What still parts their free motions is chance: a contact bounces otherwise in either.
+    """
+    mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
+    lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
+    return all(term.effect.needs_input for term in lone)
+
+
+def _left(difference: Array, by: Array, pinned: Array) -> float:
+    """Return the square sum of a difference (n,) that changes of the parameters leave.
+
+    Those of the chain, the first ones, are `pinned` (n_p,) by all earlier records: a change by so
+    much costs one.
+    """
+    columns = by.reshape(len(by), -1).T
+    held = np.zeros((pinned.size, len(by)))
+    np.fill_diagonal(held, 1.0 / pinned)
+    columns, difference = np.vstack([columns, held]), np.append(difference, np.zeros(pinned.size))
+    size = np.linalg.norm(columns, axis=0)
+    columns = columns / np.maximum(size, _SAME * size.max())
+    U, s, _ = np.linalg.svd(columns, full_matrices=False)
+    U = U[:, s > _SAME * s[0]]
+    rest = difference - U @ (U.T @ difference)
+    return float(rest @ rest)
+
+
+def _predict(
+    model: AugmentedChain, t: Array, u: Array, recording: Recording, x0: Array | None
+) -> tuple[Array, Array]:
+    """Return the readings (n, samples), and their derivatives (., n, samples) by what is free.
+
+    By every parameter of the chain and its effects, the start of a cart let go, the zeros.
+    """
+    n, k = model.chain.n, model.chain.k
+    variants = [model, *_changed(model)]
+    # A constant force or cogging holds the carts elsewhere where it, or a spring, is another.
+    stiffer = [
+        replace(model, chain=replace(model.chain, k=k * (1 + _STEP * (np.arange(n + 1) == j))))
+        for j in np.flatnonzero(k)
+    ]
+    start, by_spring = (
+        np.array([rest_positions(one, free=recording.carts) if x0 is None else x0 for one in some])
+        for some in (variants, stiffer)
+    )
+    by_spring = (by_spring - start[0]) / (_STEP * k[k != 0.0, None])
+    of = [
+        (kind, i)
+        for kind, values in (
+            (sensitivity.BY_MASS, model.chain.m),
+            (sensitivity.BY_DAMPING, model.chain.c),
+            (sensitivity.BY_STIFFNESS, k),
+        )
+        for i in np.flatnonzero(values).tolist()
+    ]
+    shared = len(of)
+    of += [(sensitivity.BY_POSITION, i) for i in range(n)]
+    still, alike = np.zeros((1, n)), np.ones(n)
+    y, by_chain = simulate(
+        [(variant.tables(), StartState(x0[None], still, alike))
+         for variant, x0 in zip(variants, start, strict=True)],
+        describe_run(t, u, free=np.isin(np.arange(1, n + 1), recording.carts)),
+        of=np.array(of).T,
+    )  # fmt: skip
+    by_chain, by_start = by_chain[:shared], by_chain[shared:]
+    by_chain[shared - len(stiffer) :] += np.tensordot(by_spring, by_start, axes=1)
+    by_start = by_start[recording.release - 1 :][:1] if recording.release else by_start[:0]
+    by_effects = (y[1:] - y[0]) / _STEP
+    zeros = np.repeat(np.eye(n)[:, :, None], t.size, axis=2)
+    x = simulate_augmented(model, t, u, free=recording.carts, x0=start[0])
+    return x, np.concatenate([by_chain, by_start, by_effects, zeros])
+
+
+def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
+    """Yield the model with each parameter of an effect a little larger."""
+    for at, term in enumerate(model.terms):
+        for i, value in enumerate(term.values):
+            moved = (*term.values[:i], value * (1 + _STEP), *term.values[i + 1 :])
+            new = EffectTerm(effect=term.effect, place=term.place, values=moved)
+            terms = (*model.terms[:at], new, *model.terms[at + 1 :])
+            yield replace(model, terms=terms)

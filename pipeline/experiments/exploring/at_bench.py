@@ -1,0 +1,75 @@
+"""An exploration of a bench on a line, which people watch and steer."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pipeline.bench.host.acquire import acquire, ensure_plan
+from pipeline.bench.host.serial_line import Runaway
+from pipeline.bench.host.signals import Stopped
+from pipeline.bench.live.observer import Buttons, Observer, Observers
+from pipeline.experiments.exploring.error_goal import ErrorGoal
+from pipeline.experiments.exploring.exploration import Exploration, Recorded
+from pipeline.experiments.plan import Recording
+from pipeline.experiments.plan_words import session_time
+from pipeline.report.exploration.diary import Turn
+from pipeline.submission.load import NAME
+from pipeline.words.text import with_symbols
+
+
+def explore_bench(
+    folder: Path,
+    *,
+    port: str,
+    observers: Sequence[Observer],
+    buttons: Buttons | None,
+    goal: ErrorGoal,
+    seconds: float,
+    vetoes: Callable[[Recording], bool] = lambda recording: False,
+) -> tuple[Turn, ...]:
+    """Explore the bench at a port; return what was known turn by turn.
+
+    Parameters
+    ----------
+    observers, buttons : see `acquire`; "skip" vetoes a recording that was chosen, before it begins
+        or while it goes on, and "stop" ends the exploration, also while it thinks.
+    goal, seconds, vetoes : see `Exploration`.
+
+    Raises
+    ------
+    Stopped : a signal or a button ended it.
+    HardwareError, ConfigError, DataError : see `acquire` and `Exploration`.
+    """
+    everyone, buttons = Observers(observers), buttons or Buttons()
+
+    def record(ids: Sequence[str]) -> Recorded:
+        outcomes = acquire(folder, port=port, observers=observers, only=ids, buttons=buttons)
+        if astray := [o.partial for o in outcomes if o.is_astray]:
+            raise Runaway(f"{astray[-1]}; the exploration ends here")
+        made = tuple(o.recording.id for o in outcomes if not o.partial)
+        tried = [o.recording for o in outcomes if o.lines]
+        skipped = any(o.wish == "skip" for o in outcomes)
+        ends = dict.fromkeys(o.partial for o in outcomes if o.partial)
+        return Recorded(
+            ids=made,
+            seconds=session_time(tried),
+            vetoed=skipped and not made,
+            why="; then ".join(ends),
+        )
+
+    def think(stage: str) -> None:
+        if buttons.pressed == "stop":
+            raise Stopped("by hand")
+        everyone.thinking(stage)
+
+    if (folder / NAME).exists():
+        ensure_plan(folder, port=port)
+    exploration = Exploration(
+        folder=folder,
+        record=record,
+        goal=goal,
+        seconds=seconds,
+        tell=lambda sentence: everyone.thought(with_symbols(sentence)),
+        progress=think,
+        vetoes=vetoes,
+    )
+    return exploration.run()

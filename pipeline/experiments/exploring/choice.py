@@ -1,0 +1,99 @@
+"""Which recording an exploration makes next, and why."""
+
+import json
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.experiments.discriminate import far_sweep
+from pipeline.experiments.exploring.turn_words import WORDS, name_model
+from pipeline.experiments.next_recordings import choose_next
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.propose import FURTHEST, identified_chain, large_steps
+from pipeline.gap.types import Gap
+from pipeline.results import Analysis
+
+SETTLED = ("named", "none")
+# Noises squared, times seconds: explanations that no recording sets further apart stay in dispute.
+# Read 200 times a second, of which every tenth reading is news, the criterion would differ by 20.
+_APART = 1.0
+_HARD = 0.8  # of what takes the carts as far as they may go: as good as that
+_FAR_OUT = "far"  # the aim of what shows what acts far out
+
+
+def choose_recording(
+    analysis: Analysis,
+    gap: Gap | None,
+    plan: Plan,
+    *,
+    missing: dict[str, float],
+    refused: Sequence[Recording],
+    commands: frozenset[str],
+) -> tuple[Recording | None, str]:
+    """Return what to record next and why; None where all is known, or nothing would help.
+
+    First what tells explanations apart, then what makes the worst parameter better known, then
+    what shows what acts far out.
+
+    Parameters
+    ----------
+    missing : the parameters that are not known well enough, with their relative errors.
+    refused : nothing that resembles one of these.
+    commands : the extensions of the protocol that the bench knows.
+    """
+    named = gap is None or gap.verdict in SETTLED
+    # A name that leaves more than noise is one of its contenders still.
+    settled = gap is None or (named and not gap.contenders)
+    end = "" if named else WORDS.text("undecided")
+    decides = gap and gap.proposal
+    told = decides and decides.prediction
+    if gap and decides and told and decides.separation**2 * told.t[-1] > _APART:
+        recording = Recording.model_validate_json(json.dumps(decides.recording))
+        disputed = [name_model(one) for one in gap.contenders]
+        names = " and ".join(f'"{disputed[i]}"' for i in told.pair)
+        return recording, WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
+    if missing and named:
+        worst = max(missing, key=lambda name: missing[name])
+        # What is open was refused, or is the next to be chosen: it tells nothing yet.
+        made = plan.model_copy(update={"recordings": ()})
+        try:
+            found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
+        except DataError as error:  # the large step is left
+            end = str(error)
+        else:
+            return found.recordings[0], found.said
+    # Each once: carts that something holds back go no further the second time.
+    recorded = {record.id for record in analysis.records}
+    tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
+    for recording, unseen in _reach_far_out(analysis, plan.limits):
+        alike = any(
+            recording.resembles(other) or (other.kind, other.aim) == (recording.kind, _FAR_OUT)
+            for other in tried
+        )
+        if not alike and (unseen or not settled):
+            why = unseen if settled else WORDS.text("as_far")
+            return recording.model_copy(update={"aim": _FAR_OUT}), why
+    return None, end
+
+
+def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
+    """Yield what shows what acts far out, with what has not been seen so far: "", all has.
+
+    A step as large as the carts may rest, and a sweep that swings them to both sides.
+    """
+    chain = identified_chain(analysis)
+    driven = [record for record in analysis.records if record.kind in ("step", "sweep")]
+    inputs = [float(np.abs(record.u).max()) for record in driven if record.u is not None]
+    hardest = max(inputs, default=0.0)
+    furthest = min(
+        max((float((side * y).max()) for record in driven for y in record.y), default=0.0)
+        for side in (1, -1)
+    )
+    step, swing = large_steps(chain, limits)[0], far_sweep(chain, limits)
+    unit = analysis.bench.units.input
+    words = WORDS.text("far_step", most=f"{hardest:.2g}", unit=unit)
+    yield step, words if hardest < _HARD * abs(step.amplitude) else ""
+    unit = analysis.bench.units.position
+    words = WORDS.text("far_swing", most=f"{furthest:.2g}", unit=unit)
+    yield swing, words if furthest < _HARD * FURTHEST * limits.travel else ""

@@ -1,0 +1,314 @@
+"""Record, identify, look for the gap, choose, record: until it is known, or time is up."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bench.host.raw import known_commands
+from pipeline.errors import ConfigError, DataError
+from pipeline.estimation.chain.parametrisation import named_estimates
+from pipeline.experiments.by_hand import add_recording
+from pipeline.experiments.discriminate import propose_for
+from pipeline.experiments.exploring.choice import SETTLED, choose_recording
+from pipeline.experiments.exploring.error_goal import ErrorGoal
+from pipeline.experiments.exploring.turn_words import (
+    WORDS,
+    list_explanations,
+    relative_errors,
+    tell_doubt,
+    tell_known,
+)
+from pipeline.experiments.goal import GAP
+from pipeline.experiments.plan import Recording
+from pipeline.experiments.plan_file import load_plan, plan_path, save_plan
+from pipeline.experiments.plan_words import session_time, time_words
+from pipeline.experiments.propose import FIRST_SWEEP_TIME, propose_plan
+from pipeline.gap.explain import investigate
+from pipeline.gap.types import Gap
+from pipeline.json_files import json_text
+from pipeline.names import parameter_names
+from pipeline.output import own_folder, write_file
+from pipeline.report.exploration.diary import Turn, write_diary
+from pipeline.results import Analysis, Stage
+from pipeline.submission import System, load_submission
+from pipeline.submission.load import NAME
+from pipeline.submission.models import MOST_CARTS
+from pipeline.words.progress import Progress, silent
+from pipeline.workflow import analyse
+
+_FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
+_SEARCH = 300.0  # s that a look for the gap may take; most take ten
+_OFTEN = 2  # times that one recording is to tell explanations apart, before another has its turn
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recorded:
+    """What came off of the recordings asked for.
+
+    Attributes
+    ----------
+    ids : of what was recorded.
+    seconds : that all tries took.
+    vetoed : somebody at the bench did not want what is not there.
+    why : else, what became of it, as far as that is known.
+    """
+
+    ids: tuple[str, ...]
+    seconds: float
+    vetoed: bool = False
+    why: str = ""
+
+
+@dataclass(kw_only=True)
+class Exploration:
+    """A bench that is explored into a submission, turn by turn.
+
+    The submission, gap/gap.json and the diary stand in its folder after each turn, so whatever
+    ends it leaves them as they were. A recording that somebody adds to plan.toml meanwhile comes
+    before what would be chosen.
+
+    Attributes
+    ----------
+    record : carries out recordings of the plan by their ids; the first call makes submission and
+        plan where there are none.
+    goal : how well what is to be known.
+    seconds : at the bench, rests included; no recording is begun that would go beyond. One that is
+        broken off counts each time it is tried.
+    tell : takes a sentence at each turn.
+    progress : takes a few words, often, while the data are asked; what it raises ends the
+        exploration.
+    vetoes : whether somebody does not want what was chosen; another is chosen then.
+    turns : what was known, turn by turn.
+    made, spent : what was recorded since the last turn, and the time at the bench, s.
+    ours : ids of the plan that nobody has added; what else is open there, somebody has.
+    refused : recordings that were vetoed or did not come off.
+    asked : recordings that were to decide between explanations, and are there.
+    lost : what became of the last one chosen, where it is not there.
+    failures : how many in a row did not come off.
+    """
+
+    folder: Path
+    record: Callable[[Sequence[str]], Recorded]
+    goal: ErrorGoal
+    seconds: float
+    tell: Progress
+    progress: Progress = silent
+    vetoes: Callable[[Recording], bool] = lambda recording: False
+    turns: list[Turn] = field(default_factory=list)
+    made: tuple[str, ...] = ()
+    spent: float = 0.0
+    ours: set[str] = field(default_factory=lambda: {_FIRST})
+    refused: list[Recording] = field(default_factory=list)
+    asked: list[Recording] = field(default_factory=list)
+    lost: str = ""
+    failures: int = 0
+
+    def run(self) -> tuple[Turn, ...]:
+        """Explore until all is known, nothing would help or time is up; return the turns.
+
+        Raises
+        ------
+        DataError : the first recordings do not identify the carts.
+        ConfigError : the goal is for a parameter that such carts do not have, or the first sweep
+            alone takes longer than is allowed.
+        """
+        self._begin()
+        self._look()
+        while (recording := self._take_turn()) is not None:
+            self._try_out(recording)
+        return tuple(self.turns)
+
+    def _begin(self) -> None:
+        """Make the first runs where nothing is recorded, if the goal can be met at all."""
+        submission = load_submission(self.folder) if (self.folder / NAME).exists() else None
+        self._check_goal(submission and submission.system)
+        known = submission is not None and bool(submission.experiments)
+        planned = submission is not None and plan_path(submission).exists()
+        first = FIRST_SWEEP_TIME
+        if submission and planned:
+            plan = load_plan(submission)
+            self.ours.update(one.id for one in plan.recordings)
+            first = session_time([one for one in plan.recordings if one.id == _FIRST])
+        if not known:
+            if first > self.seconds:
+                raise ConfigError(
+                    f"--time: the first sweep takes {time_words(first)}, "
+                    f"{time_words(self.seconds)} are allowed"
+                )
+            self._record([_FIRST])
+        submission = load_submission(self.folder)
+        usual = propose_plan(submission)
+        if not plan_path(submission).exists():
+            save_plan(usual, submission)
+        if not planned:
+            self.ours.update(one.id for one in usual.recordings)
+        if not known:
+            recordings = load_plan(submission).recordings
+            steps = [one for one in recordings if one.kind == "step" and not one.release]
+            if steps and self._has_time_for(steps):
+                self._record([step.id for step in steps])
+
+    def _check_goal(self, system: System | None) -> None:
+        """Refuse a goal that no such carts can meet; None: nobody has said how many there are."""
+        if system:
+            names = parameter_names(system.carts, rigid=not system.bench.tied)
+        else:
+            of_any = (name for n in range(1, MOST_CARTS + 1) for name in parameter_names(n))
+            names = (*parameter_names(1, rigid=True), *of_any)
+        self.goal.missing(dict.fromkeys(names))
+
+    def _record(self, ids: Sequence[str]) -> Recorded:
+        came = self.record(ids)
+        self.made += came.ids
+        self.spent += came.seconds
+        return came
+
+    def _has_time_for(self, recordings: Sequence[Recording]) -> bool:
+        return self.spent + session_time(recordings) <= self.seconds
+
+    def _look(self) -> None:
+        """Identify the carts and look for the gap, as the data stand now."""
+        analysis = analyse(load_submission(self.folder), progress=self.progress)
+        self.gap: Gap | None = None
+        try:
+            self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
+        except DataError as error:
+            self.tell(f"the gap cannot be looked for: {error}")
+        self._propose(analysis)
+        self.analysis = _identify_beside(analysis, self.gap)
+
+    def _propose(self, analysis: Analysis) -> None:
+        """Find what would decide between the explanations, and keep it in gap.json."""
+        if self.gap is None:
+            return
+        often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
+        without = [*self.refused, *often]
+        self.gap = propose_for(self.gap, load_submission(self.folder), without=without)
+        place = own_folder(self.folder, "gap")
+        place.mkdir(exist_ok=True)
+        write_file(place / "gap.json", json_text(self.gap))
+
+    def _take_turn(self) -> Recording | None:
+        """Tell what is known; return the recording to make next, which stands in the plan."""
+        self.progress("what to record next")
+        gap, errors = self.gap, relative_errors(self.analysis)
+        missing = self.goal.missing(errors)
+        recording, why = self._choose(missing)
+        doubt = tell_doubt(gap) if gap else WORDS.text("no_look")
+        if gap and not gap.complete:
+            doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
+        parts = [tell_known(missing, errors), doubt, why or WORDS.text("the_end")]
+        said, but = "; ".join(filter(None, parts)), ""
+        if recording and not self._has_time_for([recording]):
+            but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
+        elif recording and self.failures >= 3:  # in a row: it is not the choice of recording
+            but = WORDS.text("none_came", count=self.failures)
+        if but:
+            said, recording = f"{said}, but {but}", None
+        wanting = bool(but or (self.failures and not recording))  # what was still wanted
+        turn = Turn(
+            seconds=self.spent,
+            recorded=self.made,
+            errors=errors,
+            verdict=gap.verdict if gap else "",
+            explanations=list_explanations(gap) if gap else (),
+            left=gap.final if gap else None,
+            floor=gap.noise_floor if gap else None,
+            reached=not missing and not wanting and gap is not None and gap.verdict in SETTLED,
+            said=self.lost + said,
+            gap=gap,
+        )
+        self.turns.append(turn)
+        self.made = ()
+        write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)
+        self.tell(turn.said)
+        return recording
+
+    def _choose(self, missing: dict[str, float]) -> tuple[Recording | None, str]:
+        """Return the recording to make next as it stands in the plan, and why."""
+        plan, recording = load_plan(load_submission(self.folder)), None
+        try:
+            recording, why = choose_recording(
+                self.analysis,
+                self.gap,
+                plan,
+                missing=missing,
+                refused=self.refused,
+                commands=known_commands(self.folder),
+            )
+        except DataError as error:
+            why = str(error)
+        # After all that took its time: somebody may have chosen meanwhile.
+        submission = load_submission(self.folder)
+        done = {experiment.id for experiment in submission.experiments}
+        still = [one for one in load_plan(submission).recordings if one.id not in done]
+        if added := next((one for one in still if one.id not in self.ours), None):
+            return added, WORDS.text("added", name=added.id)
+        if recording is None:
+            return None, why
+        same = (
+            one for one in still if one.aim == recording.aim and _shape(one) == _shape(recording)
+        )
+        recording = next(same, None) or add_recording(self.folder, recording)
+        return recording, WORDS.text("therefore", name=recording.id, why=why)
+
+    def _try_out(self, recording: Recording) -> None:
+        """Record what was chosen and look again, or keep in mind that it was not to be had."""
+        self.ours.add(recording.id)
+        if self.vetoes(recording):
+            came = Recorded(ids=(), seconds=0.0, vetoed=True)
+        else:
+            came = self._record([recording.id])
+        if came.ids:
+            self.lost, self.failures = "", 0
+            if recording.aim == GAP:
+                self.asked.append(recording)
+            self._look()
+            return
+        self.refused.append(recording)
+        self.failures = 0 if came.vetoed else self.failures + 1
+        key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
+        values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
+        self.lost = WORDS.text(key, **values) + "; "
+        self._propose(self.analysis)  # which recording decides is open again
+
+
+def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
+    """Return the analysis with the carts as they are beside the effects that act on them.
+
+    Raises
+    ------
+    DataError : neither with effects nor without them the carts are identified.
+    """
+    fit, acting = analysis.fit, gap is not None and bool(gap.model.terms)
+    if fit is None or not (fit.converged or acting):
+        reasons = "; ".join(
+            one.reason for one in analysis.skipped if one.stage is Stage.FINAL_ESTIMATES
+        )
+        raise DataError(f"the carts are not identified: {reasons or 'see the report'}")
+    if gap is None or not acting:
+        return analysis
+    model, covariance = gap.model, gap.chain_covariance
+    if covariance is None or not model.chain.is_tied:
+        return analysis
+    names = tuple(gap.chain_std)
+    # What the linear chain leaves is no noise: the encoders' own is.
+    noise = {name: np.ones_like(left) for name, left in fit.standardised.items()}
+    parameters = named_estimates(model.chain, names=names, covariance=covariance, source="gap")
+    fit = replace(
+        fit,
+        chain=model.chain,
+        names=names,
+        covariance=covariance,
+        parameters=parameters,
+        standardised=noise,
+        converged=True,
+    )
+    return replace(analysis, fit=fit)
+
+
+def _shape(recording: Recording) -> str:
+    """Return what a recording is, whatever it is called."""
+    return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()

@@ -1,0 +1,324 @@
+"""The controller of a recording in the bench's own numbers, once it is known to do no harm there.
+
+The bench computes in duty counts and encoder counts, once a period, by the laws of
+`plant.loop.sampled_loop`: state feedback with velocities at constant velocity and one period of
+delay, PID without delay. A design has a sample time of its own and predicts with a model, so the
+loop is simulated as the bench will run it before any gain is sent.
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any, Self, TypeAlias
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.bench.protocol.messages import FULL_SCALE, Description, PidGains, StateGains
+from pipeline.errors import DataError
+from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
+from pipeline.identify.remarks import is_reversed
+from pipeline.plant.linear import step_response
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.robustness import stays_stable
+from pipeline.plant.loop.sampled_loop import (
+    Controller,
+    LoopSetup,
+    Pid,
+    StateFeedback,
+    discretise,
+    simulate_loop,
+)
+from pipeline.results import Analysis, FeedbackDesign
+from pipeline.submission import Design, Submission
+
+Table: TypeAlias = dict[str, Any]
+
+_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the carts' own stiffness that a proposed kp adds
+
+
+@dataclass(frozen=True, kw_only=True)
+class CountScales:
+    """What a count is in the submission's units.
+
+    Attributes
+    ----------
+    input : input units per duty count; negative where a positive duty drives cart 1 to negative x.
+    position : position units per encoder count.
+    """
+
+    input: float
+    position: float
+
+
+def bench_scales(submission: Submission, *, bench: Description, analysis: Analysis) -> CountScales:
+    """Return the scales the submission states, or else the bench; the sign as the data have it.
+
+    Raises
+    ------
+    DataError : a scale that neither states in the submission's unit.
+    """
+    stated = submission.system
+    for key, scale, unit in (
+        ("input", stated.input, bench.input_unit),
+        ("position", stated.position, bench.position_unit),
+    ):
+        if scale.per_count is None and scale.unit != unit:
+            raise DataError(
+                f"a loop needs to know what a count is: state system.{key}.per_count in "
+                f"{scale.unit}, the bench has it in {unit}"
+            )
+    if any(record.u is not None for record in analysis.records):
+        sign = -1 if is_reversed(analysis.records) else 1
+    else:
+        sign = stated.input.sign or 1
+    return CountScales(
+        input=sign * (stated.input.per_count or bench.input_per_count),
+        position=stated.position.per_count or bench.position_per_count,
+    )
+
+
+def bench_gains(
+    recording: Recording,
+    *,
+    submission: Submission,
+    analysis: Analysis,
+    bench: Description,
+    limits: PlanLimits,
+) -> StateGains | PidGains:
+    """Return what the bench is to be sent before a closed-loop recording starts.
+
+    What is wrong is said without the recording's name, which who tells of the recording gives.
+
+    Raises
+    ------
+    DataError : the carts are not identified; or on the bench the loop would be unstable, would
+        pass a limit, or would miss the goal of its design.
+    """
+    trial = _Trial.of(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    )
+    loop, per_count = recording.controller, trial.scales.position / trial.scales.input
+    if isinstance(loop, PidLoop):
+        trial.refuse_pid(loop)
+        return PidGains(kp=loop.kp, ki=loop.ki, kd=loop.kd)
+    if loop is None:
+        raise DataError("it has no controller")
+    law = _law(loop, analysis.feedback)
+    goal = None if loop.gains else submission.design or Design(cart=loop.cart)
+    trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
+    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders that no cart is tied to
+    return StateGains(
+        gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
+    )
+
+
+def propose_pid(
+    recording: Recording,
+    *,
+    submission: Submission,
+    analysis: Analysis,
+    bench: Description,
+    limits: PlanLimits,
+) -> PidLoop:
+    """Return gains on cart 1 for a bench that knows no other law: stiffer, damped, to the level.
+
+    A PID on a further cart soon swings up, on the one that the motor drives hardly ever.
+
+    Raises
+    ------
+    DataError : the carts are not identified, or no gains keep within the limits.
+    """
+    trial = _Trial.of(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    )
+    chain, counts = trial.chain, trial.scales.position / trial.scales.input
+    stiffness, slowest = 1 / chain.static_gains()[0], float(np.min(np.abs(chain.poles)))
+    refused = ""
+    for damped, share in product((True, False), _PID_SHARES):
+        kp = share * stiffness
+        # A damping ratio of 0.5, of all carts as one mass.
+        damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
+        loop = PidLoop(
+            kp=_typed(counts * kp),
+            ki=_typed(counts * kp * slowest * 0.25),  # the level comes slower than any pole
+            kd=_typed(counts * damping) if damped else 0.0,
+        )
+        try:
+            trial.refuse_pid(loop)
+        except DataError as error:
+            refused = str(error)
+        else:
+            return loop
+    raise DataError(f"no PID is proposed: {refused}")
+
+
+def controller_table(
+    gains: StateGains | PidGains, *, cart: int, scales: CountScales, carts: int
+) -> Table:
+    """Return what `controller` of the experiment in submission.toml is after these gains ran.
+
+    A PID's `scale` is for a data file in encoder counts.
+    """
+    if isinstance(gains, PidGains):
+        table = {"kp": gains.kp, "ki": gains.ki, "kd": gains.kd}
+        return {"type": "pid", **table, "scale": scales.input, "cart": cart}
+    per_unit = scales.input / scales.position
+    return {
+        "type": "state_feedback",
+        "gains": [_six_digits(per_unit * gain) for gain in gains.gains[: 2 * carts]],
+        "prefilter": _six_digits(per_unit * gains.prefilter),
+    }
+
+
+def _six_digits(value: float) -> float:
+    return float(f"{value:.6g}")
+
+
+def _typed(value: float) -> float:
+    return float(f"{value:.2g}")
+
+
+def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
+    """Return the gains the plan states, or those of the design, as the bench runs them."""
+    if loop.gains and loop.prefilter is not None:
+        return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
+    if design is None:
+        raise DataError("there is no controller to run; `cartlab report` says why")
+    if design.cart != loop.cart:
+        raise DataError(
+            f"the controller is designed for cart {design.cart}, the plan has cart "
+            f"{loop.cart}: change one, or state the gains"
+        )
+    return StateFeedback(gains=design.gains, prefilter=design.prefilter)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Trial:
+    """The step of a recording on the identified carts, as the bench will run it."""
+
+    recording: Recording
+    chain: Chain
+    period: float
+    scales: CountScales
+    limits: PlanLimits
+
+    @classmethod
+    def of(
+        cls,
+        recording: Recording,
+        *,
+        submission: Submission,
+        analysis: Analysis,
+        bench: Description,
+        limits: PlanLimits,
+    ) -> Self:
+        fit = analysis.fit
+        if fit is None or not fit.converged:
+            raise DataError("a loop is closed on identified carts only")
+        return cls(
+            recording=recording,
+            chain=fit.chain,
+            period=bench.period,
+            scales=bench_scales(submission, bench=bench, analysis=analysis),
+            limits=limits,
+        )
+
+    def refuse_state(
+        self, law: StateFeedback, *, cart: int, goal: Design | None, design: FeedbackDesign | None
+    ) -> None:
+        """Raise DataError where the loop is unstable, passes a limit or misses its goal."""
+        reference = self.recording.amplitude
+        if not stays_stable(self.chain, law, sample_time=self.period):
+            raise DataError(
+                f"with these gains the loop may be unstable at the bench's period of "
+                f"{1e3 * self.period:g} ms{self._advice(goal)}"
+            )
+        t, x = self._step(law, delay=1)
+        if goal is None or design is None:
+            return
+        y, judged = x[cart - 1], {"before": 0.0, "level": np.float64(reference)}
+        overshoot = float(step_response.overshoot_percent(y, **judged))
+        settling = float(step_response.settling_time(t, y, **judged))
+        # No encoder tells two counts of overshoot from its own flicker.
+        unseen = 100 * 2 * self.scales.position / abs(reference)
+        # A goal that the design itself cannot meet was said to be so in its report.
+        most = max(goal.overshoot_percent, design.overshoot_percent) + unseen
+        longest = max(goal.settling_time, design.settling_time or np.inf)
+        if overshoot > most or not settling <= longest + design.sample_time:
+            raise DataError(
+                f"on the bench the step would overshoot by {overshoot:.2g} % and settle in "
+                f"{settling:.2g} s, the design has {most:.2g} % and {longest:.2g} s"
+                f"{self._advice(goal)}"
+            )
+
+    def refuse_pid(self, loop: PidLoop) -> None:
+        """Raise DataError where the loop is unstable or passes a limit."""
+        if loop.cart > self.chain.n:
+            raise DataError(f"there is no cart {loop.cart} to control")
+        law = Pid(
+            kp=loop.kp,
+            ki=loop.ki,
+            kd=loop.kd,
+            scale=self.scales.input / self.scales.position,
+            cart=loop.cart,
+        )
+        radius = np.abs(np.linalg.eigvals(_pid_matrix(self.chain, law, period=self.period))).max()
+        if radius >= 1.0:
+            raise DataError(
+                f"with kp = {loop.kp:g}, ki = {loop.ki:g}, kd = {loop.kd:g} "
+                f"on cart {loop.cart} the loop is unstable"
+            )
+        self._step(law, delay=0)
+
+    def _advice(self, goal: Design | None) -> str:
+        if goal is None:
+            return ""
+        return f": set design.sample_time = {self.period:g} in submission.toml"
+
+    def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
+        """Return t (n,) and positions (n_carts, n) of the step; refuse one that passes a limit."""
+        run = self.recording
+        seconds = min(run.duration, 10.0)  # s that a simulated step is followed
+        motion = simulate_loop(
+            self.chain,
+            law,
+            t=np.arange(0.0, seconds, self.period),
+            reference=run.amplitude,
+            setup=LoopSetup(
+                sample_time=self.period,
+                delay=delay,
+                input_limit=FULL_SCALE * abs(self.scales.input),
+                encoder_step=self.scales.position,
+            ),
+        )
+        asked, reached = np.abs(motion.u).max(), np.abs(motion.x).max()
+        if asked > self.limits.input:
+            raise DataError(
+                f"the step takes an input of {asked:.3g}, the limit is "
+                f"{self.limits.input:g}: make the amplitude or the gains smaller"
+            )
+        if reached > self.limits.travel:
+            raise DataError(
+                f"the step moves a cart by {reached:.3g}, the travel limit is "
+                f"{self.limits.travel:g}: make the amplitude smaller"
+            )
+        return motion.t, motion.x
+
+
+def _pid_matrix(chain: Chain, pid: Pid, *, period: float) -> Array:
+    """Return the map of (x, ∫e, last e) from tick to tick without a reference or delay.
+
+    Without ki the integral does nothing and is left out: it would be an eigenvalue of one.
+    """
+    phi, gamma = discretise(chain, period)
+    row = np.zeros(gamma.size)
+    row[2 * (pid.cart - 1)] = 1.0
+    on_error = pid.kp + pid.ki * period + pid.kd / period
+    effort = pid.scale * np.array([*(-on_error * row), pid.ki, -pid.kd / period])
+    matrix = np.zeros((gamma.size + 2, gamma.size + 2))
+    matrix[:-2, :-2] = phi
+    matrix[:-2] += np.outer(gamma, effort)
+    matrix[-2, :-2], matrix[-2, -2] = -period * row, 1.0
+    matrix[-1, :-2] = -row
+    kept = np.arange(gamma.size + 2) != (gamma.size if pid.ki == 0 else -1)
+    return matrix[np.ix_(kept, kept)]

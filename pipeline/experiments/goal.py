@@ -1,0 +1,166 @@
+"""What a next experiment is to make better: one number of the parameters' covariance."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.information import Knowledge
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
+from pipeline.results import FeedbackDesign
+from pipeline.submission.complaints import nearest
+
+GAP = "gap"  # what tells the explanations of a gap apart
+DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
+_STEP = 1e-4  # relative change of a parameter, of which the loop's overshoot is a difference
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Goal:
+    """A standard error to make small: one, the largest of several, or their mean.
+
+    Attributes
+    ----------
+    name : as `--for` takes it.
+    words : what the number is, "the error of zeta_2".
+    rows : (k, n_p) derivatives of what is of interest by the relative parameters, as shares, of
+        the overshoot as shares of the step. One row: c-optimal.
+    mean : of several errors the "largest" (E-optimal in named parameters), the "root mean square"
+        (A-optimal) or the "volume" of the confidence region, as its mean radius (D-optimal).
+    """
+
+    name: str
+    words: str
+    rows: Array
+    mean: Literal["largest", "root mean square", "volume"] = "largest"
+
+    def of(self, told: Array) -> Array:
+        """Return the error (…,) that H and S (…, 2, n_p, n_p) leave; inf where they leave all."""
+        H, S = told[..., 0, :, :], told[..., 1, :, :]
+        if self.mean == "volume":
+            (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
+            log = np.where(sign > 0, of_s - 2 * of_h, np.inf)
+            return np.exp(log / (2 * H.shape[-1]))
+        variance = self._variances(H, S)
+        squares = variance.mean(-1) if self.mean == "root mean square" else variance.max(-1)
+        return np.sqrt(squares)
+
+    def _variances(self, H: Array, S: Array) -> Array:
+        try:
+            half = self.rows @ np.linalg.inv(H)
+        except np.linalg.LinAlgError:
+            return np.full((*H.shape[:-2], len(self.rows)), np.inf)
+        return np.einsum("...kp,...pq,...kq->...k", half, S, half)
+
+    def worst(self, told: Array) -> int:
+        """Return which of the rows is known worst."""
+        return int(np.argmax(self._variances(*told)))
+
+
+def check_goal(name: str, *, names: Sequence[str]) -> None:
+    """Refuse what is no goal for carts with parameters of these names.
+
+    Raises
+    ------
+    ConfigError : there is no such goal.
+    """
+    goals = [*names, DESIGN, WORST, MEAN, VOLUME]
+    if name not in goals:
+        raise ConfigError(f"--for {name}: there is no such parameter or goal{nearest(name, goals)}")
+
+
+def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
+    """Return the goal of a name: a parameter's, "design", "worst", "mean" or "volume".
+
+    Raises
+    ------
+    ConfigError : there is no such goal.
+    DataError : "design" without one.
+    """
+    values, rows = known.chain.parameters(), known.by_parameters()
+    check_goal(name, names=[*values])
+    if name == WORST:
+        return Goal(name=name, words="the error of the least known parameter", rows=rows)
+    if name == MEAN:
+        return Goal(
+            name=name, words="the mean error of all parameters", rows=rows, mean="root mean square"
+        )
+    if name == VOLUME:
+        return Goal(
+            name=name,
+            words="the mean error of masses, dampings and springs",
+            rows=rows,
+            mean="volume",
+        )
+    if name == DESIGN:
+        if feedback is None:
+            raise DataError("--for design: no controller is designed: add a [design] table first")
+        row = _by_overshoot(known, feedback)
+        return Goal(name=name, words="the error of the predicted overshoot", rows=row)
+    at = list(values).index(name)
+    return Goal(name=name, words=f"the error of {name}", rows=rows[at : at + 1])
+
+
+def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
+    """Return the derivative (1, n_p) of the loop's peak by the parameters, as share of the step.
+
+    The controller stays what it is and the carts turn out to be others.
+    """
+    P, chain = known.parametrisation, known.chain
+    controller = feedback.controller(chain)
+    t = feedback.t
+
+    def peak(chain: Chain) -> float:
+        loop = simulate_loop(
+            chain,
+            controller,
+            t=t,
+            reference=np.full(t.size, feedback.reference),
+            setup=LoopSetup(sample_time=feedback.sample_time),
+        )
+        return float(np.max(loop.x[feedback.cart - 1] * np.sign(feedback.reference)))
+
+    value, columns = P.physical(chain), []
+    for change in _STEP * known.size * np.eye(value.size):
+        up, down = (peak(P.chain(value + sign * change)) for sign in (1, -1))
+        columns.append((up - down) / (2 * _STEP * abs(feedback.reference)))
+    return np.array([columns])
+
+
+def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
+    """Return which `n` of the candidates (m, 2, n_p, n_p) leave the smallest error, the best first.
+
+    One may be taken several times. They are added one by one; then each in turn gives way to
+    whichever serves better in its place, until none does: the exchange algorithm.
+
+    Parameters
+    ----------
+    told : (2, n_p, n_p) what is known already.
+
+    References
+    ----------
+    V. V. Fedorov, Theory of Optimal Experiments, 1972, chapter 3; A. C. Atkinson, A. N. Donev,
+    R. D. Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 12.
+    """
+    enough = 1 - 1e-6  # of an error: a smaller gain is rounding
+    chosen: list[int] = []
+    total = told
+    for _ in range(n):
+        chosen.append(int(np.argmin(goal.of(total + candidates))))
+        total = total + candidates[chosen[-1]]
+    for _ in range(20):
+        before = float(goal.of(total))
+        for place, one in enumerate(chosen):
+            others = total - candidates[one]
+            left = goal.of(others + candidates)
+            best = int(np.argmin(left))
+            if left[best] < enough * left[one]:
+                chosen[place], total = best, others + candidates[best]
+        if float(goal.of(total)) >= enough * before:
+            break
+    alone = goal.of(told + candidates)
+    return tuple(sorted(chosen, key=lambda one: (alone[one], one)))

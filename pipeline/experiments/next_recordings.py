@@ -1,0 +1,286 @@
+"""`cartlab plan --next`: the experiments that bring most, and what each will bring."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import isclose
+from pathlib import Path
+
+import numpy as np
+from pydantic import ValidationError
+
+from pipeline.arrays import Array
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.candidates import propose_candidates
+from pipeline.experiments.goal import GAP, WORST, Goal, check_goal, choose, find_goal
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_file import add_recordings, plan_path
+from pipeline.experiments.plan_words import session_time, time_words
+from pipeline.experiments.propose import current_plan
+from pipeline.gap.types import read_gap
+from pipeline.ingest.read import read_data
+from pipeline.names import parameter_names
+from pipeline.plant.limits import CALIBRATION
+from pipeline.results import Analysis
+from pipeline.submission import Submission
+from pipeline.submission.toml_file import read_text
+from pipeline.words.numbers import count, first_few
+from pipeline.words.progress import Progress
+from pipeline.workflow import analyse
+
+_ALONE = 4  # recordings of the plan of which a sentence says what each would leave
+STATISTICAL = (
+    f"that counts the noise alone: no bench is calibrated better than to {100 * CALIBRATION:g} %"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class NextPlan:
+    """The experiments chosen, and the error expected after each.
+
+    Attributes
+    ----------
+    now : the error that `words` names, relative, by what is recorded.
+    errors : (n + 1,) the same once the open recordings of the plan are there too, and after each
+        more.
+    planned : what each open recording of the plan would leave by itself, by id.
+    separation : for "gap", of the two explanations that it tells apart best, in noises.
+    wrote : what became of plan.toml, in words.
+    doubt : why the errors do not hold, whatever is recorded; "": they do.
+    """
+
+    words: str
+    plan: Plan
+    path: Path | None
+    recordings: tuple[Recording, ...]
+    now: float = float("nan")
+    errors: tuple[float, ...] = ()
+    planned: dict[str, float] = field(default_factory=dict)
+    separation: float | None = None
+    wrote: str = ""
+    doubt: str = ""
+
+    @property
+    def said(self) -> str:
+        """What they bring, in one sentence."""
+        return "; ".join(self.sentences)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What they bring, and what to make of it."""
+        if self.separation is not None:
+            return (
+                f"{self.recordings[0].id} tells two explanations of the gap apart by "
+                f"{self.separation:.2g} times the noise",
+            )
+        these = "these are" if len(self.recordings) > 1 else "this one is"
+        done = "recorded"
+        steps = [f"{self.words}: ± {_percent(self.now)} now"]
+        if self.planned:
+            steps.append(f"± {_percent(self.errors[0])} once the plan so far is recorded")
+            done = "too"
+        steps.append(
+            f"± {_percent(self.errors[-1])} once {these} {done} "
+            f"({time_words(session_time(self.recordings))} at the bench)"
+        )
+        alone = [f"{name} alone ± {_percent(error)}" for name, error in self.planned.items()]
+        told = (
+            ", ".join(steps),
+            f"of the plan so far, {first_few(alone, _ALONE)}" if alone else "",
+            STATISTICAL if self.errors[-1] < CALIBRATION else "",
+            self.doubt,
+        )
+        return tuple(sentence for sentence in told if sentence)
+
+
+def plan_next(
+    submission: Submission,
+    *,
+    n: int,
+    goal: str = WORST,
+    commands: frozenset[str],
+    progress: Progress,
+) -> NextPlan:
+    """Choose the `n` next experiments of a submission and add them to its plan.toml.
+
+    Parameters
+    ----------
+    commands : the extensions of the protocol that the bench knows.
+
+    Raises
+    ------
+    DataError : the data recorded do not identify the carts, so nothing can be weighed.
+    ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
+    """
+    path = plan_path(submission)
+    old, new = current_plan(submission), not path.exists()
+    if goal == GAP:
+        if n != 1:
+            raise ConfigError(f"--for gap chooses one recording: expected --next 1, found {n}")
+        recording, separation = _decisive(submission, old.limits)
+        found = NextPlan(
+            words="gap", plan=old, path=path, recordings=(recording,), separation=separation
+        )
+        done = {experiment.id for experiment in submission.experiments}
+        open_ = [one for one in old.recordings if one.id not in done]
+        if not new and (there := next((o for o in open_ if o.resembles(recording)), None)):
+            return replace(found, recordings=(there,), wrote=f"{path}: has {there.id} already")
+    else:
+        system = submission.system
+        check_goal(goal, names=parameter_names(system.carts, rigid=not system.bench.tied))
+        progress("asking the data what they tell")
+        analysis = analyse(submission)
+        progress("weighing the next experiments")
+        found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
+        found = replace(found, path=path, doubt=_doubt(analysis, submission.folder))
+    plan = add_recordings(submission.folder, found.recordings, otherwise=old)
+    wrote = f"{path}: {count(n, 'recording')} added"
+    if new and old.recordings:
+        usual = count(len(old.recordings), "recording")
+        wrote = f"wrote {path}: the {usual} that a bench begins with, and {n} chosen beside"
+    return replace(found, plan=plan, recordings=plan.recordings[-n:], wrote=wrote)
+
+
+def _doubt(analysis: Analysis, folder: Path) -> str:
+    """Return that the errors count noise, where more than noise is left."""
+    fit = analysis.fit
+    if fit is None or fit.explains_data:
+        return ""
+    return (
+        f"the linear carts leave more than the noise (χ² per degree of freedom "
+        f"{fit.chi_square_per_dof:.3g}), so that parameters may be off by more than these errors: "
+        f"`cartlab gap {folder}` looks for what else acts"
+    )
+
+
+def choose_next(
+    analysis: Analysis,
+    plan: Plan,
+    *,
+    n: int,
+    goal: str,
+    commands: frozenset[str],
+    without: Sequence[Recording] = (),
+) -> NextPlan:
+    """Choose the `n` next experiments, each with the error expected once it is there.
+
+    Parameters
+    ----------
+    without : nothing that resembles one of these.
+
+    Raises
+    ------
+    DataError, ConfigError : see `plan_next`.
+    """
+    known = Knowledge.of(analysis)
+    wanted = find_goal(goal, known, feedback=analysis.feedback)
+    candidates = [
+        one
+        for one in propose_candidates(known, limits=plan.limits, commands=commands, goal=wanted)
+        if not any(one.resembles(other) for other in without)
+    ]
+    if not candidates:
+        raise DataError("everything that would tell more was refused before")
+    told = np.array([known.of_recording(candidate) for candidate in candidates])
+    done = {record.id for record in analysis.records}
+    still = {
+        one.id: known.of_recording(one)
+        for one in plan.recordings
+        if one.id not in done and not tells_nothing(one, known, limits=plan.limits)
+    }
+    start = known.told + sum(still.values())
+    chosen = choose(told, start, n=n, goal=wanted)
+    sums = np.concatenate([start[None], told[list(chosen)]]).cumsum(axis=0)
+    errors = wanted.of(sums)
+    if not errors[-1] < errors[0]:
+        raise DataError(f"no experiment that the limits allow makes {wanted.words} smaller")
+    words = _words(wanted, known, after=sums[-1])
+    recordings = tuple(
+        candidates[one].model_copy(
+            update={"aim": wanted.name, "note": _promise(words, before, after)}
+        )
+        for one, before, after in zip(chosen, errors, errors[1:], strict=False)
+    )
+    return NextPlan(
+        words=words,
+        plan=plan,
+        path=None,
+        recordings=recordings,
+        now=float(wanted.of(known.told)),
+        errors=tuple(errors.tolist()),
+        planned={name: float(wanted.of(known.told + one)) for name, one in still.items()},
+    )
+
+
+def tells_nothing(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
+    """Return why a recording would not make the carts known better; "": it would."""
+    kinds = ("sine",) if known.dwells else ("step", "sweep")
+    if recording.kind not in kinds:
+        used = "dwells" if known.dwells else "steps and sweeps"
+        what = "dwell" if recording.kind == "sine" else recording.kind.replace("_", " ")
+        return f"the carts are identified from {used} here, and this is a {what}"
+    if len(recording.carts) < known.chain.n:
+        return "the carts are identified from records with all of them free"
+    most = known.at_its_limits(recording, limits=limits, share=1.0)
+    if abs(recording.amplitude) > most:
+        return f"it would be stopped at the travel limit: an amplitude up to {most:.2g} would not"
+    return ""
+
+
+def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, float]:
+    """Return the recording that `cartlab gap` proposes, and how far it sets explanations apart.
+
+    Raises
+    ------
+    DataError : there is no gap.json, or it proposes none.
+    ConfigError : it is broken, or of other data or limits than these.
+    """
+    path = submission.folder / "gap" / "gap.json"
+    command = f"`cartlab gap {submission.folder}`"
+    if not path.is_file():
+        raise DataError(f"--for gap: there is no {path}: run {command} first")
+    text = read_text(path, where="gap/gap.json", limit=10_000_000, error=ConfigError)
+    try:
+        found = read_gap(text)
+        if found.proposal is None:
+            raise DataError(
+                "--for gap: gap/gap.json proposes no recording: there is nothing that one would "
+                f'decide (its verdict is "{found.verdict}")'
+            )
+        recording = Recording.model_validate_json(json.dumps(found.proposal.recording))
+    except (ConfigError, ValidationError):
+        raise ConfigError(
+            f"--for gap: gap/gap.json is not what cartlab gap writes: run {command} again"
+        ) from None
+    system = submission.system
+    of = (found.bench.n, found.bench.units.position, found.bench.units.input)
+    here = (system.carts, system.position.unit, system.input.unit)
+    if of != here or found.provenance.files != read_data(submission).files:
+        raise ConfigError(f"--for gap: gap/gap.json is of other data: run {command} again")
+    kept = found.proposal.limits
+    # The numbers of gap.json have ten digits.
+    if not all(isclose(kept.get(name, 0.0), limit, rel_tol=1e-9) for name, limit in limits):
+        raise ConfigError(
+            f"--for gap: the limits in plan.toml are not those of gap/gap.json: run {command} again"
+        )
+    return recording, found.proposal.separation
+
+
+def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
+    if goal.name != WORST:
+        return goal.words
+    names = list(known.chain.parameters())
+    now, then = (names[goal.worst(told)] for told in (known.told, after))
+    which = now if now == then else f"now {now}, then {then}"
+    return f"{goal.words} ({which})"
+
+
+def _promise(words: str, before: float, after: float) -> str:
+    """Return what one recording is to bring, as its note says it."""
+    doubt = f"; {STATISTICAL}" if after < CALIBRATION else ""
+    return f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected{doubt}"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %"

@@ -1,0 +1,367 @@
+"""Propose what to record: cautious runs first, then what a quick model of the carts asks for.
+
+Nothing is known at first, so inputs are a few percent of what the motor can do; a hand releases
+the carts. Once a sweep is recorded, the carts it identifies say at which frequencies to dwell and
+with how much input. Once the dwells are recorded, the designed controller is run.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import ceil, floor, log10
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.bench.protocol.messages import CHIRP_SPAN, FULL_SCALE, Description
+from pipeline.errors import DataError
+from pipeline.experiments.gains import propose_pid
+from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
+from pipeline.experiments.plan_file import add_recordings, load_plan, plan_path, renamed
+from pipeline.ingest.read import DUTY_COUNT
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.dwells import (
+    SETTLED,
+    SETTLED_DWELL,
+    dwell_frequencies,
+    reach,
+    settling_wait,
+    steady_time,
+)
+from pipeline.results import Analysis, Stage
+from pipeline.submission import Design, Submission, System
+from pipeline.words.numbers import count
+from pipeline.words.progress import Progress
+from pipeline.workflow import analyse
+
+AIM = 0.4  # of the travel limit: how far the carts are meant to move
+FURTHEST = 0.8  # of the travel limit: a transient may take so much; the quick model may err
+
+# About 1 cm in units people use; an ECP 210 counts 440 to the centimetre.
+_ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0, "counts": 440.0}
+
+# Shares of the input limit before anything is known. A bench's motor moves its carts some 5 to 15
+# cm at full scale, and a resonance several times that.
+_FIRST_STEP = 0.04
+_REPEATS = "ab"  # of a decay
+EDGES = 4  # half periods of a step: off, on, off, on
+_SWEEP_TIME = 20.0  # s
+_FIRST_SETTLE = 5.0  # s
+FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
+
+_DWELLS = 24
+_STEP = 0.9  # of the aim: where a step rests; it overshoots up to twice as far
+
+
+@dataclass(frozen=True, kw_only=True)
+class MadePlan:
+    """A plan as it is written now.
+
+    Attributes
+    ----------
+    said : in one sentence, what was written.
+    trouble : why the data could not help to choose; "": they could, or there are none.
+    """
+
+    plan: Plan
+    path: Path
+    said: str
+    trouble: str
+
+
+def current_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
+    """Return the plan of a submission, or the one that is proposed where it has none."""
+    there = plan_path(submission).exists()
+    return load_plan(submission) if there else propose_plan(submission, bench=bench)
+
+
+def make_plan(submission: Submission, *, stock: bool = False, progress: Progress) -> MadePlan:
+    """Write plan.toml, or add to it what the data allow.
+
+    Parameters
+    ----------
+    stock : the bench knows the stock commands only.
+    """
+    carts = submission.system.carts
+    bench = Description(name="stock", encoders=2, carts=carts) if stock else None
+    there, old = plan_path(submission).exists(), current_plan(submission, bench=bench)
+    progress("asking the data what else to record")
+    try:
+        new, trouble = extend_plan(old, submission, bench=bench), ""
+    except DataError as error:  # a plan that data cannot help stands as it is
+        new, trouble = old, str(error)
+    added = new.recordings[len(old.recordings) :]
+    new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
+    told = f"{path}: {count(len(added), 'recording')} added"
+    said = told if there else f"wrote {path}: check its [limits]"
+    return MadePlan(plan=new, path=path, said=said, trouble=trouble)
+
+
+def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
+    """Propose the first runs from what the submission says of the bench; no data are read.
+
+    What is recorded already is not proposed. `extend_plan` goes on from there.
+
+    Parameters
+    ----------
+    bench : as it describes itself; None: one that knows every command.
+    """
+    system, recorded = submission.system, submission.experiments
+    limits = _limits(system, submission.design, bench)
+    kinds = {e.kind for e in recorded if len(e.carts) == system.carts}
+    proposed: list[Recording] = []
+    for cart in range(1, system.carts + 1):
+        if not any(e.kind == "decay" and e.carts == (cart,) for e in recorded):
+            proposed += _decays(cart, system)
+    if system.bench.tied and not kinds & {"step", "sine", "bode"}:
+        proposed += _first_steps(system, limits)
+    if not kinds & {"sweep", "sine", "bode"}:
+        proposed.append(_sweep(system, limits, chirps=bench is None or "c" in bench.commands))
+    recordings = renamed(proposed, taken=[e.id for e in recorded])
+    plan = Plan(limits=limits, recordings=recordings)
+    return plan.model_copy(update={"baud": bench.baud}) if bench else plan
+
+
+def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
+    """Add what the data recorded so far allow: dwells after a sweep, the closed loop after dwells.
+
+    What stands in the plan stays as it is and where it is. What was added once is not again. A
+    bench that knows no state feedback gets a PID on cart 1.
+
+    Raises
+    ------
+    DataError : the data recorded do not identify the carts, or no loop can be closed on them.
+    """
+    stages: list[Callable[[Analysis], list[Recording]]] = []
+    if _wants_dwells(plan, submission):
+        stages.append(lambda analysis: _driven(identified_chain(analysis), plan.limits))
+    if _wants_loop(plan, submission):
+        stages.append(lambda analysis: [_loop(analysis, submission, plan.limits, bench)])
+    if not stages:
+        return plan
+    analysis = analyse(submission)
+    proposed = [recording for stage in stages for recording in stage(analysis)]
+    taken = [entry.id for entry in (*plan.recordings, *submission.experiments)]
+    return plan.model_copy(
+        update={"recordings": (*plan.recordings, *renamed(proposed, taken=taken))}
+    )
+
+
+def _wants_dwells(plan: Plan, submission: Submission) -> bool:
+    """Whether there are none yet, and a sweep (or all that was planned) is recorded."""
+    n, recorded = submission.system.carts, submission.experiments
+    kinds = {e.kind for e in recorded if len(e.carts) == n}
+    if any(r.aim for r in plan.recordings):  # somebody knows what to record; dwells replace it
+        return False
+    if kinds & {"sine", "bode"} or any(r.kind == "sine" for r in plan.recordings):
+        return False
+    ids = {e.id for e in recorded}
+    sweep_to_come = any(r.kind == "sweep" and r.id not in ids for r in plan.recordings)
+    return "sweep" in kinds or ("step" in kinds and not sweep_to_come)
+
+
+def _wants_loop(plan: Plan, submission: Submission) -> bool:
+    """Whether there is none yet, and the dwells are recorded."""
+    ids = {e.id for e in submission.experiments}
+    kinds = {e.kind for e in submission.experiments}
+    kinds_planned = {r.kind for r in plan.recordings}
+    dwells_to_come = any(r.kind == "sine" and r.id not in ids for r in plan.recordings)
+    return (
+        bool(kinds & {"sine", "bode"})
+        and not dwells_to_come
+        and "closed_loop" not in kinds | kinds_planned
+    )
+
+
+# --------------------------------------------------------- before anything is known
+
+
+def _limits(system: System, design: Design | None, bench: Description | None) -> PlanLimits:
+    """Return the stated limits, and where none are stated usual ones for a person to check."""
+    per_count = system.input.per_count or (bench.input_per_count if bench else None)
+    if per_count is None and system.input.unit == "V":
+        per_count = DUTY_COUNT
+    stated = design.input_limit if design else None
+    # Of a unit that nothing is known of, nobody can say what the motor takes.
+    # A usual input, where nothing says what the motor takes.
+    most = FULL_SCALE * per_count if per_count else stated or 5.0
+    asked = abs(design.reference) if design else 1.0
+    travel = _ABOUT_1_CM.get(system.position.unit, asked or 1.0) / AIM
+    if design:
+        travel = max(travel, asked / FURTHEST)
+    return PlanLimits(input=min(most, stated or most), travel=rounded(travel))
+
+
+def _decays(cart: int, system: System) -> list[Recording]:
+    """Let one cart go by hand, the others held; a cart without a spring cannot swing."""
+    if not (system.springs[cart - 1] or system.springs[cart]):
+        return []
+    return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS]
+
+
+def let_go(cart: int, *, name: str, seconds: float) -> Recording:
+    """Return the recording of one cart that a hand lets go, the others held."""
+    return Recording(
+        id=name,
+        kind="decay",
+        carts=(cart,),
+        wave="delta",
+        amplitude=0.0,
+        frequency=1 / seconds,
+        release=cart,
+        settle=1.0,
+    )
+
+
+def _first_steps(system: System, limits: PlanLimits) -> list[Recording]:
+    return _steps(
+        [sign * _FIRST_STEP * limits.input for sign in (1, -1)],
+        carts=system.carts,
+        edge=5.0,  # s from edge to edge of the first steps
+        settle=_FIRST_SETTLE,
+    )
+
+
+def _steps(
+    amplitudes: Sequence[float], *, carts: int, edge: float, settle: float
+) -> list[Recording]:
+    return [
+        Recording(
+            id=f"step-{number}",
+            kind="step",
+            carts=tuple(range(1, carts + 1)),
+            wave="square",
+            amplitude=rounded_down(amplitude),
+            frequency=rounded_down(0.5 / edge),
+            cycles=EDGES // 2,
+            settle=settle,
+        )
+        for number, amplitude in enumerate(amplitudes, start=1)
+    ]
+
+
+def _sweep(system: System, limits: PlanLimits, *, chirps: bool) -> Recording:
+    """Sweep once over the frequencies of such benches, or switch on and off many times."""
+    # A chirp ends 20 times higher; of a square wave, edges are 2.5 s apart.
+    frequency = 0.5 if chirps else 0.5 / 2.5
+    return Recording(
+        id="sweep",
+        kind="sweep",
+        carts=tuple(range(1, system.carts + 1)),
+        wave="chirp" if chirps else "square",
+        amplitude=rounded_down(0.02 * limits.input),
+        frequency=frequency,
+        frequency_end=CHIRP_SPAN * frequency if chirps else None,
+        cycles=round(_SWEEP_TIME * frequency),
+        settle=_FIRST_SETTLE,
+    )
+
+
+# ------------------------------------------------------------ from the quick model
+
+
+def identified_chain(analysis: Analysis) -> Chain:
+    """Return the identified carts.
+
+    Raises
+    ------
+    DataError : they are not, with the reason.
+    """
+    fit = analysis.fit
+    if fit is None or not fit.converged:
+        why = fit.message if fit else _reason(analysis, Stage.FINAL_ESTIMATES, Stage.BODE_FIT)
+        raise DataError(
+            f"the carts are not identified, and by them is chosen what to record next: {why}"
+        )
+    if not fit.chain.is_tied:
+        raise DataError(
+            "no dwells can be proposed: no spring ties the carts to a wall, so they drift; add "
+            "sweeps to plan.toml instead"
+        )
+    return fit.chain
+
+
+def _reason(analysis: Analysis, *stages: Stage) -> str:
+    return "; ".join(s.reason for s in analysis.skipped if s.stage in stages) or "see the report"
+
+
+def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
+    """Return a step to each side that ends as far out as the carts are meant to go."""
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    hold = AIM * limits.travel / float(np.max(np.abs(chain.static_gains())))
+    size = min(_STEP * hold, limits.input)
+    return _steps([size, -size], carts=chain.n, edge=settle, settle=settle)
+
+
+def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
+    """Return steps and dwells that move the carts as far as they are meant to go."""
+    aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
+    settle = rounded(settling_wait(chain, time_constants=SETTLED))
+    recordings = large_steps(chain, limits)
+    wait = settling_wait(chain, time_constants=SETTLED_DWELL)
+    for number, hertz in enumerate(dwell_frequencies(chain, n=_DWELLS), start=1):
+        cycles = ceil(hertz * (wait + steady_time(hertz)))
+        t = np.arange(0.0, cycles / hertz, min(0.005, 1 / (40 * hertz)))
+        unit = reach(chain, t, shape=np.sin(2 * np.pi * hertz * t), wait=wait)
+        amplitude = min(aim / unit.steady, furthest / unit.furthest, limits.input)
+        recordings.append(
+            Recording(
+                id=f"sine-{number:02d}",
+                kind="sine",
+                carts=tuple(range(1, chain.n + 1)),
+                wave="sine",
+                amplitude=rounded_down(amplitude),
+                frequency=hertz,
+                cycles=cycles,
+                settle=settle,
+            )
+        )
+    return recordings
+
+
+def _loop(
+    analysis: Analysis, submission: Submission, limits: PlanLimits, bench: Description | None
+) -> Recording:
+    """Step the set point of the designed loop on and off, or that of a PID on a stock bench.
+
+    Raises
+    ------
+    DataError : there is no design or no PID, with the reason.
+    """
+    feedback = analysis.feedback
+    if feedback is None:
+        raise DataError(
+            f"no closed loop can be proposed: {_reason(analysis, Stage.STATE_FEEDBACK)}"
+        )
+    task = submission.design or Design(cart=feedback.cart)
+    # Carts on the way to the controlled one may well go further than it does.
+    furthest = float(np.max(np.abs(feedback.y)) / abs(feedback.reference))
+    size = min(abs(task.reference), FURTHEST * limits.travel / furthest)
+    edge = max(3.0 * task.settling_time, 2.0)  # s from edge to edge of the set point
+    recording = Recording(
+        id="control",
+        kind="closed_loop",
+        carts=tuple(range(1, submission.system.carts + 1)),
+        wave="square",
+        amplitude=rounded_down(size) if size < abs(task.reference) else task.reference,
+        frequency=rounded_down(0.5 / edge),
+        cycles=EDGES // 2,
+        controller=StateLoop(cart=feedback.cart),
+        settle=rounded(settling_wait(identified_chain(analysis), time_constants=SETTLED)),
+    )
+    if bench is None or "f" in bench.commands:
+        return recording
+    pid = propose_pid(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=limits
+    )
+    return recording.model_copy(update={"controller": pid})
+
+
+def rounded(value: float) -> float:
+    """Return the number as one types it: two digits."""
+    return float(f"{value:.2g}")
+
+
+def rounded_down(value: float) -> float:
+    """Return the number in two digits, no further from zero than it is."""
+    size = 10.0 ** (floor(log10(abs(value))) - 1)
+    return float(f"{floor(abs(value) / size * (1 + 1e-12)) * size:.2g}") * (1 if value > 0 else -1)

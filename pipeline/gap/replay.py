@@ -1,0 +1,114 @@
+"""One run again, by the model with effects: started from rest, or as its readings say."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import DataError
+from pipeline.estimation.measured_run import measured_run
+from pipeline.gap.data.runs import GapRun
+from pipeline.gap.data.sides import prepare
+from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.results import HardwareCheck, Record
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Replay:
+    """One cart under the measured input: the linear model, and the one with effects, (n,).
+
+    `rest` is where it rests, about which its motion counts.
+    """
+
+    check: HardwareCheck
+    model: Array
+    nrmse: float
+    rest: float
+
+
+def replay_driven(
+    record: Record, checks: Sequence[HardwareCheck], model: AugmentedChain
+) -> list[Replay]:
+    """Simulate a run with the measured input; [] where the carts run away or nothing drives.
+
+    Parameters
+    ----------
+    checks : the linear model under the same input, cart by cart.
+    """
+    # Compiled code: the linear report never needs it.
+    from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
+
+    if record.u is None:
+        return []
+    run = measured_run(record, model.chain)
+    rows = [cart - 1 for cart in run.free]
+    try:
+        rest = rest_positions(model, free=run.free)
+        x0 = rest.copy()
+        x0[rows] += run.x0[::2]
+        factors = {1.0, *(c.input_scale for c in checks if c.input_scale is not None)}
+        found = [
+            run.rest[:, None] + (y - rest[:, None])[rows]
+            for factor in sorted(factors, key=lambda factor: factor != 1.0)
+            if factor == 1.0 or not 1 / 1.5 <= factor <= 1.5  # no other scale: the model's error
+            for y in [simulate_augmented(model, record.t, factor * record.u, free=run.free, x0=x0)]
+        ]
+    except DataError:
+        return []
+    as_logged, *others = found
+    best = min(others, key=run.misfit, default=as_logged)
+    # A factor on the logged input is believed where 0.6 of the error goes with it.
+    chosen = best if run.misfit(best) < 0.6 * run.misfit(as_logged) else as_logged
+    replays = []
+    for check in checks:
+        row = run.free.index(check.cart)
+        motion = check.measured - run.rest[row]
+        error = float(np.sqrt(np.sum((check.measured - chosen[row]) ** 2) / np.sum(motion**2)))
+        rest_of_cart = float(run.rest[row])
+        replays.append(Replay(check=check, model=chosen[row], nrmse=error, rest=rest_of_cart))
+    return replays
+
+
+def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
+    """Return one record as the gap's fits see it: of a decay, from where the hand has let go.
+
+    Raises
+    ------
+    DataError : it is too short, or no free cart moves.
+    """
+    return prepare([record], springs=springs, notes=[])[0]
+
+
+def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ...]) -> Array:
+    """Return the readings (rows, samples) of a run, its start and zeros fitted as in the gap.
+
+    Raises
+    ------
+    DataError : the carts run away.
+    """
+    from pipeline.gap.fit.baseline import fit_nuisance
+    from pipeline.gap.fit.levenberg_marquardt import evaluate
+    from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
+    from pipeline.gap.fit.structure import Candidate, Structure
+
+    structure = Structure(
+        springs=springs,
+        effects=tuple(
+            Candidate(
+                effect=term.effect,
+                place=term.place,
+                signs=tuple(-1.0 if value < 0 else 1.0 for value in term.values),
+                scales=tuple(abs(value) or 1.0 for value in term.values),
+            )
+            for term in model.terms
+        ),
+    )
+    start = structure.start(model.chain, [term.values for term in model.terms])
+    spread = np.full(structure.n, 0.05)
+    known = evaluate(start, [run], [fresh_nuisance(run)], spread=spread)
+    fit = fit_nuisance(known, [run])
+    readings = simulate_run(fit, run, fit.nuisance[0])
+    if not np.all(np.isfinite(readings)):
+        raise DataError(f"{run.id}: the carts run away")
+    return readings

@@ -1,0 +1,67 @@
+"""Search the catalogue: laws chosen while the model follows, then fitted to free runs, judged.
+
+Nothing is tried one by one: all laws at all places are fitted together from nothing to a model
+that follows the measurement, and those that are nothing are dropped (`gap.follow`). What is left
+is fitted to whole runs, each effect must be worth it on runs the fit has not seen, and rivals
+come from the same fit with one law exchanged.
+"""
+
+from contextlib import suppress
+
+import numpy as np
+
+from pipeline.gap.fit.baseline import first_chain
+from pipeline.gap.fit.structure import GapModel
+from pipeline.gap.follow.choose import choose_laws, rivals_of
+from pipeline.gap.follow.fit import Follow, Records
+from pipeline.gap.follow.track import make_track
+from pipeline.gap.search.deadline import OutOfTime
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, worth_it
+from pipeline.gap.search.prune import prune
+from pipeline.gap.search.translate import as_model, filled
+from pipeline.gap.search.whole import fit_whole
+
+
+def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
+    """Return the hypothesis chosen and all that were judged, the baseline first.
+
+    Past the time allowed, the best of those so far.
+    """
+    found = [baseline]
+    with suppress(OutOfTime):
+        records = Records(
+            tracks=tuple(make_track(run) for run in study.training),
+            mapper=study.mapper,
+            columns=frozenset().union(*(filled(effect) for effect in study.catalogue)),
+        )
+        chain = baseline.fit.structure.chain(baseline.fit.theta)
+        own = first_chain(study.training, springs=study.springs)
+        lean = choose_laws(
+            records, springs=study.springs, chains=[chain, own], progress=study.progress
+        )
+        if not lean.laws.groups():
+            return baseline, found
+        found.append(judge(fit_whole(_as_model(lean, study, records), study), study))
+        study.progress(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
+        for rival in rivals_of(lean, records):
+            found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
+        found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
+        # What ends at a bound is often nothing: it goes, and what remains is sound.
+        chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
+        sound = [h for h in found if h.sound and np.isfinite(h.error)]
+        if not chosen.sound:
+            chosen = prune(min(sound, key=lambda h: h.bic_of_all), study, found)
+        usable = chosen.sound and np.isfinite(chosen.error)
+        return chosen if usable else baseline, [h for h in found if h.sound]
+    found = [h for h in found if np.isfinite(h.error) and h.sound]
+    worth = [h for h in found if worth_it(h, baseline, study)]
+    return min(worth, key=lambda h: h.bic, default=baseline), found
+
+
+def _as_model(follow: Follow, study: Study, records: Records) -> GapModel:
+    """Return what a following model says, in effects of the catalogue."""
+    if not any(study.springs):
+        # On no spring errors add up: what a model lacks misleads a fit that is free at once.
+        for gain in (0.02, 0.01, 0.005, 0.002, 0.0):
+            follow = records.fit(follow, gain=gain) if gain < follow.gain else follow
+    return as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)

@@ -1,0 +1,127 @@
+"""Leave out what is not needed, and order what is left: the one that helps most first."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.gap.fit.levenberg_marquardt import GapFit
+from pipeline.gap.fit.structure import Candidate
+from pipeline.gap.limits import SURE
+from pipeline.gap.search.hypothesis import Hypothesis, Study, judge, lowers_error, worth_it
+from pipeline.gap.search.translate import make_candidate
+from pipeline.gap.search.whole import finish, fit_on
+from pipeline.plant.nonlinear.effects import find_effect
+
+_FEW = 4  # effects tried at a time: least sure means only roughly least missed
+
+
+def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
+    """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
+
+    And those that are nothing within their error. Of the least sure few, what is missed least
+    goes first; what is lost adds up, so each is compared with the best so far.
+    """
+    best = chosen
+    while chosen.key:
+        effects = chosen.fit.structure.effects
+        sure = sureness(finish(chosen.fit, study))
+        order: list[int] = np.argsort(sure, kind="stable").tolist()
+        for few in (order[:_FEW], order[_FEW:]):
+            needless = []
+            for index in few:
+                plainer = _plainer(chosen, effects[index], study)
+                if plainer is not None:
+                    found.append(plainer)
+                    needless += [plainer] if plainer.sound and plainer.bic < chosen.bic else []
+                without = found[0]
+                if len(effects) > 1:
+                    without = _without(chosen, effects[index], study)
+                    found.append(without)
+                nothing = sure[index] < SURE  # it goes, wherever that leads the others
+                if nothing or (without.sound and _as_good(without, best, study)):
+                    needless.append(without)
+            if needless:
+                chosen = min(needless, key=lambda h: h.bic)
+                best = min(best, chosen, key=lambda h: h.error)
+                break
+        else:
+            break
+    return chosen
+
+
+def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
+    """Return a hypothesis without its least sure effect, where that may be nothing; or None.
+
+    `final` is its fit with the covariance.
+    """
+    sure = sureness(final)
+    if not sure or min(sure) >= SURE:
+        return None
+    return _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
+
+
+def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
+    """Does a hypothesis without one of the effects do about as well?
+
+    Where much is left for another reason, the criterion's drop is small: an effect that lowers the
+    error of runs not seen by a tenth is kept there, if the criterion is for it at all.
+    """
+    if worth_it(chosen, without, study):
+        return False
+    if study.explains(chosen):
+        return True
+    return without.bic < chosen.bic or not lowers_error(chosen, without, study)
+
+
+def sureness(fit: GapFit) -> list[float]:
+    """Return how many standard errors each effect is from nothing, by its least sure parameter."""
+    structure = fit.structure
+    if fit.covariance is None:
+        return [np.inf] * len(structure.effects)
+    std = np.sqrt(np.diag(fit.covariance)) * structure.physical_derivative(fit.theta)
+    return [
+        min(
+            (
+                abs(value - p.neutral) / error
+                for p, value, error in zip(
+                    term.effect.parameters, term.values, std[structure.span(index)], strict=True
+                )
+                if p.neutral is not None and p.reported
+            ),
+            default=np.inf,
+        )
+        for index, term in enumerate(fit.terms)
+    ]
+
+
+def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
+    """Return the hypothesis without one of its effects, fitted from where it is."""
+    index = hypothesis.fit.structure.effects.index(effect)
+    return judge(fit_on(hypothesis.fit, hypothesis.fit.without(index), study), study)
+
+
+def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
+    """Return the hypothesis with the law that a richer one grew from in its place."""
+    if rich.effect.grows_from is None:
+        return None
+    index = hypothesis.fit.structure.effects.index(rich)
+    effect = find_effect(rich.effect.grows_from)
+    values = [hypothesis.fit.terms[index].values[rich.effect.names.index(name)]
+              for name in effect.names]  # fmt: skip
+    chain = hypothesis.fit.structure.chain(hypothesis.fit.theta)
+    plain = make_candidate(effect, rich.place, values, runs=study.training, chain=chain)
+    model = hypothesis.fit.without(index).with_effect(plain, values)
+    return judge(fit_on(hypothesis.fit, model, study), study)
+
+
+def steps_to(
+    chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
+) -> tuple[Hypothesis, ...]:
+    """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
+    steps = [chosen]
+    while effects := steps[0].fit.structure.effects:
+        known = {h.key: h for h in found}
+        rest = [(steps[0].key - {effect.key}, effect) for effect in effects]
+        smaller = [known.get(key) or _without(steps[0], effect, study) for key, effect in rest]
+        steps.insert(0, min(smaller, key=lambda h: h.error))
+    return tuple(steps)

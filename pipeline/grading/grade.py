@@ -1,0 +1,142 @@
+"""The grade of a submission as it is made, stored and published: `grade.json`."""
+
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from pipeline.json_files import json_text
+from pipeline.set_up import Units
+
+Outcome = Literal["pass", "partial", "fail", "skip"]
+Code = Literal[
+    "hz_for_rad_s",
+    "peak_count",
+    "peak_for_steady_state",
+    "peak_to_peak",
+    "transient_used",
+    "carts_swapped",
+    "counts_for_length",
+    "log10_for_ln",
+    "no_fit_done",
+    "final_off",
+    "initial_off",
+    "initial_final_disagree",
+    "physically_impossible",
+    "wrong_state_space",
+    "wrong_gains",
+    "wrong_prefilter",
+    "missing",
+    "shared_data",
+    "data_problem",
+]
+CODES: tuple[Code, ...] = get_args(Code)
+Values = dict[str, Any]  # numbers, texts, or lists of them
+
+
+class GradeTable(BaseModel):
+    """A table of the file; unknown keys are let through, as later versions may add some."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+
+
+class Criterion(GradeTable):
+    """One line of the grade; `skip` where what it builds on failed, or nothing could be judged."""
+
+    id: str
+    title: str
+    outcome: Outcome
+    points: float
+    out_of: float
+    message: str
+    expected: Annotated[Values, Field(description="by parameter or entry")]
+    found: Annotated[Values, Field(description="by parameter or entry")]
+
+
+class Flag(GradeTable):
+    """A named mistake, where, and the evidence for it."""
+
+    code: Code
+    parameters: Annotated[
+        tuple[str, ...],
+        Field(description="the numbers it explains, or what is missing, or the runs concerned"),
+    ]
+    message: str
+    evidence: Values
+
+
+class GradeOverride(GradeTable):
+    """Points given by hand, already among those of the criterion."""
+
+    criterion: str
+    points: float
+    why: str
+
+
+class Grade(GradeTable):
+    """The grade of one submission."""
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=True)
+
+    schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")] = "cartlab-grade/1"
+    submission: str
+    authors: Annotated[tuple[str, ...], Field(description="none where names are left out")]
+    status: Literal["graded", "failed"]
+    points: float
+    out_of: float
+    days_late: float = 0.0
+    deducted: Annotated[float, Field(description="for lateness, already out of `points`")] = 0.0
+    reason: Annotated[
+        str, Field(description="why it could not be graded, a line for each reason, or empty")
+    ] = ""
+    criteria: tuple[Criterion, ...] = ()
+    flags: tuple[Flag, ...] = ()
+    notes: tuple[str, ...] = ()
+    units: Annotated[
+        Units | None, Field(description="of the numbers in the criteria; none where not judged")
+    ] = None
+    springs: Annotated[
+        tuple[str, ...],
+        Field(description="that the recordings ask for and the rubric does not have"),
+    ] = ()
+    overrides: tuple[GradeOverride, ...] = ()
+
+    @classmethod
+    def failed(
+        cls,
+        submission: str,
+        reason: str,
+        *,
+        out_of: float,
+        authors: tuple[str, ...],
+        days_late: float,
+    ) -> "Grade":
+        """Return the grade of what could not be graded."""
+        return cls(
+            submission=submission,
+            authors=authors,
+            status="failed",
+            points=0.0,
+            out_of=out_of,
+            days_late=days_late,
+            reason=reason,
+        )
+
+    def with_flags(self, *flags: Flag) -> "Grade":
+        """Return the grade with further flags, in the order of the codes."""
+        together = sorted((*self.flags, *flags), key=lambda flag: CODES.index(flag.code))
+        return self.model_copy(update={"flags": tuple(together)})
+
+
+def grade_text(grade: Grade) -> str:
+    """Return `grade.json` as text; same grade, same bytes."""
+    return json_text(grade)
+
+
+def read_grade(text: str) -> Grade:
+    """Return the grade that a `grade.json` holds.
+
+    Raises
+    ------
+    ValueError : it is none.
+    """
+    return Grade.model_validate_json(text)

@@ -1,0 +1,286 @@
+"""A gradebook in which students ask for another look, once their feedback is released."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+from sqlalchemy import Connection, Row
+
+from pipeline.errors import ConfigError
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.open_book import Conflict, OpenBook, find_version
+from pipeline.grading.gradebook.override import WantedPoints
+from pipeline.grading.gradebook.requests import (
+    MOST_OPEN,
+    Request,
+    RequestEvent,
+    RequestRefused,
+    find_requests,
+    is_released,
+    read_requests,
+    read_words,
+)
+from pipeline.grading.gradebook.rows import (
+    Entry,
+    add_row,
+    class_list,
+    final_entry,
+    last_named,
+    read_flag,
+    read_rubric,
+)
+from pipeline.grading.gradebook.schema import entries, releases, request_events
+from pipeline.grading.rubric import Rubric
+
+_MOST_SHOWN = 50  # requests of a kind on one page
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnFeedback:
+    """What the authors of a submission read: their grade, and their requests by criterion."""
+
+    rubric: Rubric
+    entry: Entry
+    requests: Mapping[str, Request]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Queued:
+    """A request as TAs see it; `version` is what an answer rests on."""
+
+    entry: Entry
+    request: Request
+    version: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Queue:
+    """The requests of a class: those that wait, oldest first, and the others, newest first.
+
+    Attributes
+    ----------
+    n_waiting, n_settled : how many there are; no more than a page of each is listed.
+    """
+
+    rubric: Rubric
+    waiting: Sequence[Queued]
+    settled: Sequence[Queued]
+    n_waiting: int
+    n_settled: int
+
+
+class RequestBook(OpenBook):
+    """A gradebook whose students read their feedback and ask for another look."""
+
+    @property
+    def released(self) -> bool:
+        """Whether students may read the feedback of the class."""
+        with self._database.reading() as connection:
+            return is_released(connection, self._last(connection).assignment)
+
+    def release(self, released: bool, *, by: str) -> None:
+        """Let students read the feedback of the class, or no longer."""
+        with self._database.writing() as connection:
+            assignment = self._last(connection).assignment
+            values = {"assignment": assignment, "at": self._at(), "by": by, "released": released}
+            add_row(connection, releases, values)
+
+    def n_waiting(self) -> int:
+        """Return how many requests of the class wait for an answer."""
+        with self._database.reading() as connection:
+            last = self._newest(connection)
+            return 0 if last is None else len(find_requests(connection, last)[0])
+
+    def queue(self, of: str = "") -> Queue:
+        """Return the requests of the class, or of one submission."""
+        with self._database.reading() as connection:
+            last = self._last(connection)
+            rubric = read_rubric(last)
+            waiting, settled = (
+                [row for row in rows if not of or row.name == of]
+                for rows in find_requests(connection, last)
+            )
+            shown = (
+                tuple(self._queued(connection, last, row) for row in rows[:_MOST_SHOWN])
+                for rows in (waiting, settled)
+            )
+            return Queue(
+                rubric=rubric,
+                waiting=next(shown),
+                settled=next(shown),
+                n_waiting=len(waiting),
+                n_settled=len(settled),
+            )
+
+    def request_states(self, team: str) -> dict[str, str]:
+        """Return, by criterion, how the requests of a submission stand."""
+        with self._database.reading() as connection:
+            _, row = self._find(connection, team)
+            requests = read_requests(connection, row.submission_id, row.authors)
+        return {criterion: request.state for criterion, request in requests.items()}
+
+    # ----------------------------------------------------------------- for students
+
+    def own_feedback(self, submission: str, *, assignment: str = "") -> OwnFeedback | None:
+        """Return what the authors of a submission may read; None while it is not released.
+
+        Parameters
+        ----------
+        submission : its very name; no author's name will do.
+        assignment : whose class list it must be; "": whichever is there.
+
+        Raises
+        ------
+        ConfigError : the class list has no such submission.
+        """
+        with self._database.reading() as connection:
+            found = self._find_released(connection, submission, assignment)
+            if found is None:
+                return None
+            last, row = found
+            return OwnFeedback(
+                rubric=read_rubric(last),
+                entry=_entry(connection, last, row),
+                requests=read_requests(connection, row.submission_id, row.authors),
+            )
+
+    def ask(
+        self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
+    ) -> None:
+        """Ask for another look at a criterion that lost points, once unless it was reopened.
+
+        Raises
+        ------
+        RequestRefused : it cannot be asked for, or there is no reason.
+        """
+        why = read_words(why, wanted="say what should be looked at, and why")
+        with self._database.changing() as connection:
+            found = self._find_released(connection, submission, assignment)
+            if found is None:
+                raise RequestRefused("the feedback is not released to students")
+            last, row = found
+            requests = read_requests(connection, row.submission_id, row.authors)
+            known = requests.get(criterion)
+            if known is not None and known.state != "reopened":
+                raise RequestRefused("another look at this criterion was asked for already")
+            if criterion not in points_lost(_entry(connection, last, row).grade, read_rubric(last)):
+                raise RequestRefused("another look is for criteria that lost points")
+            if sum(one.state == "asked" for one in requests.values()) >= MOST_OPEN:
+                raise RequestRefused(
+                    f"{MOST_OPEN} requests of yours wait already: ask again after an answer"
+                )
+            asked = RequestEvent(criterion=criterion, what="asked", text=why, by=by)
+            self._add(connection, row, asked)
+
+    # ---------------------------------------------------------------------- for TAs
+
+    def answer(
+        self,
+        submission: str,
+        criterion: str,
+        points: float | None,
+        *,
+        text: str,
+        by: str,
+        seen: str,
+    ) -> None:
+        """Answer a request and, where points are given, change them: both, or neither.
+
+        Parameters
+        ----------
+        points : None: they stay.
+        text : what the students read; the reason of the points too.
+        seen : what the answer rests on, from `Queued.version`.
+
+        Raises
+        ------
+        Conflict : somebody else answered or changed the points, or the submission was graded again.
+        RequestRefused : there is no answer, or it is not a request that waits.
+        ConfigError : the criterion cannot have these points.
+        """
+        text = read_words(text, wanted="write an answer for the students")
+        with self._database.changing() as connection:
+            last, row, request = self._find_request(connection, submission, criterion, seen=seen)
+            if request.state != "asked":
+                raise RequestRefused("this request was answered already; reopen it for another")
+            if points is not None:
+                wish = WantedPoints(
+                    submission=submission, criterion=criterion, points=points, why=text
+                )
+                self._give(connection, row, wish, by=by, rubric=read_rubric(last))
+            answered = RequestEvent(
+                criterion=criterion, what="answered", text=text, points=points, by=by
+            )
+            self._add(connection, row, answered)
+
+    def reopen(self, submission: str, criterion: str, *, by: str, seen: str) -> None:
+        """Let the students ask once more about a criterion.
+
+        Raises
+        ------
+        Conflict : see `answer`.
+        RequestRefused : the request waits for an answer.
+        """
+        with self._database.changing() as connection:
+            _, row, request = self._find_request(connection, submission, criterion, seen=seen)
+            if request.state != "answered":
+                raise RequestRefused("only a request that was answered can be reopened")
+            reopened = RequestEvent(criterion=criterion, what="reopened", text="", by=by)
+            self._add(connection, row, reopened)
+
+    # ---------------------------------------------------------------------- in parts
+
+    def _find_released(
+        self, connection: Connection, submission: str, assignment: str
+    ) -> tuple[Row, Row] | None:
+        """Return the class list and a line of it, where students may read it."""
+        last = self._newest(connection)
+        if last is None or assignment not in ("", last.assignment):
+            return None
+        if not is_released(connection, last.assignment):
+            return None
+        _, row = self._find(connection, submission)
+        if row.name != submission:  # found by an author's name
+            raise ConfigError(f"{submission}: is not the name of a submission")
+        return last, row
+
+    def _find_request(
+        self, connection: Connection, submission: str, criterion: str, *, seen: str
+    ) -> tuple[Row, Row, Request]:
+        """Return the class list, the line and the request, if that is as somebody saw it."""
+        last, row = self._find(connection, submission)
+        request = read_requests(connection, row.submission_id, row.authors).get(criterion)
+        if request is None:
+            raise ConfigError(f"{criterion}: nobody asked for another look")
+        version, given = find_version(connection, row, criterion)
+        if seen != f"{version}.{request.number}":
+            raise Conflict(f"{criterion}: was changed after this page was shown", now=given)
+        return last, row, request
+
+    def _queued(self, connection: Connection, last: Row, found: Row) -> Queued:
+        row = connection.execute(class_list(last).where(entries.c.position == found.position)).one()
+        version, _ = find_version(connection, row, found.criterion)
+        requests = read_requests(connection, row.submission_id, row.authors)
+        request = requests[found.criterion]
+        return Queued(
+            entry=_entry(connection, last, row),
+            request=request,
+            version=f"{version}.{request.number}",
+        )
+
+    def _add(self, connection: Connection, row: Row, said: RequestEvent) -> None:
+        """Add an event of a request, as of now and of the authors of now."""
+        if not said.by.strip():
+            raise RequestRefused("say who you are: a request and an answer have a name to them")
+        authors = last_named(connection, row.submission_id)
+        event = replace(said, at=self._at(), authors=authors)
+        add_row(connection, request_events, {**asdict(event), "submission_id": row.submission_id})
+
+
+def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
+    """Return the criteria of the rubric that have not all their points, judged or not."""
+    points = {criterion.id: criterion.points for criterion in grade.criteria}
+    return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
+
+
+def _entry(connection: Connection, last: Row, row: Row) -> Entry:
+    return final_entry(connection, row, shared=read_flag(row.shared), rubric=read_rubric(last))

@@ -1,0 +1,156 @@
+"""Requests for another look: events of a criterion, of which the newest says how it stands."""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Literal
+
+from sqlalchemy import Connection, Row, Select, func, select
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.schema import (
+    entries,
+    gradings,
+    releases,
+    request_events,
+    submissions,
+)
+from pipeline.grading.gradings import go_with
+from pipeline.words.text import clean
+
+MOST_LETTERS = 1_000  # of a reason or an answer: a paragraph, read within a minute
+MOST_OPEN = 4  # of one submission at a time: a team with more doubts should talk to a TA
+
+
+class RequestRefused(ConfigError):
+    """A request or an answer cannot be taken; the text says why to the person who wrote it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequestEvent:
+    """One step of a request.
+
+    Attributes
+    ----------
+    text : the reason, or the answer; "" where it was reopened.
+    points : that an answer gave; None where they stayed.
+    at : ISO 8601, UTC.
+    authors : of the submission at the time; the request goes with them.
+    """
+
+    criterion: str
+    what: Literal["asked", "answered", "reopened"]
+    text: str
+    points: float | None = None
+    by: str
+    at: str = ""
+    authors: tuple[str, ...] = ()
+
+
+EVENT = [request_events.c[f.name] for f in fields(RequestEvent)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """All that was asked and answered about one criterion of a submission, oldest first.
+
+    Attributes
+    ----------
+    number : of the newest event in the gradebook; an answer rests on it.
+    """
+
+    criterion: str
+    events: tuple[RequestEvent, ...]
+    number: int
+
+    @property
+    def state(self) -> Literal["asked", "answered", "reopened"]:
+        """What happened last: `asked` waits for an answer, `reopened` may be asked once more."""
+        return self.events[-1].what
+
+
+def read_requests(
+    connection: Connection, submission: int, authors: tuple[str, ...]
+) -> dict[str, Request]:
+    """Return the requests of a submission by criterion, those of its authors of now."""
+    mine = select(request_events.c.id, *EVENT).where(request_events.c.submission_id == submission)
+    events: dict[str, list[RequestEvent]] = defaultdict(list)
+    numbers: dict[str, int] = {}
+    for row in connection.execute(mine.order_by(request_events.c.id)):
+        event = RequestEvent(**{column.name: row._mapping[column.name] for column in EVENT})
+        if go_with(event.authors, authors):
+            events[event.criterion].append(event)
+            numbers[event.criterion] = row.id
+    return {
+        criterion: Request(criterion=criterion, events=tuple(steps), number=numbers[criterion])
+        for criterion, steps in events.items()
+    }
+
+
+def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
+    """Return the requests of a class list, those that wait first, by their newest events.
+
+    Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
+    submission. Those that wait come oldest first, the others newest first.
+    """
+    of = request_events.c.submission_id
+    newest = select(func.max(request_events.c.id)).group_by(of, request_events.c.criterion)
+    found = connection.execute(
+        _in_class(batch).where(request_events.c.id.in_(newest)).order_by(request_events.c.id)
+    ).all()
+    theirs = [row for row in found if go_with(row.asked_by, row.authors)]
+    waiting = [row for row in theirs if row.what == "asked"]
+    return waiting, [row for row in reversed(theirs) if row.what != "asked"]
+
+
+def _in_class(batch: Row) -> Select:
+    """Return the query for the request events of submissions on a class list."""
+    joined = (
+        request_events.join(entries, entries.c.submission_id == request_events.c.submission_id)
+        .join(gradings, gradings.c.id == entries.c.grading_id)
+        .join(submissions, submissions.c.id == entries.c.submission_id)
+    )
+    return (
+        select(
+            request_events.c.id,
+            request_events.c.submission_id,
+            request_events.c.criterion,
+            request_events.c.what,
+            request_events.c.authors.label("asked_by"),
+            entries.c.position,
+            gradings.c.authors,
+            submissions.c.name,
+        )
+        .select_from(joined)
+        .where(entries.c.batch_id == batch.id)
+    )
+
+
+def hide_people(text: str, people: Iterable[str]) -> str:
+    """Return words without the names of those who wrote them, as far as they are known."""
+    known = "|".join(re.escape(one) for one in people if one)
+    return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
+
+
+def is_released(connection: Connection, assignment: str) -> bool:
+    """Whether students may read the feedback of an assignment."""
+    mine = select(releases.c.released).where(releases.c.assignment == assignment)
+    return bool(connection.scalar(mine.order_by(releases.c.id.desc()).limit(1)))
+
+
+def read_words(text: str, *, wanted: str) -> str:
+    """Return what somebody wrote, without characters that no page can show.
+
+    Raises
+    ------
+    RequestRefused : there is nothing, or too much.
+    """
+    text = clean(text).strip()
+    if not text:
+        raise RequestRefused(wanted)
+    if len(text) > MOST_LETTERS:
+        raise RequestRefused(
+            f"write at most {MOST_LETTERS:,} characters, found {len(text):,}: keep the main point"
+        )
+    return text

@@ -1,0 +1,55 @@
+"""From verdicts to points: what each criterion waits for, what remarks cost, the rubric's step."""
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+
+from pipeline.grading import rubric as asked
+from pipeline.grading.grade import Criterion, Flag, Outcome
+from pipeline.grading.judge.costs import charge
+from pipeline.grading.judge.work import Verdict
+from pipeline.grading.references.tolerance import exact, to_step
+from pipeline.grading.rubric import Rubric
+
+
+def award(
+    criteria: Sequence[asked.Criterion],
+    verdicts: Mapping[str, Verdict],
+    flags: Sequence[Flag],
+    *,
+    rubric: Rubric,
+) -> tuple[Criterion, ...]:
+    """Return the points of criteria of a rubric; there is a verdict on each."""
+    done: dict[str, Criterion] = {}
+    for wanted in criteria:
+        waits_for = (done[p] for p in wanted.requires if p in done)
+        failed = next((p for p in waits_for if p.outcome in ("fail", "skip")), None)
+        verdict = _waiting(failed) if failed else verdicts[wanted.id]
+        verdict = charge(verdict, wanted, flags, rubric=rubric)
+        points = to_step((verdict.share or 0) * exact(wanted.points), rubric.step)
+        outcome = _outcome(verdict.share, points, out_of=exact(wanted.points))
+        advised = outcome in ("partial", "fail") and not verdict.explained
+        more = f" {wanted.message}" if wanted.message and advised else ""
+        done[wanted.id] = Criterion(
+            id=wanted.id,
+            title=wanted.title,
+            outcome=outcome,
+            points=float(points),
+            out_of=wanted.points,
+            message=verdict.message + more,
+            expected=verdict.expected,
+            found=verdict.found,
+        )
+    return tuple(done.values())
+
+
+def _waiting(parent: Criterion) -> Verdict:
+    how = "not passed" if parent.outcome == "fail" else "skipped"
+    on = f"{parent.id!r} ({parent.title or parent.id})"
+    return Verdict(share=None, message=f"Not checked: it builds on {on}, which was {how}.")
+
+
+def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> Outcome:
+    """Return how a criterion went, by the points it is given: what rounding forgives has passed."""
+    if share is None:
+        return "skip"
+    return "pass" if points == out_of else "fail" if points == 0 else "partial"

@@ -1,0 +1,106 @@
+"""Points under another rubric, from what the checks found: no recording is read again.
+
+A grading keeps, for every criterion, how far each number is off (exactly, as a fraction). Points,
+tolerances, what remarks cost, lateness and the step are applied to that anew, by the code that
+grades. What decides how far a number is off needs the recordings again: see `needs_recordings`.
+"""
+
+import json
+from collections.abc import Mapping
+from fractions import Fraction
+
+from pipeline.grading import rubric as asked
+from pipeline.grading.grade import Grade
+from pipeline.grading.judge.award import award
+from pipeline.grading.judge.earned import Deviation, earned
+from pipeline.grading.judge.work import Verdict
+from pipeline.grading.references.tolerance import late_deduction
+from pipeline.grading.rubric import Rubric
+
+# Keys that decide what is compared with what; changed, the recordings are judged again.
+_OF_RUBRIC = ("system", "design", "required", "examples")
+_OF_CRITERION = ("check", "parameters", "sigmas", "frequency_percent", "damping_percent")
+
+
+def findings_text(verdicts: Mapping[str, Verdict]) -> str:
+    """Return what the checks found as text, by criterion; same findings, same bytes."""
+    plain = {
+        id_: {
+            "share": None if verdict.share is None else str(verdict.share),
+            "most": str(verdict.most),
+            "models": [[(str(d.error), d.by) for d in model] for model in verdict.models],
+        }
+        for id_, verdict in verdicts.items()
+    }
+    return json.dumps(plain, separators=(",", ":"))
+
+
+def read_findings(text: str) -> dict[str, Verdict]:
+    """Return what `findings_text` made a text of, without messages."""
+    return {
+        id_: Verdict(
+            share=None if plain["share"] is None else Fraction(plain["share"]),
+            message="",
+            most=Fraction(plain["most"]),
+            models=tuple(
+                tuple(Deviation(error=Fraction(error), by=by) for error, by in model)
+                for model in plain["models"]
+            ),
+        )
+        for id_, plain in json.loads(text).items()
+    }
+
+
+def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
+    """Return the points of a grade under another rubric, before points given by hand.
+
+    Outcomes and points are those of grading again; messages are left empty. A criterion without
+    findings is left out.
+    """
+    if grade.status == "failed":
+        nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
+        return grade.model_copy(update={**nothing, "criteria": ()})
+    judged = [wanted for wanted in rubric.criteria if wanted.id in findings]
+    verdicts = {wanted.id: _weighed(wanted, findings[wanted.id]) for wanted in judged}
+    criteria = award(judged, verdicts, grade.flags, rubric=rubric)
+    points = sum((Fraction(str(c.points)) for c in criteria), Fraction(0))
+    late = {"late": rubric.late, "step": rubric.step, "days_late": grade.days_late}
+    deducted = late_deduction(points, **late)
+    changed = {
+        "criteria": criteria,
+        "points": float(points - deducted),
+        "deducted": float(deducted),
+        "out_of": rubric.out_of,
+        "overrides": (),
+    }
+    return grade.model_copy(update=changed)
+
+
+def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
+    """Return a finding with the share that the criterion's tolerances give it."""
+    if not finding.models:
+        return Verdict(share=finding.share, message="")
+    best = max(earned(wanted, model) for model in finding.models)
+    return Verdict(share=min(best, finding.most), message="")
+
+
+def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
+    """Return the keys of a rubric that changed and that only grading again can apply.
+
+    `criteria.ID` is a criterion that was never judged; `criteria.ID.KEY` is one that was judged
+    by other numbers.
+    """
+    found = [key for key in _OF_RUBRIC if getattr(before, key) != getattr(now, key)]
+    if before.late.due != now.late.due:
+        found.append("late.due")
+    old = {criterion.id: criterion for criterion in before.criteria}
+    for criterion in now.criteria:
+        if criterion.id not in old:
+            found.append(f"criteria.{criterion.id}")
+            continue
+        was = old[criterion.id]
+        for key in _OF_CRITERION:
+            # `damping_percent` and `frequency_percent` are those of the laws alone.
+            if getattr(was, key, None) != getattr(criterion, key, None):
+                found.append(f"criteria.{criterion.id}.{key}")
+    return found

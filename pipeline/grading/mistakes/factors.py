@@ -1,0 +1,112 @@
+"""Mistakes that multiply a number by one factor, as a table: a new one is a row here.
+
+Its code stands in `pipeline/grading/grade.py`, its sentences in `templates/words/grading.toml`.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from pipeline.grading import limits
+from pipeline.grading.grade import Code
+
+TURN = 2 * math.pi
+LOG10 = math.log10(math.e)
+MISREAD_RATIO = 0.06  # a ratio of a reduced table that is read off by one slip
+Of = Literal[
+    "frequencies",  # … that the recordings tell well
+    "all frequencies",  # … where some are told vaguely
+    "gains",
+    "sharp gains",  # … that friction does not blur
+    "dampings",  # of decays
+    "sharp dampings",  # … each on its own
+    "frequencies of rows",  # of a table that the students reduced themselves, beside dwells
+    "ratios of rows",
+    "fitted gains",  # … fitted, beside steps and decays
+    "fitted frequencies",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Factor:
+    """A row: reported is what is asked for times a factor.
+
+    Attributes
+    ----------
+    code : of the flag; `said` is the sentence that helps, by its key in the words of grading.
+    of : the numbers in which it is made.
+    tolerance : relative, around what it makes of the recordings' own number.
+    whole, least, tries, from_time_records : see `Mistake`.
+    """
+
+    code: Code
+    said: str
+    of: Of
+    factor: float
+    tolerance: float
+    whole: bool = False
+    least: int = 1
+    tries: int = 1
+    from_time_records: bool = False
+
+
+def _frequency(said: str, factor: float, *, of: Of = "frequencies", least: int = 1) -> Factor:
+    tolerance = limits.UNMISTAKABLE
+    return Factor(
+        code="hz_for_rad_s", said=said, of=of, factor=factor, tolerance=tolerance, least=least
+    )
+
+
+def _peaks(said: str, factor: float, *, of: Of, whole: bool = False) -> Factor:
+    return Factor(
+        code="peak_to_peak", said=said, of=of, factor=factor, tolerance=limits.READ, whole=whole
+    )
+
+
+def _decrement(said: str, factor: float) -> Factor:
+    return Factor(
+        code="peak_count",
+        said=said,
+        of="sharp dampings",
+        factor=factor,
+        tolerance=limits.READ,
+        tries=2,
+        from_time_records=True,
+    )
+
+
+def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
+    return Factor(code=code, said=said, of=of, factor=factor, tolerance=MISREAD_RATIO)
+
+
+FACTORS = (
+    _frequency("hertz", 1 / TURN),
+    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),  # beside a sharper one
+    _frequency("hertz_twice", TURN),
+    # Who reads from peak to peak does so for every cart; of one alone a sharp reference tells.
+    _peaks("peak_to_peak", 2.0, of="gains", whole=True),
+    _peaks("input_peak_to_peak", 0.5, of="gains", whole=True),
+    _peaks("peak_to_peak", 2.0, of="sharp gains"),
+    _peaks("input_peak_to_peak", 0.5, of="sharp gains"),
+    Factor(
+        code="log10_for_ln",
+        said="log10",
+        of="dampings",
+        factor=LOG10,
+        tolerance=limits.LOG10_DAMPING,
+        whole=True,
+        from_time_records=True,
+    ),
+    # The decrement alone, not blurred by friction: over half a period, or over two.
+    _decrement("half_decrement", 0.5),
+    _decrement("twice_decrement", 2.0),
+    # A column headed in Hz that holds rad/s, and the other way round.
+    _reduced("hz_for_rad_s", "reduced_radians", 1 / TURN, of="frequencies of rows"),
+    _reduced("hz_for_rad_s", "reduced_hertz", TURN, of="frequencies of rows"),
+    _reduced("peak_to_peak", "reduced_twice", 2.0, of="ratios of rows"),
+    _reduced("peak_to_peak", "reduced_half", 0.5, of="ratios of rows"),
+    _reduced("peak_to_peak", "gains_twice", 2.0, of="fitted gains"),
+    _reduced("peak_to_peak", "gains_half", 0.5, of="fitted gains"),
+    _reduced("hz_for_rad_s", "frequencies_in_radians", TURN, of="fitted frequencies"),
+    _reduced("hz_for_rad_s", "frequencies_in_hertz", 1 / TURN, of="fitted frequencies"),
+)

@@ -1,0 +1,151 @@
+"""The preview of a graded class under another rubric."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.grading.grade import Grade
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.override import with_overrides
+from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.judge.reweigh import needs_recordings, read_findings, reweigh
+from pipeline.grading.judge.work import Verdict
+from pipeline.grading.rubric import Rubric
+from pipeline.words.progress import Progress, silent
+
+_BARS = 10  # of a distribution; each is a tenth of all points
+
+
+@dataclass(frozen=True, kw_only=True)
+class CriterionChange:
+    """A criterion that would give a team other points.
+
+    Attributes
+    ----------
+    before, after : None where one of the rubrics does not have it.
+    """
+
+    id: str
+    before: float | None
+    after: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class TeamChange:
+    """What a team has, and what it would have.
+
+    Attributes
+    ----------
+    late_before, late_after : points taken off for lateness.
+    by_hand : criteria whose points a person gave; they stay.
+    """
+
+    submission: str
+    before: float
+    after: float
+    criteria: tuple[CriterionChange, ...] = ()
+    late_before: float = 0.0
+    late_after: float = 0.0
+    by_hand: tuple[str, ...] = ()
+
+    @property
+    def gain(self) -> float:
+        """Points more than before; negative where they are fewer."""
+        return self.after - self.before
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricPreview:
+    """A graded class under another rubric.
+
+    Attributes
+    ----------
+    assignment : what the class calls the file of its rubric, without `.toml`.
+    teams : those whose points are known under both, the largest change first.
+    unknown : submissions of which the gradebook does not keep what the checks found.
+    bars_before, bars_after : how many teams have how many tenths of all points.
+    failed : how many could not be graded, and stay so.
+    needs : keys of the rubric that only grading again can apply, see `needs_recordings`.
+    """
+
+    assignment: str
+    out_of_before: float
+    out_of_after: float
+    teams: tuple[TeamChange, ...]
+    bars_before: tuple[int, ...]
+    bars_after: tuple[int, ...]
+    unknown: tuple[str, ...] = ()
+    failed: int = 0
+    needs: tuple[str, ...] = ()
+
+
+def preview_rubric(
+    book: Gradebook, rubric: Rubric, *, progress: Progress = silent
+) -> RubricPreview:
+    """Weigh a class under another rubric; points given by hand stay.
+
+    Raises
+    ------
+    ConfigError : the gradebook holds no class.
+    """
+    before = book.rubric
+    elsewhere = set(book.by_other_rubrics())
+    teams, unknown, failed = [], [], 0
+    for entry in book.entries():
+        if entry.grade.status == "failed" and not entry.overrides:
+            failed += 1
+            continue
+        found = _usable(book.findings(entry), before, rubric)
+        if entry.grade.status == "graded" and (not found or entry.submission in elsewhere):
+            unknown.append(entry.submission)
+            continue
+        teams.append(_compared(entry, found, rubric))
+        progress(f"{len(teams)} submissions")
+    teams.sort(key=lambda team: (-abs(team.gain), team.submission))
+    return RubricPreview(
+        assignment=book.assignment,
+        out_of_before=before.out_of,
+        out_of_after=rubric.out_of,
+        teams=tuple(teams),
+        bars_before=_bars([team.before for team in teams], out_of=before.out_of),
+        bars_after=_bars([team.after for team in teams], out_of=rubric.out_of),
+        unknown=tuple(unknown),
+        failed=failed,
+        needs=tuple(needs_recordings(before, rubric)),
+    )
+
+
+def _bars(points: list[float], *, out_of: float) -> tuple[int, ...]:
+    counts, _ = np.histogram(np.clip(points, 0.0, out_of), bins=_BARS, range=(0.0, out_of))
+    return tuple(map(int, counts))
+
+
+def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Verdict]:
+    """Return the findings of criteria that still check the same."""
+    was = {criterion.id: criterion.check for criterion in before.criteria}
+    same = {c.id for c in now.criteria if was.get(c.id) == c.check}
+    return {id_: found for id_, found in read_findings(text or "{}").items() if id_ in same}
+
+
+def _compared(entry: Entry, found: Mapping[str, Verdict], rubric: Rubric) -> TeamChange:
+    weighed = reweigh(entry.grade, found, rubric=rubric)
+    after = with_overrides(weighed, entry.overrides, rubric=rubric)
+    had, has = _points(entry.grade), _points(after)
+    return TeamChange(
+        submission=entry.submission,
+        before=entry.grade.points,
+        after=after.points,
+        criteria=tuple(
+            CriterionChange(id=id_, before=had.get(id_), after=has.get(id_))
+            for id_ in {**had, **has}
+            if had.get(id_) != has.get(id_)
+        ),
+        late_before=entry.grade.deducted,
+        late_after=after.deducted,
+        by_hand=tuple(sorted(entry.overrides)),
+    )
+
+
+def _points(grade: Grade) -> dict[str, float]:
+    return {criterion.id: criterion.points for criterion in grade.criteria}

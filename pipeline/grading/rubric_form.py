@@ -1,0 +1,246 @@
+"""The numbers of a rubric as a form, and written back into its text.
+
+The text stays the truth. Only the digits of a value that changed are replaced, or a line is added:
+comments, order and everything else stay byte for byte.
+"""
+
+import re
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from typing import Any, Literal
+
+from pipeline.errors import ConfigError
+from pipeline.grading import rubric as asked
+from pipeline.grading.rubric import Rubric, matching
+from pipeline.grading.rubric_file import key_lines
+from pipeline.names import read_name
+from pipeline.submission.complaints import quote
+
+Unit = Literal["points", "percent", "share", "days", "percentage points"]
+Key = tuple[str | int, ...]  # ("criteria", 3, "points")
+
+_UNITS: Mapping[str, Unit] = {
+    "points": "points",
+    "step": "points",
+    "grace_days": "days",
+    "overshoot_full": "percentage points",
+    "overshoot_none": "percentage points",
+}
+_LATE = ("percent_per_day", "grace_days", "most_percent")
+_NUMBER = re.compile(
+    r"^(?P<before>\s*[A-Za-z0-9_.\"'-]+\s*=\s*)[-+]?[0-9][0-9_.eE+-]*(?P<after>\s*(?:#.*)?)$"
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricField:
+    """A number of a rubric.
+
+    Attributes
+    ----------
+    name : of the input; that of a criterion has its id in it.
+    value : as it is shown; a share is shown in percent.
+    """
+
+    name: str
+    key: Key
+    unit: Unit
+    value: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CriterionFields:
+    """The numbers of a criterion; `tolerances` by their keys, in the order of the rubric."""
+
+    id: str
+    title: str
+    check: str
+    points: RubricField
+    tolerances: Mapping[str, RubricField]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RubricForm:
+    """All numbers of a rubric; `costs` by the code of the remark."""
+
+    criteria: tuple[CriterionFields, ...]
+    late: Mapping[str, RubricField]
+    costs: Mapping[str, RubricField]
+    step: RubricField
+
+    @property
+    def charged(self) -> list[str]:
+        """The codes of the remarks that take something."""
+        return [code for code, field in self.costs.items() if field.value != "0"]
+
+    def fields(self) -> Iterator[RubricField]:
+        """Yield every field."""
+        for criterion in self.criteria:
+            yield criterion.points
+            yield from criterion.tolerances.values()
+        yield from self.late.values()
+        yield from self.costs.values()
+        yield self.step
+
+
+class WrongFields(ConfigError):
+    """Fields that are no numbers; `problems` by the name of the field."""
+
+    def __init__(self, problems: Mapping[str, str]) -> None:
+        self.problems = dict(problems)
+        super().__init__("\n".join(f"{name}: {what}" for name, what in problems.items()))
+
+
+def rubric_form(rubric: Rubric) -> RubricForm:
+    """Return the numbers of a rubric as fields; defaults are filled in."""
+    return RubricForm(
+        criteria=tuple(_criterion(i, own, rubric.names) for i, own in enumerate(rubric.criteria)),
+        late={key: _field(("late", key), getattr(rubric.late, key)) for key in _LATE},
+        costs={
+            code: _field(("flags", code), cost, unit="share")
+            for code, cost in rubric.flags.model_dump().items()
+        },
+        step=_field(("step",), rubric.step),
+    )
+
+
+def _criterion(index: int, own: asked.Criterion, names: list[str]) -> CriterionFields:
+    def field(key: str) -> RubricField:
+        name = f"criteria.{own.id}.{key}"
+        return _field(("criteria", index, key), getattr(own, key), name=name)
+
+    return CriterionFields(
+        id=own.id,
+        title=own.title or own.id,
+        check=own.check,
+        points=field("points"),
+        tolerances={key: field(key) for key in _tolerances(own, names)},
+    )
+
+
+def _tolerances(own: asked.Criterion, names: list[str]) -> Iterator[str]:
+    """Yield the keys of the tolerances that judge the numbers of a criterion."""
+    judged = matching(getattr(own, "parameters", ("*",)), names)
+    dampings = [read_name(name).is_damping for name in judged]
+    for key in type(own).model_fields:
+        of_dampings = key.startswith("damping_")
+        by_kind = isinstance(own, asked.Parameters | asked.InitialFinal)
+        if key.endswith(("_percent", "_full", "_none")) and not (
+            by_kind and dampings and (not any(dampings) if of_dampings else all(dampings))
+        ):
+            yield key
+
+
+def _field(
+    key: Key, value: float, *, unit: Unit | None = None, name: str | None = None
+) -> RubricField:
+    number = Decimal(repr(value)) * (100 if unit == "share" else 1)
+    return RubricField(
+        name=name or ".".join(map(str, key)),
+        key=key,
+        unit=unit or _UNITS.get(str(key[-1]), "percent"),
+        value=_digits(number),
+    )
+
+
+def _digits(number: Decimal) -> str:
+    """Return a number without an exponent and without zeros that say nothing."""
+    text = format(number.normalize(), "f")
+    return "0" if text == "-0" else text
+
+
+# ------------------------------------------------------------------------ written back
+
+
+def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Decimal]:
+    """Return the values that were changed in a form, as the file has them.
+
+    Fields that are not among `typed` stay.
+
+    Raises
+    ------
+    WrongFields : some are no numbers, or no fields of this rubric.
+    """
+    fields = {field.name: field for field in form.fields()}
+    changed: dict[Key, Decimal] = {}
+    wrong = {name: "the text does not have it any more" for name in typed if name not in fields}
+    for name, field in fields.items():
+        text = typed.get(name)
+        if text is None or text.strip() == field.value:
+            continue
+        try:
+            number = Decimal(text.strip().replace(",", "."))
+        except InvalidOperation:
+            number = Decimal("nan")
+        if not number.is_finite() or len(text) > 20:
+            wrong[name] = f"needs a number, found {quote(text)}"
+        elif number != Decimal(field.value):
+            changed[field.key] = number / 100 if field.unit == "share" else number
+    if wrong:
+        raise WrongFields(wrong)
+    return changed
+
+
+def with_values(text: str, values: Mapping[Key, Decimal]) -> str:
+    """Return the text of a rubric with other numbers in it.
+
+    Raises
+    ------
+    ConfigError : a value is not on a line of its own; a person must change it in the text.
+    """
+    for key, number in values.items():
+        text = _with_value(text, key, number)
+    return text
+
+
+def _with_value(text: str, key: Key, number: Decimal) -> str:
+    wanted = _set(tomllib.loads(text), key, number)
+    for candidate in _candidates(text, key, _digits(number)):
+        try:
+            if tomllib.loads(candidate) == wanted:
+                return candidate
+        except tomllib.TOMLDecodeError:
+            continue
+    name = ".".join(map(str, key))
+    raise ConfigError(f"{name}: is not on a line of its own; change it in the text")
+
+
+def _set(document: dict[str, Any], key: Key, number: Decimal) -> dict[str, Any]:
+    """Return a document with another number in it."""
+    document = deepcopy(document)
+    here: Any = document
+    for part in key[:-1]:
+        here = here.setdefault(part, {}) if isinstance(here, dict) else here[part]
+    here[key[-1]] = tomllib.loads(f"x = {_digits(number)}")["x"]
+    return document
+
+
+def _candidates(text: str, key: Key, digits: str) -> Iterator[str]:
+    """Yield the text with a number in the line that has it, or in a new one; the best first.
+
+    What looks like a key may stand within a longer value: whoever asks sees what TOML makes of it.
+    """
+    lines, places = text.split("\n"), list(key_lines(text))
+    for number, path in places:
+        found = _NUMBER.match(lines[number - 1]) if path == key else None
+        if found:
+            line = f"{found['before']}{digits}{found['after']}"
+            yield "\n".join([*lines[: number - 1], line, *lines[number:]])
+    new, table = f"{key[-1]} = {digits}", key[:-1]
+    inside = [n for n, path in places if path == table or path[:-1] == table]
+    for number in reversed(inside):
+        yield "\n".join([*lines[:number], new, *lines[number:]])
+    heading = next((n for n, path in places if path == ("criteria", 0)), 0)
+    if heading and not inside:
+        at = _above(lines, heading - 1)
+        yield "\n".join([*lines[:at], f"[{table[0]}]", new, "", *lines[at:]])
+
+
+def _above(lines: Sequence[str], at: int) -> int:
+    """Return where the comments begin that stand above a line."""
+    while at and lines[at - 1].lstrip().startswith("#"):
+        at -= 1
+    return at

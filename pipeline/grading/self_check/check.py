@@ -1,0 +1,171 @@
+"""Check a submission's numbers as grading judges them; the answer has names only."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from pipeline.errors import SubmissionError
+from pipeline.grading.grade import Flag
+from pipeline.grading.judge.checks import judge
+from pipeline.grading.judge.run import analyse_under, prepare_work
+from pipeline.grading.judge.work import Work
+from pipeline.grading.rubric import (
+    Claims,
+    Gains,
+    Parameters,
+    Prefilter,
+    Rubric,
+    StateModel,
+)
+from pipeline.grading.rubric_file import shipped_rubric
+from pipeline.grading.self_check.hints import find_hint
+from pipeline.grading.self_check.log import (
+    CheckAnswer,
+    find_basis,
+    read_answers,
+    write_answer,
+)
+from pipeline.lock import turn_in
+from pipeline.results import Analysis
+from pipeline.submission import Reported, Submission
+from pipeline.words.progress import Progress, silent
+
+# The tables of `[reported]` whose numbers are held against the recordings, by check.
+_TABLE = {
+    "initial": "initial",
+    "final": "final",
+    "state_space": "state_space",
+    "gains": "feedback",
+    "claims": "feedback",
+    "prefilter": "feedback",
+}
+
+
+def check_numbers(
+    submission: Submission,
+    *,
+    rubric: Rubric | None,
+    where: Collection[str] | None = None,
+    progress: Progress = silent,
+) -> CheckAnswer:
+    """Answer which of the reported numbers disagree; asked again about them, where to look.
+
+    The answer is written into the submission's `checks.jsonl` before it is given.
+
+    Parameters
+    ----------
+    rubric : whose tolerances hold; None: those of the shipped rubric for so many carts, for the
+        submission's own system.
+    where : the numbers that a hint is asked for; None: all that may have one.
+
+    Raises
+    ------
+    SubmissionError : nothing is reported, no recording can be read, or the file of earlier answers
+        is not as it was written.
+    """
+    if not _list_reported(submission.reported or Reported()):
+        raise SubmissionError(
+            "no number is reported yet: write what you found under [reported.initial] or "
+            "[reported.final] of submission.toml, then check again"
+        )
+    folder, rubric = submission.folder, rubric or _default_rubric(submission)
+    read_answers(folder)  # a fault of the file is reported before the work
+    judged = analyse_under(submission, rubric=rubric, progress=progress)
+    found = judge_numbers(judged.submission, judged.analysis, rubric=rubric)
+    with turn_in(folder):
+        before = read_answers(folder)
+        answer = next_answer(found, before, basis=find_basis(submission), where=where)
+        write_answer(folder, answer)
+    return answer
+
+
+@dataclass(frozen=True, kw_only=True)
+class JudgedNumbers:
+    """The reported numbers by what became of them, and what it rests on."""
+
+    work: Work
+    flags: Sequence[Flag]
+    disagree: tuple[str, ...]
+    agree: tuple[str, ...]
+    not_checked: tuple[str, ...]
+
+
+def judge_numbers(submission: Submission, analysis: Analysis, *, rubric: Rubric) -> JudgedNumbers:
+    """Judge every reported number as grading does; one that several criteria judge passes all.
+
+    Parameters
+    ----------
+    submission : under the rubric's system, see `analyse_under`.
+    """
+    work, flags, _ = prepare_work(submission, analysis, rubric=rubric)
+    agrees: dict[str, bool] = {}
+    for criterion in rubric.criteria:
+        if table := _TABLE.get(criterion.check):
+            for name, right in judge(criterion, work).agrees.items():
+                number = f"{table}.{name}"
+                agrees[number] = right and agrees.get(number, True)
+    reported = _list_reported(work.reported)
+    entries = [number for number in agrees if number.startswith("state_space.")]
+    listed = [n for n in reported if n != "state_space" or not entries] + entries
+    return JudgedNumbers(
+        work=work,
+        flags=flags,
+        disagree=tuple(n for n in listed if agrees.get(n) is False),
+        agree=tuple(n for n in listed if agrees.get(n)),
+        not_checked=tuple(n for n in listed if n not in agrees),
+    )
+
+
+def next_answer(
+    found: JudgedNumbers,
+    before: Sequence[CheckAnswer],
+    *,
+    basis: str,
+    where: Collection[str] | None = None,
+) -> CheckAnswer:
+    """Return the answer to one more ask.
+
+    A number has a hint only if the last answer said that it disagrees, and nothing was changed
+    since.
+    """
+    known: Collection[str] = ()
+    if before and before[-1].basis == basis:
+        known = before[-1].disagree
+    told = [n for n in found.disagree if n in known and (where is None or n in where)]
+    return CheckAnswer(
+        ask=len(before) + 1,
+        stage="where" if told else "which",
+        basis=basis,
+        disagree=found.disagree,
+        agree=found.agree,
+        not_checked=found.not_checked,
+        doubtful=tuple(found.work.bad),
+        hints=tuple(find_hint(number, found.work, found.flags) for number in told),
+    )
+
+
+def _list_reported(reported: Reported) -> list[str]:
+    """Return the keys of what is reported; A and B are one."""
+    found = [f"initial.{name}" for name in reported.initial]
+    found += [f"final.{name}" for name in reported.final]
+    if reported.state_space and (reported.state_space.A or reported.state_space.B):
+        found.append("state_space")
+    if loop := reported.feedback:
+        for name in ("gains", "prefilter", "overshoot_percent", "settling_time"):
+            if getattr(loop, name) not in (None, ()):
+                found.append(f"feedback.{name}")
+    return found
+
+
+def _default_rubric(submission: Submission) -> Rubric:
+    """Return the shipped rubric for so many carts, for the submission's own system."""
+    system = submission.system
+    shipped = None if system.bench.rigid else shipped_rubric(system.carts)
+    criteria = (
+        Parameters(id="initial", check="initial", points=1),
+        Parameters(id="final", check="final", points=1),
+        StateModel(id="state", check="state_space", points=1),
+        Gains(id="gains", check="gains", points=1),
+        Claims(id="claims", check="claims", points=1),
+        Prefilter(id="prefilter", check="prefilter", points=1),
+    )
+    return Rubric(version=1, system=system, criteria=shipped.criteria if shipped else criteria)

@@ -1,1 +1,0 @@
-"""Which recordings do not hold what happened, and what they did instead."""

@@ -1,0 +1,294 @@
+"""The variables of a `.mat` file: versions 4 to 7 are read here, version 7.3 by h5py.
+
+A hostile file can ask for gigabytes, for a walk that never ends or for a file elsewhere on the
+disk; in scipy's reader a few flipped bytes end the whole process. So only real matrices are read,
+inflated no further than a recording is long. Layout: "MAT-File Format", The MathWorks, R2023b.
+"""
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.table import Variable
+
+_MOST_BYTES = 200_000_000  # of all variables, inflated
+_MOST_VARIABLES, _LONGEST_NAME = 1000, 64  # no workspace has more
+_MOST_DIMENSIONS = 32
+# Codes of version 5: elements, a flag, the classes of variables, and how their numbers are stored.
+_MATRIX, _COMPRESSED, _OPAQUE, _COMPLEX = 14, 15, 17, 0x800
+_CLASSES = {
+    6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
+}  # fmt: skip
+_OTHER_CLASSES = {
+    1: "cell", 2: "struct", 3: "object", 4: "text", 5: "sparse", 16: "function", 17: "object",
+}  # fmt: skip
+_STORED = {
+    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8",
+}  # fmt: skip
+_NUMBERS = frozenset(
+    "double single logical int8 uint8 int16 uint16 int32 uint32 int64 uint64".split()
+)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class MatVariable:
+    """A variable: its numbers (rows, columns), or None and what it is instead.
+
+    `bytes` is how many it takes in the file, where it has no numbers that are read.
+    """
+
+    name: str
+    values: np.ndarray | None
+    kind: str
+    size: tuple[int, ...] = ()
+    bytes: int = 0
+
+    @property
+    def numbers(self) -> np.ndarray:
+        """Its numbers, where it has any."""
+        assert self.values is not None
+        return self.values
+
+    @property
+    def samples(self) -> int:
+        """How many samples it has, if it is a signal or a matrix of them."""
+        return max(self.numbers.shape)
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether its numbers are those of one signal."""
+        return self.numbers.size > 1 and min(self.numbers.shape) == 1
+
+    def told(self, *, read: bool, advice: str = "") -> Variable:
+        """Return what an inspection says of it."""
+        return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
+
+    def __str__(self) -> str:
+        return str(self.told(read=False))
+
+
+def is_mat(raw: bytes) -> bool:
+    """Tell a `.mat` file by its first bytes."""
+    return raw.startswith(b"MATLAB") or _v4_heading(raw, 0) is not None
+
+
+def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
+    """Return the variables of a `.mat` file, in its order.
+
+    Raises
+    ------
+    SubmissionError : it is broken, or no workspace of a bench has so many.
+    """
+    if raw[:10] == b"MATLAB 7.3" or raw[512:516] == b"\x89HDF":
+        read = _version_7_3
+    else:
+        read = _version_5 if raw.startswith(b"MATLAB") else _version_4
+    try:
+        variables = list(islice(read(raw), _MOST_VARIABLES + 1))
+    # h5py raises what it stumbles on.
+    except (ArithmeticError, LookupError, NotImplementedError, OSError, RuntimeError, TypeError,
+            ValueError, struct.error, zlib.error):  # fmt: skip
+        raise SubmissionError(f"{source}: the .mat file is broken or cut short") from None
+    if len(variables) > _MOST_VARIABLES:
+        raise SubmissionError(
+            f"{source}: holds more than {_MOST_VARIABLES:,} variables; keep those of the recording"
+        )
+    return variables
+
+
+def _matrix(name: str, values: np.ndarray, *, bytes: int) -> MatVariable:
+    """Return what a variable of MATLAB's numbers is."""
+    if np.iscomplexobj(values):  # in version 7.3
+        return _nothing(name, "complex", size=values.shape, bytes=bytes)
+    dtype = np.dtype("u1") if values.dtype == bool else values.dtype.newbyteorder("=")
+    return MatVariable(name=name, values=values.astype(dtype), kind=str(dtype), size=values.shape)
+
+
+def _nothing(name: str, kind: str, *, size: tuple[int, ...] = (), bytes: int) -> MatVariable:
+    return MatVariable(name=name, values=None, kind=kind, size=size, bytes=bytes)
+
+
+def _no_matrix(size: tuple[int, ...]) -> str:
+    """Return why numbers of a size are no matrix; "" where they are."""
+    if len(size) != 2 or min(size) < 0:
+        return "array of more than two dimensions"
+    return "empty" if 0 in size else ""
+
+
+# ------------------------------------------------------------------------- versions 5 to 7
+
+
+def _version_5(raw: bytes) -> Iterator[MatVariable]:
+    order = {b"IM": "<", b"MI": ">"}[raw[126:128]]
+    left, at = _MOST_BYTES, 128
+    while at + 8 <= len(raw):
+        kind, content = _content(raw, at, order)
+        at += 8 + len(content)
+        if kind == _COMPRESSED:
+            inflated = zlib.decompressobj().decompress(content, left + 1)
+            left -= len(inflated)
+            if left < 0:
+                raise ValueError(len(inflated))
+            kind, content = _content(inflated, 0, order)
+        if kind == _MATRIX and content:
+            one = _read_matrix(content, order)
+            if one.name:  # MATLAB keeps what its objects share without a name
+                yield one
+    if raw[at:].strip(b"\0"):
+        raise ValueError(at)
+
+
+def _content(raw: bytes, at: int, order: str) -> tuple[int, bytes]:
+    """Return (type, bytes) of the long element at `at`, which must be whole."""
+    kind, size = struct.unpack_from(order + "II", raw, at)
+    content = raw[at + 8 : at + 8 + size]
+    if len(content) < size:
+        raise ValueError(size)
+    return kind, content
+
+
+def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
+    """Return (type, bytes, where the next element starts) of the element at `at`."""
+    (word,) = struct.unpack_from(order + "I", content, at)
+    if not word >> 16:
+        kind, data = _content(content, at, order)
+        return kind, data, at + 8 + (len(data) + 7) // 8 * 8
+    # The short form: type, size and up to four bytes in eight.
+    size = word >> 16
+    data = content[at + 4 : at + 4 + size]
+    if size > 4 or len(data) < size:
+        raise ValueError(size)
+    return word & 0xFFFF, data, at + 8
+
+
+def _read_matrix(content: bytes, order: str) -> MatVariable:
+    _, flags, at = _element(content, 0, order)
+    (flag,) = struct.unpack_from(order + "I", flags)
+    code = flag & 0xFF
+    shape: tuple[int, ...] = ()
+    if code != _OPAQUE:
+        _, dims, at = _element(content, at, order)
+        if len(dims) > 4 * _MOST_DIMENSIONS:
+            raise ValueError(len(dims))
+        shape = tuple(int(d) for d in np.frombuffer(dims, dtype=order + "i4"))
+    _, name, at = _element(content, at, order)
+    label = _label(name)
+    kind = "" if code in _CLASSES else _OTHER_CLASSES.get(code, "unknown")
+    kind = kind or ("complex" if flag & _COMPLEX else _no_matrix(shape))
+    if kind:
+        return _nothing(label, kind, size=shape, bytes=0 if kind == "empty" else len(content))
+    stored_as, data, _ = _element(content, at, order)
+    values = np.frombuffer(data, dtype=order + _STORED[stored_as])
+    # MATLAB stores whole doubles as short integers.
+    return _matrix(label, values.astype(_CLASSES[code]).reshape(shape, order="F"), bytes=0)
+
+
+def _label(name: bytes) -> str:
+    label = name.decode("ascii")
+    if not label.isprintable() or len(label) > _LONGEST_NAME:
+        raise ValueError(label)
+    return label
+
+
+# ------------------------------------------------------------------------------- version 4
+
+
+def _version_4(raw: bytes) -> Iterator[MatVariable]:
+    at = 0
+    while at < len(raw):
+        heading = _v4_heading(raw, at)
+        if heading is None:
+            raise ValueError(at)
+        dtype, size, length, is_real = heading
+        label = _label(raw[at + 20 : at + 20 + length].rstrip(b"\0"))
+        taken = math.prod(size) * dtype.itemsize
+        data = raw[at + 20 + length :][:taken]
+        at += 20 + length + (taken if is_real else 2 * taken)
+        if at > len(raw):
+            raise ValueError(at)
+        if is_real and 0 not in size:
+            values = np.frombuffer(data, dtype=dtype).reshape(size, order="F")
+            yield _matrix(label, values, bytes=taken)
+        else:
+            yield _nothing(label, "no real matrix", size=size, bytes=taken)
+
+
+def _v4_heading(raw: bytes, at: int) -> tuple[np.dtype, tuple[int, int], int, bool] | None:
+    """Return (type, size, length of the name, whether real), None where no variable begins."""
+    for order in "<>" if len(raw) >= at + 20 else "":
+        code, rows, columns, imaginary, length = struct.unpack_from(order + "5i", raw, at)
+        machine, zero, precision, kind = (code // 10**power % 10 for power in (3, 2, 1, 0))
+        known = machine == "<>".index(order) and zero == 0 and precision < 6 and kind < 2
+        sensible = min(code, rows, columns) >= 0 and imaginary in (0, 1) and 1 < length <= 64
+        if code < 5000 and known and sensible:
+            dtype = np.dtype(order + ("f8", "f4", "i4", "i2", "u2", "u1")[precision])
+            return dtype, (rows, columns), length, not (imaginary or kind)
+    return None
+
+
+# ----------------------------------------------------------------------------- version 7.3
+
+
+def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
+    import h5py
+
+    left = _MOST_BYTES
+    with h5py.File(BytesIO(raw), "r") as file:
+        for name in map(str, file):
+            if name.startswith("#"):  # what MATLAB's cells and objects refer to
+                continue
+            is_link = not isinstance(file.get(name, getlink=True), h5py.HardLink)
+            if is_link or not name.isprintable() or len(name) > _LONGEST_NAME:
+                raise ValueError(name)
+            item: Any = file[name]
+            if isinstance(item, h5py.Datatype):  # a type that somebody named: no numbers
+                continue
+            if isinstance(item, h5py.Group):
+                kind = "sparse" if "MATLAB_sparse" in item.attrs else "struct"
+                own = [
+                    key for key in item if isinstance(item.get(key, getlink=True), h5py.HardLink)
+                ]
+                parts = [item[key] for key in own]
+                taken = sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
+                yield _nothing(name, kind, size=(1, 1), bytes=taken)
+                continue
+            size = tuple(reversed(item.shape)) if len(item.shape) > 1 else (item.size, 1)
+            kind = _class_of(item)
+            if kind in _NUMBERS:  # so its attribute says
+                kind = _no_matrix(size) if _holds_numbers(item.dtype) else "unknown"
+            left -= item.nbytes if not kind else 0
+            if left < 0 or item.is_virtual or item.external:  # the numbers of another file
+                raise ValueError(name)
+            if kind:
+                yield _nothing(name, kind, size=size, bytes=item.nbytes)
+            else:
+                values = np.atleast_1d(item[()])
+                if values.dtype.names == ("real", "imag"):
+                    values = values["real"] + 1j * values["imag"]
+                yield _matrix(name, values.T.reshape(size), bytes=item.nbytes)
+
+
+def _holds_numbers(dtype: np.dtype) -> bool:
+    """Tell numbers, or the pairs of a complex matrix, from texts, references and other records."""
+    if dtype.names == ("real", "imag"):
+        return all(dtype[name].kind in "iuf" for name in ("real", "imag"))
+    return dtype.kind in "biuf" and dtype.shape == ()
+
+
+def _class_of(item: Any) -> str:
+    """Return MATLAB's class of a data set; of one that another program wrote, by its numbers."""
+    if "MATLAB_empty" in item.attrs:
+        return "empty"
+    of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")
+    name = of.decode("ascii") if isinstance(of, bytes) else str(of)
+    if name not in _NUMBERS and "MATLAB_object_decode" in item.attrs:
+        return "object"
+    return "text" if name == "char" else name

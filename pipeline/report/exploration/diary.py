@@ -1,0 +1,228 @@
+"""`exploration.html`: what is known, then how it came to be known, turn by turn."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pipeline.gap.types import Gap
+from pipeline.names import read_name
+from pipeline.output import write_file
+from pipeline.report.document import Block, Heading, Tile, Tiles, Tone, paragraph
+from pipeline.report.figures.style import QUIET, SECOND, legend_above, panels
+from pipeline.report.gap.story import before_after_picture, deciding_trace
+from pipeline.report.gap.verdict import error_board, verdict_blocks, verdict_title
+from pipeline.report.render.html import render_html
+from pipeline.report.sections.page import Page
+from pipeline.results import Analysis
+from pipeline.words.numbers import NOTHING, count, listing, unit_text, with_error
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import spans
+from pipeline.words.text import capital, clean, name_span, rich, symbol_text
+
+NAME = "exploration.html"
+_WORDS = phrases("exploration")
+
+
+@dataclass(frozen=True, kw_only=True)
+class WeighedExplanation:
+    """One explanation of the gap: its effects in words, and its weight among those in dispute."""
+
+    name: str
+    weight: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Turn:
+    """What was known at one turn.
+
+    Attributes
+    ----------
+    seconds : at the bench so far, rests included.
+    recorded : ids of the recordings made in this turn.
+    errors : relative standard error of each named parameter, by name; None where it has none.
+    verdict : of the gap; "" where it could not be looked for.
+    explanations : in dispute, that of the model first, or the one that is named; none where the
+        linear chain does.
+    left, floor : what the model leaves of the motion, and what noise alone would.
+    reached : all that was asked for is known, and what else acts has a name or is not there.
+    said : what is known, what is doubted and why the next recording is made, in one sentence.
+    gap : as it was looked for at that turn; None where it could not be.
+    """
+
+    seconds: float
+    recorded: tuple[str, ...]
+    errors: dict[str, float | None]
+    verdict: str
+    explanations: tuple[WeighedExplanation, ...]
+    left: float | None
+    floor: float | None
+    reached: bool
+    said: str
+    gap: Gap | None = None
+
+
+def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:
+    """Write the diary into a submission's folder; `wanted`: the relative error asked for."""
+    page = Page(analysis)
+    sections = page.sections(
+        [
+            ("summary", _WORDS.text("answer"), lambda page: _answer(page, turns, wanted)),
+            ("turns", _WORDS.text("turns"), lambda page: _story(page, turns)),
+            ("errors", _WORDS.text("errors"), lambda page: _errors(page, turns, wanted)),
+            ("explanations", _WORDS.text("explanations"), lambda page: _gap(page, turns)),
+        ],
+        doing="diary",
+    )
+    document = page.document(sections, about=_WORDS.text("about"))
+    write_file(folder / NAME, render_html(document))
+    return folder / NAME
+
+
+def _answer(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
+    """Return what is known at the end: parameters with errors, effects with sizes, what is left."""
+    last = turns[-1]
+    blocks: list[Block] = [_board(turns, wanted)]
+    if last.gap:
+        blocks += [*verdict_blocks(last.gap), error_board(last.gap)]
+    fit = page.analysis.fit
+    assert fit is not None
+    rows = [
+        [
+            name_span(name),
+            with_error(estimate.value, estimate.std),
+            unit_text(clean(read_name(name).unit(page.units))) or "1",
+            _known(last.errors.get(name)),
+        ]
+        for name, estimate in fit.parameters.items()
+    ]
+    return [*blocks, page.table(_WORDS, "known_table", rows, "ldlr")]
+
+
+def _board(turns: Sequence[Turn], wanted: float) -> Tiles:
+    last = turns[-1]
+    worst = max((error for error in last.errors.values() if error is not None), default=None)
+    known = worst is not None and worst <= wanted
+    told = {"wanted": _known(wanted), "turns": count(len(turns), "turn")}
+    values: dict[str, tuple[str, Tone]] = {
+        "tile_worst": (_known(worst), "good" if known else "bad"),
+        "tile_verdict": (verdict_title(last.gap) if last.gap else NOTHING, _tone(last.gap)),
+        "tile_time": (f"{last.seconds:.0f}\u00a0s", ""),
+    }
+    return Tiles(
+        tuple(
+            Tile(_WORDS.spans(key), spans(value), _WORDS.spans(f"{key}_note", **told), tone)
+            for key, (value, tone) in values.items()
+        )
+    )
+
+
+def _tone(gap: Gap | None) -> Tone:
+    if gap is None or gap.verdict == "ambiguous":
+        return ""
+    return "good" if gap.verdict in ("none", "named") else "bad"
+
+
+def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
+    """Tell each turn: when, what was recorded, what was said, and the run that decided it."""
+    blocks: list[Block] = []
+    for number, turn in enumerate(turns, start=1):
+        recorded = listing(turn.recorded) or _WORDS.text("nothing_new")
+        head = {"number": str(number), "seconds": f"{turn.seconds:.0f}", "recorded": recorded}
+        blocks.append(Heading(_WORDS.spans("turn", **head)))
+        blocks.append(paragraph(rich(clean(turn.said + "."))))
+        trace = deciding_trace(turn.gap, turn.recorded) if turn.gap else None
+        if turn.gap and trace:
+            blocks.append(before_after_picture(page, turn.gap, trace, number=number))
+    return blocks
+
+
+def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
+    names = [name for name in turns[-1].errors if turns[-1].errors[name] is not None]
+    if not names:
+        return []
+    rows = [[name_span(name), *(_known(turn.errors.get(name)) for turn in turns)] for name in names]
+    head = ["", *(f"{turn.seconds:.0f} s" for turn in turns)]
+    table = page.headed_table(_WORDS.text("errors_table"), head, rows, "l" + "r" * len(turns))
+    if len(turns) < 2:  # nothing has fallen yet
+        return [table]
+    figure = _shrinking(turns, names, wanted)
+    return [page.picture("shrinking", figure, _WORDS, "shrinking", wanted=_known(wanted)), table]
+
+
+def _known(error: float | None) -> str:
+    return NOTHING if error is None else f"{100 * error:.2g} %"
+
+
+def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Figure:
+    """Draw each parameter's standard error against time at the bench."""
+    figure, (ax,) = panels(2.2)
+    seconds = [turn.seconds for turn in turns]
+    for name in names:
+        errors = [turn.errors.get(name) for turn in turns]
+        shown = [np.nan if error is None else 100 * error for error in errors]
+        ax.plot(seconds, shown, "o-", ms=3, lw=0.9, label=symbol_text(name))
+    ax.axhline(100 * wanted, color=QUIET, lw=0.8, ls="--")
+    every = [100 * e for turn in turns for e in turn.errors.values() if e]
+    _whole_axes(ax, turns, [100 * wanted, *(min(e, 100.0) for e in every)])  # above: not known
+    ax.set_ylabel("standard error [%]")
+    # Beside the axes: three carts have a dozen.
+    box = ax.get_position()
+    ax.set_position((box.x0, box.y0, box.width - 0.09, box.height))
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderpad=0.0, handlelength=1.6)
+    return figure
+
+
+def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> None:
+    """Let time begin at zero, and a logarithmic axis go from one power of ten to another."""
+    ax.set_xlim(0.0, 1.04 * turns[-1].seconds)
+    ax.set_xlabel("time at the bench [s]")
+    exponents = np.log10([value for value in values if value > 0])
+    low, high = np.floor(exponents.min()), np.ceil(exponents.max())
+    ax.set_yscale("log")
+    ax.set_ylim(10.0**low, 10.0 ** max(high, low + 1))
+
+
+def _explained(turn: Turn) -> list[str]:
+    """Return each explanation in dispute with its weight; of one alone there is none to tell."""
+    if len(turn.explanations) < 2:
+        return [one.name for one in turn.explanations]
+    weights = [
+        f"{100 * one.weight:.0f} %" if one.weight >= 0.01 else "under 1 %"
+        for one in turn.explanations
+    ]
+    weights[0] = f"in the model, {weights[0]}"
+    return [
+        f"{one.name} ({weight})" for one, weight in zip(turn.explanations, weights, strict=True)
+    ]
+
+
+def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
+    """Show what the model leaves, and between which explanations the data were undecided."""
+    looked = [turn for turn in turns if turn.left is not None and turn.floor is not None]
+    if not looked:
+        return []
+    rows = [
+        (f"{turn.seconds:.0f} s", turn.verdict, capital("; ".join(_explained(turn))))
+        for turn in looked
+    ]
+    table = page.table(_WORDS, "gap_table", rows, "lll")
+    if len(looked) < 2:
+        return [table]
+    return [page.picture("left", _left_figure(turns, looked), _WORDS, "left"), table]
+
+
+def _left_figure(turns: Sequence[Turn], looked: Sequence[Turn]) -> Figure:
+    """Draw what the model leaves of the motion over time, and what noise alone would."""
+    figure, (ax,) = panels(1.5)
+    seconds = [turn.seconds for turn in looked]
+    left, floor = ([100 * (getattr(t, name) or 0.0) for t in looked] for name in ("left", "floor"))
+    ax.plot(seconds, left, "o-", label="left by the model")
+    ax.plot(seconds, floor, "--", color=SECOND, label="noise alone")
+    _whole_axes(ax, turns, [*left, *floor])
+    ax.set_ylabel("of the motion [%]")
+    legend_above(ax)
+    return figure

@@ -1,0 +1,405 @@
+"""The gap report: the verdict on one page, then the story step by step."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from pipeline import __version__
+from pipeline.arrays import Array
+from pipeline.estimation.interventions import but_releases
+from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
+from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.report.document import Block, Document, bullet_list, paragraph
+from pipeline.report.equations.effects import augmented_equations, law
+from pipeline.report.figures.gap import (
+    before_after_figure,
+    by_record_figure,
+    force_figure,
+    force_left_figure,
+    predicted_figure,
+    spectrum_figure,
+    timing_figure,
+)
+from pipeline.report.gap.tables import (
+    effect_parameter_table,
+    error_table,
+    intervention_table,
+    rival_table,
+    window_table,
+)
+from pipeline.report.gap.verdict import (
+    WORDS,
+    added_name,
+    contenders,
+    effect_name,
+    error_board,
+    next_block,
+    place_name,
+    scope_blocks,
+    share,
+    shares,
+    verdict_blocks,
+    verdict_title,
+    whole_model,
+)
+from pipeline.report.render.builder import Part
+from pipeline.report.render.write import write_document
+from pipeline.report.sections.housekeeping import provenance_blocks
+from pipeline.report.sections.page import Page, left_out, remarks
+from pipeline.report.sections.parameters import chain_table
+from pipeline.results import Analysis
+from pipeline.words.numbers import count, listing, percent
+from pipeline.words.progress import Progress, silent
+from pipeline.words.spans import plain
+from pipeline.words.text import capital, clean
+
+_MOST_ROWS = 28  # runs in the overview; the JSON has all
+_MORE_TRACES = 3  # drawn after the one in the summary
+
+
+def render_gap(
+    gap: Gap,
+    analysis: Analysis,
+    out: Path,
+    *,
+    pdf: bool = True,
+    progress: Progress = silent,
+) -> None:
+    """Write `gap.html`, `gap.pdf` and `figures/*.svg` into the folder `out`."""
+    document = build_gap_document(gap, analysis, progress=progress)
+    write_document(document, out, name="gap", pdf=pdf)
+
+
+def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = silent) -> Document:
+    """Return the gap report; sections that have nothing to show are left out."""
+    page = Page(analysis)
+    worst = _worst_first(gap)
+    forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
+    where = WORDS.text("where_enough" if gap.verdict == "none" else "where_fails")
+    parts: list[Part] = [
+        ("summary", verdict_title(gap), lambda page: _summary(page, gap, worst[:1])),
+        ("where", where, lambda page: _where(page, gap)),
+    ]
+    for i, found in enumerate(gap.effects):
+        name = effect_name(found.effect, found.where)
+        title = name
+        if gap.verdict == "unexplained":
+            title = WORDS.text("suspect", name=name)
+        elif gap.verdict == "ambiguous" and found is contenders(gap)[0]:
+            title = WORDS.text("one_explanation", name=name)
+        parts.append(
+            (
+                f"effect-{i + 1}",
+                capital(title),
+                lambda page, i=i: _effect(page, gap, i, forces=forces),
+            )
+        )
+    made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
+    parts += [
+        ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
+        ("force-left", "What force is left", lambda page: _force_left(page, gap)),
+        ("hands", WORDS.text("hands"), lambda page: _hands(page, gap)),
+        ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
+        ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
+        ("method", "How this was found", lambda page: _method(gap)),
+        ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
+        ("provenance", "Provenance", lambda page: provenance_blocks(page, made)),
+    ]
+    return page.document(
+        page.sections(parts, doing="gap report", progress=progress),
+        about="What the linear model leaves out",
+    )
+
+
+# --------------------------------------------------------------------- the page
+
+
+def _summary(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
+    blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
+    blocks += [before_after_picture(page, gap, trace, number=1) for trace in worst]
+    if gap.verdict == "none":
+        blocks += scope_blocks(gap, position=page.position, drive=page.drive)
+    return blocks + next_block(gap)
+
+
+def _where(page: Page, gap: Gap) -> list[Block]:
+    rows = sorted(gap.by_record, key=lambda row: (not row.held_out, -row.baseline))
+    if not rows:
+        return []
+    shown = rows[:_MOST_ROWS]
+    top, more = shown[0], left_out(len(rows) - len(shown))
+    alone = "" if gap.effects else "_linear"
+    said = {"more": more, "runs": count(len(shown), "run"), "run": top.experiment, "cart": top.cart}
+    figure = by_record_figure(shown, added=added_name(gap))
+    picture = page.picture("by-record", figure, WORDS, f"by_record{alone}", **said, **shares(top))
+    blocks: list[Block] = [picture]
+    if gap.where:
+        blocks.append(window_table(page, gap.where, model=WORDS.text("linear_model")))
+    return blocks
+
+
+def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
+    """Return one cart in one run: measured, both models, and what each leaves below."""
+    row = _row(gap, trace)
+    noise = 0.0
+    if row is not None and row.final > 0:
+        left = trace.measured - trace.final
+        noise = row.noise_floor * (float((left**2).mean() ** 0.5) / row.final)
+    alone = "" if gap.effects else "_linear"
+    figure = before_after_figure(
+        trace,
+        noise=noise,
+        position_unit=page.position,
+        added=added_name(gap),
+        touched=_touched(page, gap, trace),
+    )
+    said = {
+        "cart": trace.cart,
+        "run": trace.experiment,
+        "held": WORDS.text("held_out" if trace.held_out else "used"),
+        "errors": WORDS.text(f"run_errors{alone}", **shares(row)) if row else "",
+        "model": whole_model(gap),
+    }
+    return page.picture(f"before-after-{number}", figure, WORDS, f"before_after{alone}", **said)
+
+
+# ------------------------------------------------------------------- the effects
+
+
+def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]) -> list[Block]:
+    found = gap.effects[index]
+    effect = found.effect
+    before, after = share(found.nrmse_before), share(found.nrmse_after)
+    blocks: list[Block] = [
+        paragraph(WORDS.spans("step", sentence=effect.sentence, before=before, after=after)),
+        law(gap.model.terms, index),
+        *_evidence(page, gap, found, forces=forces, number=index + 1),
+        effect_parameter_table(page, found),
+    ]
+    if found.rivals:
+        blocks.append(rival_table(page, found, gap))
+    facts = {
+        "fingerprint": effect.fingerprint,
+        "decides": effect.deciding_run,
+        "equivalent": effect.equivalent,
+        "read": effect.reference,
+    }
+    blocks.append(bullet_list(WORDS.spans(key, text=text) for key, text in facts.items() if text))
+    return blocks
+
+
+def _evidence(
+    page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
+) -> list[Block]:
+    """Return the figure that shows the effect: force against what causes it, or in time."""
+    axis, added = found.effect.axis, added_name(gap)
+    if axis == "frequency":
+        held_out = [trace for trace in gap.traces if trace.held_out]
+        if not held_out:
+            return []
+        shown = "shown_frequency"
+        figure = spectrum_figure(held_out, position_unit=page.position, added=added)
+    elif axis == "time":
+        shown, figure = "shown_time", timing_figure(forces, drive=page.drive, added=added)
+    else:
+        units = (page.position, page.drive)
+        shown, figure = "shown_force", force_figure(found, forces, units=units, added=added)
+    if figure is None:
+        return []
+    others = WORDS.text("others") if len(gap.effects) > 1 else ""
+    said = {
+        "name": effect_name(found.effect, found.where),
+        "shown": WORDS.text(shown, others=others, model=whole_model(gap)),
+        "axis": axis,
+        "fingerprint": found.effect.fingerprint,
+    }
+    return [page.picture(f"effect-{number}", figure, WORDS, "evidence", **said)]
+
+
+# --------------------------------------------------------------- runs and rivals
+
+
+def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
+    blocks = [
+        before_after_picture(page, gap, trace, number=i)
+        for i, trace in enumerate(worst[:_MORE_TRACES], start=2)
+    ]
+    if gap.left and gap.effects:
+        blocks.append(window_table(page, gap.left, model=whole_model(gap)))
+    return blocks
+
+
+def _force_left(page: Page, gap: Gap) -> list[Block]:
+    """Show what no law of the model explains, cart by cart, and the formula for it."""
+    if not gap.residual:
+        return []
+    model = whole_model(gap) if gap.effects else WORDS.text("linear_model")
+    blocks: list[Block] = [paragraph(WORDS.spans("force_left", model=model))]
+    for residual in gap.residual:
+        cart = str(residual.cart)
+        if residual.formula is None:
+            said = WORDS.spans("force_left_no_formula", cart=cart)
+        else:
+            said = WORDS.spans(
+                "force_left_formula",
+                formula=residual.formula.text,
+                unit=residual.unit,
+                position=page.position,
+                drive=page.drive,
+                share=percent(100 * residual.formula.explains),
+            )
+        shown = {
+            "cart": cart,
+            "line": WORDS.text("force_left_formula_line") if residual.formula else "",
+            "quantities": listing([shown.quantity for shown in residual.against]),
+            "formula": plain(said),
+        }
+        figure, key = force_left_figure(residual), "force_left_figure"
+        blocks += [page.picture(f"force-left-{cart}", figure, WORDS, key, **shown), paragraph(said)]
+    return blocks
+
+
+def _hands(page: Page, gap: Gap) -> list[Block]:
+    hands = but_releases(gap.interventions, list(page.records.values()))
+    return [intervention_table(page, hands)] if hands else []
+
+
+def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
+    """Return the stretches right before and after a run in which a hand moved a cart."""
+    record = page.records.get(trace.experiment)
+    if record is None:
+        return []
+    near = 2.0 * record.sample_time
+    found = []
+    for one in gap.interventions:
+        before, after = trace.t[0] - one.end, one.start - trace.t[-1]
+        if one.experiment == record.id and (0.0 <= before < near or 0.0 <= after < near):
+            shown = (record.t >= one.start) & (record.t <= one.end)
+            found.append((record.t[shown], record.position(trace.cart)[shown]))
+    return found
+
+
+def _apart(page: Page, gap: Gap) -> list[Block]:
+    predicted = _predicted(page, gap)
+    if gap.verdict != "ambiguous":
+        return predicted
+    last, rival = contenders(gap)
+    pair = [(last.effect, last.where), *([(rival.effect, rival.where)] if rival else [])]
+    runs = bullet_list(
+        WORDS.spans("apart_run", name=effect_name(effect, where), run=effect.deciding_run)
+        for effect, where in pair
+    )
+    return [paragraph(WORDS.spans("apart")), runs, *predicted]
+
+
+def _predicted(page: Page, gap: Gap) -> list[Block]:
+    """Return the recording proposed, and what each explanation predicts of it."""
+    proposal = gap.proposal
+    if proposal is None or proposal.prediction is None:
+        return []
+    table = proposal.recording
+    if "release" in table:
+        said = WORDS.text("predicted_release", cart=str(table["release"]))
+    else:
+        said = WORDS.text(
+            "predicted_driven",
+            drive=page.drive,
+            **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
+        )
+    one, other = _told_apart(*(gap.contenders[i] for i in proposal.prediction.pair))
+    figure = predicted_figure(proposal.prediction, names=(one, other), position_unit=page.position)
+    paragraph_ = WORDS.spans(
+        "predicted",
+        recording=said,
+        separation=f"{proposal.separation:.2g}",
+        one=one,
+        other=other,
+        hand=WORDS.text("predicted_hand", note=table["note"]) if "note" in table else "",
+    )
+    names = {"cart": proposal.prediction.cart, "names": f"{one}; {other}"}
+    picture = page.picture("predicted", figure, WORDS, "predicted_figure", **names)
+    return [paragraph(paragraph_), picture]
+
+
+def _told_apart(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
+    """Return what either model has that the other has not, in words."""
+    mine, yours = (
+        [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
+    )
+    apart = (
+        [name for name in mine if name not in yours],
+        [name for name in yours if name not in mine],
+    )
+    first, second = map(listing, apart)
+    return first or f"without {second}", second or f"without {first}"
+
+
+# --------------------------------------------------------------------- the model
+
+
+def _model(page: Page, gap: Gap) -> list[Block]:
+    terms = gap.model.terms
+    if not terms:
+        return []
+    blocks: list[Block] = [
+        paragraph(WORDS.spans("model", drive=page.drive)),
+        augmented_equations(page.analysis.bench.springs, terms),
+    ]
+    for index, term in enumerate(terms):
+        name, place = effect_name(term.effect, term.where), place_name(term.where)
+        where = WORDS.spans(f"where_{term.effect.place}", name=capital(name), place=place)
+        blocks += [paragraph(where), law(terms, index)]
+    table = chain_table(page, gap.model.chain, std=gap.chain_std)
+    scatter = [
+        WORDS.text("scatter", cart=cart, spread=percent(100 * spread))
+        for cart, spread in sorted(gap.spread.items())
+    ]
+    return [*blocks, table, *remarks(scatter), paragraph(WORDS.spans("model_file"))]
+
+
+# ------------------------------------------------------------------ housekeeping
+
+
+def _method(gap: Gap) -> list[Block]:
+    runs = bullet_list(
+        WORDS.spans(key, runs=clean(listing(names)))
+        for key, names in (("fitted_to", gap.training), ("runs_held_out", gap.held_out))
+        if names
+    )
+    if gap.verdict == "none":
+        method = WORDS.spans("method_none")
+    else:
+        method = WORDS.spans("method" if gap.complete else "method_so_far")
+    return [paragraph(method), runs, *remarks(list(gap.notes))]
+
+
+def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
+    """Return the cart that moves least as the linear model says, in runs just recorded.
+
+    Of all runs where the gap has none of these; None where it has no runs at all.
+    """
+
+    def size(trace: Trace) -> float:
+        row = _row(gap, trace)
+        return row.baseline if row else 0.0
+
+    new = [trace for trace in gap.traces if trace.experiment in recorded]
+    return max(new or gap.traces, key=size, default=None)
+
+
+def _worst_first(gap: Gap) -> list[Trace]:
+    """Return the held-out runs, that of the largest error before first; one a run."""
+
+    def size(trace: Trace) -> float:
+        row = _row(gap, trace)
+        return row.baseline if row else 0.0
+
+    # In ascending order, so that of each run the cart with the largest error stays.
+    held_out = sorted((trace for trace in gap.traces if trace.held_out), key=size)
+    worst = {trace.experiment: trace for trace in held_out}
+    return sorted(worst.values(), key=size, reverse=True)
+
+
+def _row(gap: Gap, trace: Trace) -> RecordGap | None:
+    of_trace = (trace.experiment, trace.cart, trace.held_out)
+    return next((r for r in gap.by_record if (r.experiment, r.cart, r.held_out) == of_trace), None)

@@ -1,0 +1,280 @@
+"""The gap in plain words: what explains it, how well, and what to do next."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.gap.limits import AS_REPEATS, AT_FLOOR, NOTHING
+from pipeline.gap.types import FoundEffect, Gap, NamedValue, RecordGap, Rival
+from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.report.document import Block, Tile, Tiles, Tone, bullet_list, paragraph, plain_lines
+from pipeline.words.numbers import count, listing, significant, unit_text, with_error
+from pipeline.words.phrases import phrases
+from pipeline.words.spans import Spans, spans
+from pipeline.words.text import capital, clean
+
+WORDS = phrases("gap")
+
+
+def added_name(gap: Gap) -> str:
+    """Return what the model with more than the linear one is called; "" where there is none."""
+    if not gap.effects:
+        return ""
+    return WORDS.text("with_suspects" if gap.verdict == "unexplained" else "with_effects")
+
+
+def whole_model(gap: Gap) -> str:
+    """Return what the last model is called in a sentence, "the model with its effects"."""
+    return WORDS.text("model_suspects" if gap.verdict == "unexplained" else "model_effects")
+
+
+def verdict_title(gap: Gap) -> str:
+    """Return the verdict in a few words."""
+    undecided = gap.verdict == "unexplained" and not gap.complete
+    return WORDS.text("title_undecided" if undecided else f"title_{gap.verdict}")
+
+
+def error_board(gap: Gap) -> Tiles:
+    """Return the error on runs no fit has seen: before, after, and what noise alone makes.
+
+    The last model has the tone of the verdict; of two explanations neither is wrong or right yet.
+    """
+    tones: dict[str, Tone] = {"none": "good", "named": "good", "ambiguous": ""}
+    tiles = [_tile("linear", gap.baseline)]
+    if gap.effects:
+        what = "suspect" if gap.verdict == "unexplained" else "effect"
+        tiles.append(_tile("effects", gap.final, effects=count(len(gap.effects), what)))
+    tiles[-1] = replace(tiles[-1], tone=tones.get(gap.verdict, "bad"))
+    tiles.append(_tile("noise", gap.noise_floor))
+    if gap.repeatability is not None:
+        tiles.append(_tile("repeats", gap.repeatability))
+    return Tiles(tuple(tiles))
+
+
+def _tile(key: str, error: float, **values: str) -> Tile:
+    label, note = WORDS.spans(f"tile_{key}", **values), WORDS.spans(f"tile_{key}_note")
+    return Tile(label, spans(share(error)), note)
+
+
+def verdict_blocks(gap: Gap) -> list[Block]:
+    """Say what explains the gap and how well; under `ambiguous`, both explanations."""
+    so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
+    match gap.verdict:
+        case "none":
+            said: list[Block] = [
+                paragraph(WORDS.spans("none", noise=_noise(gap), baseline=share(gap.baseline)))
+            ]
+        case "named" | "partial":
+            said = [_named(gap)]
+        case "ambiguous":
+            said = _ambiguous(gap)
+        case "unexplained":
+            said = [_unexplained(gap)]
+    return [*so_far, *said]
+
+
+def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
+    """Say of a linear model that is enough what that covers, and what would have shown."""
+    repeats = AS_REPEATS * (gap.repeatability or 0.0)
+    noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
+    # A search begins above both: the square of what is hidden adds to that of the noise.
+    hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
+    lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
+    blocks: list[Block] = [
+        paragraph(WORDS.spans("none_hidden", share=share(hidden), lost=lost)),
+    ]
+    reach: dict[int, float] = {}
+    for trace in gap.traces:
+        far = float(np.max(np.abs(trace.measured - trace.zero)))
+        reach[trace.cart] = max(far, reach.get(trace.cart, 0.0))
+    if not reach:  # read from a file
+        return blocks
+    said = [
+        f"cart {cart} up to {significant(far, digits=3)} {position}"
+        for cart, far in sorted(reach.items())
+    ]
+    driven = max(float(np.max(np.abs(trace.u))) for trace in gap.traces)
+    if driven > 0:
+        said.append(f"the input up to {significant(driven, digits=3)} {drive}")
+    return [paragraph(WORDS.spans("none_reach", reach=listing(said))), *blocks]
+
+
+def next_block(gap: Gap) -> list[Block]:
+    """Say what comes next."""
+    if gap.verdict == "none":
+        return [paragraph(WORDS.spans("next_none"))]
+    if not gap.next_experiment:
+        return []
+    key = f"next_{gap.verdict}" if gap.verdict in ("named", "ambiguous") else "next"
+    return [paragraph(WORDS.spans(key, experiment=clean(gap.next_experiment)))]
+
+
+def terminal_verdict(gap: Gap) -> str:
+    """Return the verdict as a few lines of plain text."""
+    return plain_lines([paragraph(verdict_title(gap)), *verdict_blocks(gap), *next_block(gap)])
+
+
+# ------------------------------------------------------------------- the verdicts
+
+
+def _named(gap: Gap) -> Block:
+    names = [effect_name(found.effect, found.where) for found in gap.effects]
+    return paragraph(
+        WORDS.spans(
+            "named",
+            names=capital(listing(names)),
+            explain="explains" if len(names) == 1 else "together explain",
+            what="part of what" if gap.verdict == "partial" else "what",
+            sizes="; ".join(_sizes_there(found, several=len(names) > 1) for found in gap.effects),
+            sentences=" ".join(dict.fromkeys(found.effect.sentence for found in gap.effects)),
+            errors=_errors(gap),
+        )
+    )
+
+
+def _ambiguous(gap: Gap) -> list[Block]:
+    last, rival = contenders(gap)
+    others = [effect_name(f.effect, f.where) for f in gap.effects if f is not last]
+    said = {
+        "name": capital(effect_name(last.effect, last.where)),
+        "beside": f", beside {listing(others)}" if others else "",
+        "errors": _errors(gap),
+    }
+    both = [_explanation(last.effect, last.where, gap.final, sizes_text(last.parameters))]
+    if rival is None:
+        return [paragraph(WORDS.spans("ambiguous_alone", **said)), bullet_list(both)]
+    both.append(_explanation(rival.effect, rival.where, rival.nrmse_after, ""))
+    named = effect_name(rival.effect, rival.where)
+    return [paragraph(WORDS.spans("ambiguous", rival=named, **said)), bullet_list(both)]
+
+
+def _explanation(effect: Effect, where: Mapping[str, int], error: float, sizes: str) -> Spans:
+    return WORDS.spans(
+        "explanation",
+        name=capital(effect_name(effect, where)),
+        values=f" ({sizes})" if sizes else "",
+        error=share(error),
+        sentence=effect.sentence,
+        fingerprint=effect.fingerprint,
+    )
+
+
+def _unexplained(gap: Gap) -> Block:
+    said = {"noise": _noise(gap), "suspicion": _suspicion(gap), **shares(gap)}
+    if not gap.effects:
+        key = "unexplained" if gap.complete else "undecided"
+        if gap.final < NOTHING * gap.noise_floor:
+            key = f"{key}_taught"
+        return paragraph(WORDS.spans(key, **said))
+    suspects = listing([effect_name(found.effect, found.where) for found in gap.effects])
+    are = "suspect is" if len(gap.effects) == 1 else "suspects, together, are"
+    key = "suspected" if gap.complete else "suspected_so_far"
+    return paragraph(WORDS.spans(key, are=are, suspects=suspects, **said))
+
+
+def _suspicion(gap: Gap) -> str:
+    """Return who else is suspected, as a further sentence."""
+    if not gap.suspects:
+        return ""
+    named = [
+        f"{effect_name(s.effect, s.where)} (leaves {share(s.nrmse_after)})" for s in gap.suspects
+    ]
+    also = "Also suspected" if gap.effects else "Suspected, though not proven"
+    return f" {also}: {listing(named)}."
+
+
+def shares(gap: Gap | RecordGap) -> dict[str, str]:
+    """Return the errors before and after, and the noise, of all runs or of one."""
+    errors = {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor}
+    return {name: share(error) for name, error in errors.items()}
+
+
+def _noise(gap: Gap) -> str:
+    """Return what no model can be better than, as a clause."""
+    if gap.repeatability is not None and gap.repeatability >= gap.noise_floor:
+        return WORDS.text("repeats_differ", share=share(gap.repeatability))
+    return WORDS.text("noise_makes", share=share(gap.noise_floor))
+
+
+def _errors(gap: Gap) -> str:
+    errors = WORDS.text("errors", noise=_noise(gap), **shares(gap))
+    if not gap.left:
+        return errors
+    least = max(gap.noise_floor, gap.repeatability or 0.0)
+    worst = gap.left[0]
+    return WORDS.text(
+        "left",
+        errors=errors,
+        times=f"So {significant(gap.final / least, digits=2)} times as much" if least else "More",
+        run=clean(worst.experiment),
+        cart=worst.cart,
+        start=f"{worst.start:.2f}",
+        end=f"{worst.end:.2f}",
+        what=phase(worst.what),
+    )
+
+
+def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
+    """Return the two explanations that the data do not tell apart: chosen effect and rival."""
+    close = [
+        (rival.confidence, i, found, rival)
+        for i, found in enumerate(gap.effects)
+        for rival in found.rivals
+        if rival.nrmse_after <= 1.15 * gap.final  # the data do not tell it from what was chosen
+        and rival.effect.grows_from != found.effect.key
+    ]
+    if not close:
+        return gap.effects[-1], None
+    _, _, found, rival = max(close, key=lambda entry: entry[:2])
+    return found, rival
+
+
+# ----------------------------------------------------------------------- phrases
+
+
+def effect_name(effect: Effect, where: Mapping[str, int]) -> str:
+    """Return "dry (Coulomb) friction on cart 2", as it stands inside a sentence."""
+    title = effect.title[:1].lower() + effect.title[1:]
+    place = place_name(where)
+    if not place:
+        return title
+    named = any(kind in title for kind in where)  # "a hidden mass on a cart"
+    return f"{title} ({place})" if named else f"{title} on {place}"
+
+
+def place_name(where: Mapping[str, int]) -> str:
+    """Return "cart 2" or "spring 1"; "" for the input."""
+    return " ".join(f"{kind} {number}" for kind, number in where.items())
+
+
+def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
+    """Return "force 0.41 ± 0.01 V, distance 0.02 ± 0.01 cm", for a sentence."""
+    return ", ".join(
+        f"{name.replace('_', ' ')} {_size(value)}" for name, value in parameters.items()
+    )
+
+
+def _sizes_there(found: FoundEffect, *, several: bool) -> str:
+    """Return the sizes of one effect; of several, with the cart or spring that they belong to."""
+    place = place_name(found.where) if several else ""
+    return sizes_text(found.parameters) + (f" on {place}" if place else "")
+
+
+def _size(value: NamedValue) -> str:
+    unit = unit_text(clean(value.unit))
+    # So small an error stands in the table alone.
+    exact = value.std is not None and value.std < 1e-3 * abs(value.value)
+    text = significant(value.value) if exact else with_error(value.value, value.std)
+    return text + (f" {unit}" if unit else "")
+
+
+def phase(what: str) -> str:
+    """Return what a cart does in a stretch of time, as the gap's windows name it, in words."""
+    return WORDS.text("throughout") if what == "throughout" else clean(what)
+
+
+def share(value: float) -> str:
+    """Return a share of the motion in percent, with as many digits as matter."""
+    digits = 3 if value >= 0.0995 else 2
+    return f"{significant(100 * value, digits=digits)} %"

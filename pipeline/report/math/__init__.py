@@ -1,1 +1,0 @@
-"""Mathematics as a small tree, which every page can set."""

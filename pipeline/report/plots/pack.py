@@ -1,0 +1,104 @@
+"""Runs as compact text inside a page: thinned so that every peak stays, sixteen bits a number."""
+
+from base64 import b64encode
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
+from pipeline.report.figures.svg import packed_time
+from pipeline.report.plots.runs import ComparedCart, ComparedRun
+from pipeline.report.plots.spectrum import amplitude_spectrum, thin_lines
+from pipeline.words.text import clean
+
+MOST_WHOLE = 4_000  # samples of a run that is shown whole
+_STRETCHES = 1_000  # of a longer one; each keeps its ends, and the extremes of every signal
+_LEVELS = 65_534  # of a number; the one below them all is for none
+_SMALLEST = 1e-12  # of the largest amplitude
+
+
+def pack_run(run: ComparedRun) -> dict[str, Any]:
+    """Return a run as the page's script reads it.
+
+    Positions and residuals stand by themselves, so that a residual has all its digits; a model is
+    the one less the other.
+    """
+    signals = [cart.measured for cart in run.carts]
+    signals += [cart.measured - one.y for cart in run.carts for one in cart.models]
+    signals += [run.u] if run.u is not None else []
+    kept = keep_extremes(signals) if run.t.size > MOST_WHOLE else np.arange(run.t.size)
+    omega, spectra = _spectra(run)
+    return {
+        "id": clean(run.id),
+        "kind": run.kind,
+        "note": clean(run.note),
+        "t": packed_time(run.t[kept]),
+        "u": None if run.u is None else pack(run.u[kept]),
+        "omega": pack(omega),
+        "carts": [
+            {
+                "cart": cart.cart,
+                "y": pack(cart.measured[kept]),
+                "spectrum": next(spectra),
+                "models": [
+                    {
+                        "model": one.model,
+                        "nrmse": float(f"{one.nrmse:.6g}"),
+                        "residual": pack((cart.measured - one.y)[kept]),
+                        "spectrum": next(spectra),
+                        "residual_spectrum": next(spectra),
+                    }
+                    for one in cart.models
+                ],
+            }
+            for cart in run.carts
+        ],
+    }
+
+
+def keep_extremes(signals: Sequence[Array]) -> NDArray[np.intp]:
+    """Return which samples (k,) of signals (n,) show the ends and extremes of every stretch."""
+    bounds = np.linspace(0, signals[0].size, _STRETCHES + 1).astype(int)
+    kept = [bounds[:-1], bounds[1:] - 1]
+    for signal in signals:
+        for fill, extreme in ((np.inf, np.argmin), (-np.inf, np.argmax)):
+            filled = np.where(np.isnan(signal), fill, signal)
+            pieces = pairwise(bounds.tolist())
+            kept.append(np.array([a + extreme(filled[a:b]) for a, b in pieces]))
+    return np.unique(np.concatenate(kept))
+
+
+def pack(values: Array) -> list[Any]:
+    """Return numbers, NaN for none, as [lowest, step, base64 of little-endian int16]."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+    step = (high - low) / _LEVELS
+    middle = low + step * (_LEVELS // 2)
+    shown = np.where(np.isfinite(values), values, middle)
+    levels = np.round((shown - middle) / step) if step > 0.0 else np.zeros(values.size)
+    levels = np.where(np.isfinite(values), np.clip(levels, -32767, 32767), -32768)
+    return [middle, step, b64encode(levels.astype("<i2").tobytes()).decode()]
+
+
+def _spectra(run: ComparedRun) -> tuple[Array, Any]:
+    """Return frequencies (k,), and an iterator over packed spectra in the order of the page.
+
+    Spectra are logarithms to base ten. What is not simulated from the first sample is of the rest.
+    """
+    signals = [signal for cart in run.carts for signal in _signals_of(cart)]
+    first = max((int(np.argmax(np.isfinite(one))) for one in signals), default=0)
+    if run.t.size - first < 4 or not signals:
+        return np.zeros(0), iter([pack(np.zeros(0))] * len(signals))
+    omega, amplitudes = amplitude_spectrum(run.t[first:], np.array([s[first:] for s in signals]))
+    kept, shown = thin_lines([amplitudes.max(axis=0), *amplitudes])
+    least = _SMALLEST * max(float(amplitudes.max()), 1e-300)
+    return omega[kept], iter([pack(np.log10(np.maximum(one, least))) for one in shown[1:]])
+
+
+def _signals_of(cart: ComparedCart) -> list[Array]:
+    """Return measured, and of each model what it reads and what it leaves."""
+    pairs = [(one.y, cart.measured - one.y) for one in cart.models]
+    return [cart.measured, *(signal for pair in pairs for signal in pair)]

@@ -1,0 +1,45 @@
+"""Amplitude spectra of a run, of all its samples, thinned to what a plot can show."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.arrays import Array
+
+MOST_LINES = 400  # of a spectrum on a logarithmic axis: finer than a screen
+
+
+def amplitude_spectrum(t: Array, y: Array) -> tuple[Array, Array]:
+    """Return frequencies (f,) in rad/s, without zero, and amplitudes (…, f) of signals (…, n).
+
+    The mean is taken off; a Hann window, its own gain taken off too, keeps the ends from leaking:
+    a sine in the middle of a line has its amplitude there. Samples off an even grid are
+    interpolated.
+    """
+    even = np.linspace(t[0], t[-1], t.size)
+    if np.max(np.abs(even - t)) > 1e-6 * (t[-1] - t[0]):
+        flat = y.reshape(-1, t.size)
+        y = np.array([np.interp(even, t, row) for row in flat]).reshape(y.shape)
+    window = np.hanning(t.size)
+    lines = np.fft.rfft((y - y.mean(axis=-1, keepdims=True)) * window)
+    step = 2.0 * np.pi / (even[-1] - even[0]) * (t.size - 1) / t.size
+    omega = step * np.arange(1, lines.shape[-1])
+    return omega, 2.0 / window.sum() * np.abs(lines[..., 1:])
+
+
+def thin_lines(amplitudes: Sequence[Array]) -> tuple[NDArray[np.intp], list[Array]]:
+    """Return which lines (k,) of spectra (f,) are kept, and what each shows there, (k,).
+
+    Of neighbours on a logarithmic axis each spectrum shows its largest, so that every peak stays;
+    they stand where the first spectrum is largest.
+    """
+    count = amplitudes[0].size
+    if count <= MOST_LINES:
+        return np.arange(count), list(amplitudes)
+    edges = np.unique(np.round(np.geomspace(1, count + 1, MOST_LINES + 1)).astype(int)) - 1
+    starts = edges[:-1]
+    pieces = [slice(a, b) for a, b in pairwise(edges.tolist())]
+    kept = starts + np.array([int(np.argmax(amplitudes[0][piece])) for piece in pieces])
+    return kept, [np.maximum.reduceat(one, starts) for one in amplitudes]

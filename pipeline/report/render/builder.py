@@ -1,0 +1,89 @@
+"""One builder for every page: running numbers, figures and tables with their words, sections."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from pipeline.report.document import Block, Cell, Picture, Section, Table, make_table
+from pipeline.report.figures.style import WIDTH, drawing
+from pipeline.report.figures.svg import to_svg
+from pipeline.words.phrases import Phrases
+from pipeline.words.progress import Progress, silent
+from pipeline.words.spans import Spans
+from pipeline.words.text import clean, rich
+
+Part = tuple[str, str, Callable[[Any], Sequence[Block]]]  # anchor, title, blocks of a page
+
+
+@dataclass(frozen=True)
+class PageBuilder:
+    """The running numbers of a page's figures and tables."""
+
+    _figures: Iterator[int] = field(default_factory=lambda: count(1), init=False)
+    _tables: Iterator[int] = field(default_factory=lambda: count(1), init=False)
+
+    def sections(
+        self, parts: Iterable[Part], *, doing: str = "", progress: Progress = silent
+    ) -> tuple[Section, ...]:
+        """Return the sections that have something to show, each said to `progress` beforehand."""
+        found = []
+        with drawing():
+            for id_, title, blocks_of in parts:
+                progress(f"{doing}: {title.lower()}")
+                if blocks := blocks_of(self):
+                    found.append(Section(id=id_, title=title, blocks=tuple(blocks)))
+        return tuple(found)
+
+    def table(
+        self,
+        words: Phrases,
+        key: str,
+        rows: Iterable[Sequence[Cell | str | Spans]],
+        align: str,
+        /,
+        **said: object,
+    ) -> Table:
+        """Return a table, see `make_table`, under the next number.
+
+        The sentence `key` is its caption, `key_head` has its headings, `said` what both name.
+        """
+        head = [rich(text) for text in words.cells(f"{key}_head", **said)]
+        return self.headed_table(words.text(key, **said), head[: len(align)], rows, align)
+
+    def headed_table(
+        self,
+        caption: str,
+        head: Iterable[str | Spans],
+        rows: Iterable[Sequence[Cell | str | Spans]],
+        align: str,
+    ) -> Table:
+        """Return a table whose headings are no fixed words, under the next number."""
+        return make_table(next(self._tables), caption, head, rows, align)
+
+    def picture(
+        self,
+        name: str,
+        figure: Figure,
+        words: Phrases,
+        key: str,
+        /,
+        *,
+        alt: str = "",
+        **said: object,
+    ) -> Picture:
+        """Return a figure as SVG, under the next number.
+
+        The sentence `key` is its caption; `alt`, by default `key_alt`, reads it to who sees none.
+        """
+        alt = clean(words.text(alt or f"{key}_alt", **said))
+        return Picture(
+            number=next(self._figures),
+            name=name,
+            caption=rich(clean(words.text(key, **said))),
+            alt=alt,
+            svg=to_svg(figure, name=name, alt=alt),
+            width=WIDTH,
+        )

@@ -1,0 +1,261 @@
+"""A simulated bench: how its carts move in one run, and what the encoders say of it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import ConfigError
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import propagate, simulate_linear
+from pipeline.plant.loop.sampled_loop import LoopSetup, StateFeedback, simulate_loop
+from pipeline.plant.nonlinear.effects import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.tables import Cart
+from pipeline.results import Kind
+
+# The ECP 210: its servo loop and its encoder.
+SAMPLE_TIME = 0.00884  # s
+COUNT = 0.00227  # cm
+
+# A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
+_TREMOR_HZ = np.array([1.3, 4.1, 8.7])
+_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance the cart is held at
+_SHORTEST_STEP = 1e-5  # s of the simulator: a session then takes half an hour to simulate
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleasingHand:
+    """A hand that holds one cart off its rest and lets go.
+
+    Attributes
+    ----------
+    position : where it holds the cart, position units from rest.
+    release, fade : s; from `release` on its force falls to zero in a straight line over `fade`.
+    tremor : (3,) phases of its trembling, rad.
+    """
+
+    cart: int
+    position: float
+    release: float
+    fade: float
+    tremor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def hold(self, t: Array) -> tuple[Array, Array]:
+        """Return the position (n,) and velocity (n,) of the cart in the hand."""
+        rate = 2 * np.pi * _TREMOR_HZ
+        phase = np.multiply.outer(np.asarray(t), rate) + np.array(self.tremor)
+        position = self.position * (1.0 + np.sin(phase) @ _TREMOR_AMPLITUDE)
+        return position, self.position * (np.cos(phase) @ (_TREMOR_AMPLITUDE * rate))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BenchRun:
+    """One run: what is done to the carts.
+
+    Attributes
+    ----------
+    t, u : (n,) s and input, held between the samples; in a closed loop the bench finds u itself.
+    free : the carts free to move.
+    frequency : of a sine dwell, Hz.
+    reference, controller, input_limit : of a closed loop; `cart` is the one it steers.
+    keep_from : s; the recorder starts here, and its clock with it.
+    """
+
+    id: str
+    kind: Kind
+    t: Array
+    u: Array
+    free: tuple[int, ...]
+    note: str = ""
+    hand: ReleasingHand | None = None
+    frequency: float | None = None
+    cart: int | None = None
+    reference: Array | None = None
+    controller: StateFeedback | None = None
+    input_limit: float | None = None
+    keep_from: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrueMotion:
+    """What truly happened: the input (n,) and the positions (n_carts, n) from the springs' rest.
+
+    Where a sensor has a scale of its own, positions are as it scales them.
+    """
+
+    u: Array
+    x: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SimulatedBench:
+    """A plant with what is hidden in it, its encoders and its controller's clock.
+
+    Attributes
+    ----------
+    name : of the preset or the model's file; "": it has none.
+    effects : what the plant does beyond the linear chain; without any nothing is compiled.
+    told : one sentence for each effect, with its parameters; not for the submission.
+    travel : how far the carts are meant to move, position units.
+    count : the encoder step, position units.
+    input_limit : the largest input, input units.
+    sample_time : s, of the controller, the input and the log.
+    noise_counts : standard deviation of what shakes a free cart's encoder; 0.2 makes its reading
+        flicker between two counts.
+    zero_error_counts : the encoders are zeroed by hand, within this of the carts' rest.
+    """
+
+    chain: Chain
+    name: str = ""
+    effects: tuple[EffectTerm, ...] = ()
+    told: tuple[str, ...] = ()
+    position_unit: str = "cm"
+    input_unit: str = "V"
+    travel: float = 1.0
+    count: float = COUNT
+    input_limit: float = 5.0
+    sample_time: float = SAMPLE_TIME
+    noise_counts: float = 0.2
+    zero_error_counts: float = 2.0
+
+    def refuse_endless(self) -> None:
+        """Refuse effects so stiff, or masses so small, that no simulation of them would end.
+
+        Raises
+        ------
+        ConfigError : the simulation would never end.
+        """
+        if not self.effects:
+            return
+        from pipeline.plant.nonlinear.augmented import SteppedBench
+
+        model = AugmentedChain(chain=self.chain, terms=self.effects)
+        step = SteppedBench(model, x0=np.zeros(self.chain.n)).shortest_step
+        if step < _SHORTEST_STEP:
+            raise ConfigError(
+                f"{self.name}: with these effects a simulation needs steps of {step:.1g} s, and "
+                f"{_SHORTEST_STEP:g} s is the least: a stiffness is too large, or a mass too small"
+            )
+
+    def move(self, run: BenchRun) -> TrueMotion:
+        """Return how the carts move: the one place that knows the law of motion.
+
+        Raises
+        ------
+        DataError : the effects make the carts run away.
+        """
+        chain, x = self.chain, np.zeros((self.chain.n, run.t.size))
+        rows = [cart - 1 for cart in run.free]
+        model = AugmentedChain(chain=chain, terms=self.effects)
+        if run.controller is not None and run.reference is not None:
+            plant = None
+            if self.effects:
+                from pipeline.plant.nonlinear.augmented import SteppedBench
+
+                plant = SteppedBench(model, free=run.free)
+            loop = simulate_loop(
+                chain,
+                run.controller,
+                t=run.t,
+                reference=run.reference,
+                start=plant,
+                setup=LoopSetup(
+                    sample_time=self.sample_time,
+                    input_limit=run.input_limit,
+                    encoder_step=self.count,
+                    # Where the carts rest, the encoders are zeroed.
+                    rest=-plant.state[0::2] if plant else 0.0,
+                    free=run.free,
+                ),
+            )
+            x[rows] = loop.x
+            return TrueMotion(u=loop.u, x=x)
+        if self.effects and run.hand is not None:
+            return TrueMotion(u=run.u, x=_release_with_effects(model, run, run.hand))
+        if self.effects:
+            from pipeline.plant.nonlinear.augmented import simulate_augmented
+
+            return TrueMotion(u=run.u, x=simulate_augmented(model, run.t, run.u, free=run.free))
+        if run.hand is not None:
+            x[rows] = _release(chain, run.t, run.hand, free=run.free)
+        else:
+            x[rows] = simulate_linear(chain, run.t, run.u, free=run.free)
+        return TrueMotion(u=run.u, x=x)
+
+    def read(self, motion: TrueMotion, *, run: BenchRun, rng: np.random.Generator) -> Array:
+        """Return the encoder readings (n_carts, n), whole counts in position units."""
+        n_carts, n = motion.x.shape
+        error = self.zero_error_counts * self.count
+        zero = rng.uniform(-error, error, size=(n_carts, 1))
+        if run.controller is not None:
+            zero[:] = 0.0  # the controller needs its zero at rest, so that is seen to first
+        shaken = np.isin(np.arange(1, n_carts + 1), run.free)[:, None]
+        noise = self.noise_counts * self.count
+        x = motion.x + zero + noise * shaken * rng.standard_normal((n_carts, n))
+        return self.count * np.round(x / self.count)
+
+
+def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]) -> Array:
+    """Return the positions (f, n) of the free carts, all but the hand's at rest until it lets go.
+
+    The hand's force on its cart balances the springs at the release and fades from there, so the
+    decay begins softly, as a hand's does, and not with a step.
+    """
+    A, B, C, _ = chain.state_space(free=free)
+    row = sorted(free).index(hand.cart)
+    start = int(np.searchsorted(t, hand.release))
+    x = np.zeros((len(free), t.size))
+    x[row], _ = hand.hold(t)
+    position, velocity = hand.hold(t[start])
+    state = np.zeros(A.shape[0])
+    state[2 * row : 2 * row + 2] = position, velocity
+    push = np.zeros_like(B)
+    push[2 * row + 1] = 1.0 / chain.m[hand.cart - 1]
+    stiffness = chain.k[hand.cart - 1] + chain.k[hand.cart]
+    force = stiffness * position * np.clip(1 - (t[start:] - t[start]) / hand.fade, 0.0, 1.0)
+    x[:, start:] = C @ propagate(A, push, t[start:], force, x0=state, linear=True)
+    return x
+
+
+def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingHand) -> Array:
+    """Return the readings (n_carts, n) of a run with a hand in it, as `_release` does.
+
+    The hand pulls the cart out before the recorder starts, so friction and hidden masses are
+    where that leaves them; it then follows its tremor, and lets go as in the linear chain.
+    """
+    from pipeline.plant.nonlinear.augmented import SteppedBench
+
+    hand = before_stop(hand, model)
+    bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart
+    start = int(np.searchsorted(t, hand.release))
+    x = np.zeros((model.chain.n, t.size))
+    # A hand takes 1.5 s to pull a cart out, before the recorder starts.
+    pull = np.linspace(0.0, np.pi, round(1.5 / float(t[1] - t[0])))
+    path = np.append(hand.hold(t[0])[0] * (1 - np.cos(pull)) / 2, hand.hold(t[: start + 1])[0])
+    for sample, position in enumerate(path, start=-pull.size):
+        bench.carry(cart, to=float(position), interval=float(t[1] - t[0]))
+        if sample >= 0:
+            x[:, sample] = bench.readings
+    force = bench.let_go(cart, velocity=float(hand.hold(t[start])[1]))
+    ramp = force * np.clip(1 - (t - t[start]) / hand.fade, 0.0, 1.0)
+    for sample in range(start, t.size - 1):
+        # Between the samples the force runs straight; each short step takes its mean.
+        steps = 10 if ramp[sample] != 0.0 else 1  # while the hand's force falls
+        for share in (np.arange(steps) + 0.5) / steps:
+            push = float((1 - share) * ramp[sample] + share * ramp[sample + 1])
+            bench.push(cart, push)
+            bench.step(0.0, following=0.0, interval=float(t[sample + 1] - t[sample]) / steps)
+            bench.push(cart, -push)
+        x[:, sample + 1] = bench.readings
+    return x
+
+
+def before_stop(hand: ReleasingHand, model: AugmentedChain) -> ReleasingHand:
+    """Return a hand that holds its cart on the near side of the end stop, if there is one."""
+    row = model.tables()[0][hand.cart - 1]
+    stiff = row[Cart.END_STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]
+    # No hand pulls a cart into its end stop.
+    furthest = 0.9 * float(row[Cart.END_STOP_POSITION])
+    beyond = hand.position * furthest > furthest**2
+    return replace(hand, position=furthest) if stiff and beyond else hand

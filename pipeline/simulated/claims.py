@@ -1,0 +1,86 @@
+"""What an honest student knows and writes: a model a little off the truth, rounded numbers."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.names import read_name
+from pipeline.plant.linear.chain import Chain
+from pipeline.results import FeedbackDesign
+from pipeline.submission.toml_file import Value
+from pipeline.submission.toml_section import TypedNumber
+
+# A fit to some twenty dwells leaves about this much, as relative standard deviations.
+_FIT_ERROR_SPRING_OR_MASS = 0.005
+# Ruler, cursor and peak-picking: first estimates from steps and decays.
+_HAND_ERROR = 0.007
+_GUESSED_ZETA = TypedNumber(
+    "0.10"
+)  # "we usually use the initial estimate that both are approximately 0.1"
+
+
+def believed_chain(chain: Chain, rng: np.random.Generator) -> Chain:
+    """Return the chain as the students have identified it."""
+
+    def off(values: np.ndarray, spread: float) -> np.ndarray:
+        return values * (1 + spread * np.clip(rng.standard_normal(values.size), -2, 2))
+
+    return Chain(
+        m=off(chain.m, _FIT_ERROR_SPRING_OR_MASS),
+        c=off(chain.c, 0.04),
+        k=off(chain.k, _FIT_ERROR_SPRING_OR_MASS),
+    )
+
+
+def initial_estimates(
+    chain: Chain, *, dwells_hz: Sequence[float], rng: np.random.Generator
+) -> dict[str, Value]:
+    """Return the students' first estimates of every named parameter.
+
+    Gains come from the steps, each cart's own frequency and damping from its decay; resonances and
+    nulls are the nearest dwell, and their dampings are guessed.
+    """
+    typed: dict[str, Value] = {}
+    for name, value in chain.parameters().items():
+        read = read_name(name)
+        error = float(np.clip(rng.standard_normal(), -2, 2))
+        if read.is_by_eye and chain.n > 1:
+            nearest = min((2 * math.pi * f for f in dwells_hz), key=lambda w: abs(w - value))
+            typed[name] = _GUESSED_ZETA if read.is_ratio else _significant(nearest)
+        else:
+            spread = 0.08 if read.is_ratio else _HAND_ERROR
+            typed[name] = _significant(value * (1 + spread * error))
+    return typed
+
+
+def final_estimates(believed: Chain) -> dict[str, Value]:
+    """Return the students' fitted parameters: those of one chain, so that they agree."""
+    return {name: _significant(value) for name, value in believed.parameters().items()}
+
+
+def state_space(believed: Chain) -> dict[str, Value]:
+    """Return A (2n, 2n) and B (2n,)."""
+    A, B, _, _ = believed.state_space()
+    return {
+        "A": [[_significant(a, 4) for a in row] for row in A],
+        "B": [_significant(b, 4) for b in B[:, 0]],
+    }
+
+
+def feedback(design: FeedbackDesign) -> dict[str, Value]:
+    """Return the controller and what the students' simulation of it showed."""
+    typed: dict[str, Value] = {
+        "gains": [_significant(gain, 4) for gain in design.gains],
+        "prefilter": _significant(design.prefilter, 4),
+        "overshoot_percent": TypedNumber(f"{design.overshoot_percent:.1f}"),
+    }
+    if design.settling_time is not None:
+        typed["settling_time"] = TypedNumber(f"{design.settling_time:.2f}")
+    return typed
+
+
+def _significant(value: float, digits: int = 3) -> TypedNumber:
+    """Return the number rounded to significant digits, trailing zeros kept."""
+    exact = value in (0.0, 1.0)  # of a state matrix: written, not measured
+    return TypedNumber(f"{value:g}" if exact else f"{value:#.{digits}g}".removesuffix("."))

@@ -1,0 +1,96 @@
+"""The virtual benches that run on this computer: each writes a file while it does."""
+
+import json
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+
+from pipeline.output import OWNERS_FOLDER
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunningBench:
+    """A virtual bench of the same person.
+
+    Attributes
+    ----------
+    address : what a host opens.
+    """
+
+    name: str
+    address: str
+
+
+@contextmanager
+def announced(bench: RunningBench) -> Iterator[None]:
+    """Tell the desks of this person that a bench runs; the file goes with the context."""
+    folder, pid = _find_folder(), os.getpid()
+    path = folder / f"{pid}.json"
+    told = {"name": bench.name, "address": bench.address, "began": _began(pid)}
+    with suppress(OSError):  # nowhere to write: its address can still be typed
+        folder.mkdir(OWNERS_FOLDER, exist_ok=True)
+        if _is_own(folder):
+            _clear_stale(folder)
+            path.write_text(json.dumps(told), encoding="utf-8")
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+
+
+def running_benches() -> list[RunningBench]:
+    """Return the virtual benches that run now."""
+    folder = _find_folder()
+    if not _is_own(folder):
+        return []
+    found = [_read(path) for path in sorted(folder.glob("*.json"))]
+    return [bench for bench in found if bench is not None]
+
+
+def _find_folder() -> Path:
+    """Return the folder of the files, which no other person can write to where systems tell."""
+    own = str(os.getuid()) if hasattr(os, "getuid") else "user"
+    root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
+    return Path(root) / f"cartlab-benches-{own}"
+
+
+def _is_own(folder: Path) -> bool:
+    """Whether the folder is there and belongs to this person alone."""
+    if folder.is_symlink() or not folder.is_dir():
+        return False
+    info = folder.stat()
+    return os.name != "posix" or (info.st_uid == os.getuid() and not info.st_mode & 0o022)
+
+
+def _read(path: Path) -> RunningBench | None:
+    """Return the bench of a file; None if its process has ended."""
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if told["began"] != _began(int(path.stem)):
+            return None
+        return RunningBench(name=str(told["name"]), address=str(told["address"]))
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _began(pid: int) -> float:
+    """Return when a process began, s; 0 if there is no such process.
+
+    The number of a process is used again, not together with its time.
+    """
+    try:
+        return psutil.Process(pid).create_time()
+    except psutil.Error:
+        return 0.0
+
+
+def _clear_stale(folder: Path) -> None:
+    for path in folder.glob("*.json"):
+        if _read(path) is None:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,128 @@
+"""The carts of a virtual bench: a preset with what is hidden in it, its hands and its encoders."""
+
+import math
+from collections.abc import Generator
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.bench.protocol.messages import FULL_SCALE, Hands
+from pipeline.plant.nonlinear.augmented import SteppedBench
+from pipeline.plant.nonlinear.effects import AugmentedChain
+from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
+
+TRUE_PERIOD = 1.0024e-3  # s from tick to tick, where the controller believes in 1 ms
+REACH = 12.0  # times the travel that full duty moves the carts, about: 1 cm is some 300 counts
+FEWEST_ENCODERS = 2  # a line has two counts even where there is one cart
+
+_NOISE = 0.2  # counts that shake a free cart's encoder: it flickers between two counts
+
+
+class VirtualCarts:
+    """Carts that move under a motor and hands, one tick at a time.
+
+    Parameters
+    ----------
+    seed : of the encoders' noise, the hands' tremor and when they let go.
+    period : s from tick to tick.
+
+    Attributes
+    ----------
+    encoders : how many counts there are, never under two; those without a cart stay at zero.
+    """
+
+    def __init__(self, bench: SimulatedBench, *, seed: int, period: float = TRUE_PERIOD) -> None:
+        self._bench, self._period = bench, period
+        self._model = AugmentedChain(chain=bench.chain, terms=bench.effects)
+        self._noise_rng, self._hand_rng = np.random.default_rng(seed).spawn(2)
+        n = bench.chain.n
+        self.encoders = max(FEWEST_ENCODERS, n)
+        self.input_per_count = input_per_count(bench)
+        # Where between two counts an encoder gets its power is chance.
+        self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
+        self.take_in_hand(Hands())
+
+    def counts(self) -> tuple[int, ...]:
+        """Return what the encoders count since they had power."""
+        noise = next(self._noise, None)
+        if noise is None:
+            block = self._noise_rng.standard_normal((1024, self._shaken.size))
+            self._noise = iter(_NOISE * block * self._shaken)
+            noise = next(self._noise)
+        exact = self._plant.readings / self._bench.count + self._phase + noise
+        spare = self.encoders - exact.size
+        return (*np.rint(exact).astype(int).tolist(), *(0,) * spare)
+
+    def move(self, duty: int) -> None:
+        """Move on by one tick under a duty.
+
+        Raises
+        ------
+        DataError : what is hidden makes the carts run away.
+        """
+        if self._hand is not None:
+            try:
+                next(self._hand)
+                return
+            except StopIteration:
+                self._hand = None
+        u = duty * self.input_per_count
+        self._plant.step(u, following=u, interval=self._period)
+
+    def take_in_hand(self, hands: Hands) -> None:
+        """Bring all carts to rest; hold some, and pull one out to let it go in the next run."""
+        self._started = False
+        n = self._bench.chain.n
+        free = [cart for cart in range(1, n + 1) if cart not in hands.held]
+        self._shaken = np.isin(np.arange(1, n + 1), free).astype(float)
+        self._noise = iter(np.empty((0, n)))
+        self._plant = SteppedBench(self._model, free=free)
+        self._hand = self._lead(hands.released) if hands.released in free else None
+
+    def start(self) -> None:
+        """Tell the hands that a run starts."""
+        self._started = True
+
+    def _lead(self, cart: int) -> Generator[None]:
+        """Pull a cart out, hold it until a run has begun, let go; one tick a step."""
+        rng = self._hand_rng
+        tremor = rng.uniform(0.0, 2 * np.pi, size=3)
+        hand = before_stop(
+            ReleasingHand(
+                cart=cart,
+                position=rng.choice([-1.0, 1.0]) * rng.uniform(1.2, 1.8) * self._bench.travel,
+                release=float(rng.uniform(0.3, 0.6)),  # s after the start of a run
+                fade=float(rng.uniform(0.01, 0.03)),  # s that its force takes to fall
+                tremor=(float(tremor[0]), float(tremor[1]), float(tremor[2])),
+            ),
+            self._model,
+        )
+        out, _ = hand.hold(np.zeros(1))
+        for angle in np.linspace(0.0, math.pi, math.ceil(1.5 / self._period)):
+            yield self._carry(cart, out * (1.0 - math.cos(angle)) / 2.0)
+        held, left = np.zeros(1), hand.release
+        while left > 0.0:
+            held += self._period
+            left -= self._period * self._started
+            yield self._carry(cart, hand.hold(held)[0])
+        force = self._plant.let_go(cart, velocity=float(hand.hold(held)[1][0]))
+        ticks = math.ceil(hand.fade / self._period)
+        for tick in range(ticks):
+            # The force of a tick is the mean of a fall in a straight line.
+            push = force * (1.0 - (tick + 0.5) / ticks)
+            self._plant.push(cart, push)
+            yield self._plant.step(0.0, following=0.0, interval=self._period)
+            self._plant.push(cart, -push)
+
+    def _carry(self, cart: int, to: Array) -> None:
+        self._plant.carry(cart, to=float(to[0]), interval=self._period)
+
+
+def input_per_count(bench: SimulatedBench) -> float:
+    """Return input units per duty count: five over a power of ten, over full scale.
+
+    So a full-scale input holds the carts some ten travels out, and one travel takes hundreds of
+    counts; 5 V for all of it would be 28.
+    """
+    hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
+    return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE

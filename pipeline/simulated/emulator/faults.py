@@ -1,0 +1,178 @@
+"""What goes wrong on a serial line, on purpose: faults put into the lines a bench sends.
+
+Each is written `KIND=RATE`, `KIND@SECONDS` or, of an encoder, `stuck=ENCODER@SECONDS`: at random
+in so many of the lines, or once, when the bench has streamed for so long in all its runs.
+"""
+
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import ConfigError
+from pipeline.submission.complaints import nearest
+
+HOLD = 0.05  # s of the bench's clock that a late lump is held back
+
+KINDS = {
+    "drop": "the line never comes",
+    "garble": "one character of the line is another, one that no line has",
+    "merge": "the line's end is lost: the next line stands right behind it",
+    "delay": f"this line and those behind it come in a lump, {1e3 * HOLD:g} ms late",
+    "reset": "the bench's clock begins again in mid-run",
+    "disconnect": "the cable is pulled: the connection ends",
+    "stuck": "from then on the encoder stands still",
+}
+_SYNTAX = re.compile(r"(?P<kind>[a-z]+)(?:=(?P<value>[0-9.e-]+))?(?:@(?P<at>[0-9.]+))?")
+_NOISE = b"#?xZ~ \x80\xff"  # none of these is in a line, so no garbled line passes for a reading
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineFault:
+    """One kind of fault.
+
+    Attributes
+    ----------
+    rate : share of the lines it strikes.
+    at : s of streaming after which it strikes once; None: at random.
+    encoder : that is stuck; 0: none.
+    """
+
+    kind: str
+    rate: float = 0.0
+    at: float | None = None
+    encoder: int = 0
+
+
+def read_fault(text: str) -> LineFault:
+    """Read one fault as the user writes it.
+
+    Raises
+    ------
+    ConfigError : it is none.
+    """
+    where = f"--fault {text}"
+    match = _SYNTAX.fullmatch(text.strip())
+    if match is None:
+        raise ConfigError(f"{where}: write KIND=RATE, KIND@SECONDS or stuck=ENCODER@SECONDS")
+    kind = match["kind"]
+    if kind not in KINDS:
+        raise ConfigError(f"{where}: no fault {kind!r}{nearest(kind, list(KINDS))}")
+    try:
+        value = None if match["value"] is None else float(match["value"])
+        at = None if match["at"] is None else float(match["at"])
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
+    if kind == "stuck":
+        if value not in (1, 2, 3):
+            raise ConfigError(f"{where}: say which encoder and when, as in stuck=1@5")
+        return LineFault(kind=kind, at=at or 0.0, encoder=int(value))
+    if (value is None) == (at is None):
+        raise ConfigError(f"{where}: give a rate, {kind}=0.01, or a time, {kind}@5")
+    if value is not None and not 0 <= value <= 1:
+        raise ConfigError(f"{where}: a rate is between 0 and 1")
+    return LineFault(kind=kind, rate=value or 0.0, at=at)
+
+
+class Faults:
+    """Strikes the lines that go by, each at most once.
+
+    Parameters
+    ----------
+    period : s from line to line.
+
+    Attributes
+    ----------
+    injected : how often each kind struck; `late` are the lines that a delay held back.
+    """
+
+    def __init__(self, faults: Sequence[LineFault] = (), *, seed: int, period: float) -> None:
+        self._random = [fault for fault in faults if fault.rate > 0]
+        timed = [(fault.at, fault) for fault in faults if fault.at is not None]
+        self._timed = sorted(timed, key=lambda entry: entry[0])
+        self._rng = np.random.default_rng(seed)
+        self.injected: Counter[str] = Counter()
+        self._period, self._streamed = period, 0.0  # s
+        self._stuck: dict[int, bytes | None] = {}  # what the encoder shows; None: from now on
+        self._ms = -1  # of the last line
+        self._clock_began = 0  # ms of the run, at the last reset
+        self._open = False  # the last line has lost its end
+        self._held = bytearray()
+        self._until = 0.0  # s of the bench's clock, the end of the hold
+
+    def strike(self, line: bytes, *, clock: float) -> tuple[bytes, str]:
+        """Return what goes out instead of a line of the stream, and what struck it ("": nothing).
+
+        Parameters
+        ----------
+        clock : s of the bench's clock.
+        """
+        kind = self._choose()
+        self._open = kind == "merge"
+        line = self._rewritten(line, reset=kind == "reset")
+        if kind == "garble":
+            at = int(self._rng.integers(len(line) - 1))
+            line = line[:at] + bytes([int(self._rng.choice(list(_NOISE)))]) + line[at + 1 :]
+        elif kind == "merge":
+            line = line[:-1]
+        elif kind == "delay":
+            self._until = clock + HOLD
+        elif kind in ("drop", "disconnect"):
+            line = b""
+        if clock < self._until:
+            self.injected["late"] += bool(line)
+        return self._hold(line, clock=clock), kind
+
+    def idle(self, *, clock: float) -> bytes:
+        """Return what is still due where the bench sends no line: a late lump, a lost line end."""
+        end, self._open = b"\n" * self._open, False
+        return self._hold(end, clock=clock)
+
+    def behind(self, data: bytes, *, clock: float) -> bytes:
+        """Return what goes out of what is no line of the stream: it overtakes none of them."""
+        return self._hold(data, clock=clock)
+
+    def _hold(self, data: bytes, *, clock: float) -> bytes:
+        """Return what goes out now: this and what was held back, or nothing yet."""
+        self._held += data
+        if not self._held or clock < self._until:
+            return b""
+        out = bytes(self._held)
+        self._held.clear()
+        return out
+
+    def _choose(self) -> str:
+        """Return the kind that strikes the next line; "": none."""
+        self._streamed += self._period
+        while self._timed and self._timed[0][0] <= self._streamed:
+            _, fault = self._timed.pop(0)
+            self.injected[fault.kind] += 1
+            if not fault.encoder:
+                return fault.kind
+            self._stuck[fault.encoder] = None
+        if self._open or not self._random:  # what follows a merger is lost with it already
+            return ""
+        draw = self._rng.random()
+        for fault in self._random:
+            if draw < fault.rate:
+                if fault.kind == "delay" and self._held:  # late already
+                    return ""
+                self.injected[fault.kind] += 1
+                return fault.kind
+            draw -= fault.rate
+        return ""
+
+    def _rewritten(self, line: bytes, *, reset: bool) -> bytes:
+        """Return the line as encoders that are stuck and a clock that began again make it."""
+        *counts, target, duty, stamp = line.rstrip().split(b":")
+        ms = int(stamp)
+        if reset or ms < self._ms:  # or another run
+            self._clock_began = ms if reset else 0
+        self._ms = ms
+        for encoder, shown in self._stuck.items():
+            if encoder <= len(counts):
+                self._stuck[encoder] = shown = counts[encoder - 1] if shown is None else shown
+                counts[encoder - 1] = shown
+        return b":".join([*counts, target, duty, b"%d" % (ms - self._clock_began)]) + b"\n"

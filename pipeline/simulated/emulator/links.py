@@ -1,0 +1,226 @@
+"""The far ends of a serial line: a TCP port that `socket://` reaches, or a pseudo-terminal."""
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import sys
+import time
+from ipaddress import ip_address
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from pipeline.errors import ConfigError
+
+_CHUNK = 65_536  # bytes
+
+
+class Link(Protocol):
+    """What a bench has of its line. Hosts come one after the other; the next one waits.
+
+    Attributes
+    ----------
+    address : what a host opens.
+    """
+
+    address: str
+
+    @property
+    def connected(self) -> bool:
+        """Whether a host is there; `receive` brings it up to date."""
+        ...
+
+    @property
+    def unsent(self) -> int:
+        """Bytes that wait for the host to read."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Sleep until something arrives, or so long."""
+        ...
+
+    def receive(self) -> bytes:
+        """Return what arrived; b"": nothing."""
+        ...
+
+    def send(self, data: bytes) -> None:
+        """Send, or keep for later what the host does not take yet; nothing where none is there."""
+        ...
+
+    def hang_up(self) -> None:
+        """Drop the host, and what it has not read."""
+        ...
+
+    def close(self) -> None:
+        """Leave the line."""
+        ...
+
+
+def open_link(port: str, *, remote: bool = False) -> Link:
+    """Open `socket://HOST:PORT` (port 0: any that is free) or `pty`.
+
+    Raises
+    ------
+    ConfigError : it is neither; the port is taken; or others could reach it, and `remote` is False.
+    """
+    if port == "pty":
+        return _open_pty()
+    where = f"--port {port}"
+    parts = urlsplit(port)
+    try:
+        host, number = parts.hostname, parts.port
+    except ValueError:
+        host = number = None
+    if parts.scheme != "socket" or host is None or number is None:
+        raise ConfigError(f"{where}: write socket://127.0.0.1:5555, port 0 for any, or pty")
+    try:
+        family, *_, address = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0]
+    except OSError as error:
+        raise ConfigError(f"{where}: {error.strerror}") from None
+    if not (remote or ip_address(address[0]).is_loopback):
+        raise ConfigError(
+            f"{where}: whoever reaches this port can drive the bench; "
+            "take 127.0.0.1, or add --remote if that is meant"
+        )
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    if sys.platform != "win32":  # there it would let two emulators share a port
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind(address)
+    except OSError as error:
+        listener.close()
+        taken = "; choose another port, or 0 for any" if error.errno == errno.EADDRINUSE else ""
+        raise ConfigError(f"{where}: {error.strerror}{taken}") from None
+    listener.listen()
+    listener.setblocking(False)
+    name = f"[{host}]" if ":" in host else host
+    return _SocketLink(listener, address=f"socket://{name}:{listener.getsockname()[1]}")
+
+
+class _SocketLink:
+    def __init__(self, listener: socket.socket, *, address: str) -> None:
+        self.address, self._listener = address, listener
+        self._client: socket.socket | None = None
+        self._ready = False  # something arrived, or a host is at the door
+        self._unsent = bytearray()
+
+    @property
+    def connected(self) -> bool:
+        return self._client is not None
+
+    @property
+    def unsent(self) -> int:
+        return len(self._unsent)
+
+    def wait(self, seconds: float) -> None:
+        reader = self._client or self._listener
+        writers = [self._client] if self._client and self._unsent else []
+        readable, writable, _ = select.select([reader], writers, [], seconds)
+        self._ready = bool(readable)
+        if writable:
+            self.send(b"")
+
+    def receive(self) -> bytes:
+        if not self._ready:
+            return b""
+        self._ready = False
+        if self._client is None:
+            self._accept()
+            return b""
+        try:
+            data = self._client.recv(_CHUNK)
+        except BlockingIOError:
+            return b""
+        except OSError:  # reset by the host
+            data = b""
+        if not data:
+            self.hang_up()
+        return data
+
+    def _accept(self) -> None:
+        with contextlib.suppress(BlockingIOError, ConnectionError):
+            self._client, _ = self._listener.accept()
+            self._client.setblocking(False)
+            self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+    def send(self, data: bytes) -> None:
+        if self._client is None:
+            return
+        self._unsent += data
+        try:
+            while self._unsent:
+                del self._unsent[: self._client.send(self._unsent[:_CHUNK])]
+        except BlockingIOError:
+            return
+        except OSError:
+            self.hang_up()
+
+    def hang_up(self) -> None:
+        self._unsent.clear()
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def close(self) -> None:
+        self.hang_up()
+        self._listener.close()
+
+
+def _open_pty() -> "Link":
+    if sys.platform == "win32":
+        raise ConfigError("--port pty: Windows has no pseudo-terminals; take socket://127.0.0.1:0")
+    return _PtyLink()
+
+
+class _PtyLink:
+    def __init__(self) -> None:
+        import tty  # not on Windows
+
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        self.address = os.ttyname(slave)
+        os.close(slave)  # so that the master tells when no host has it open
+        os.set_blocking(self._master, False)
+        self.connected = False
+        self._unsent = bytearray()
+
+    @property
+    def unsent(self) -> int:
+        return len(self._unsent)
+
+    def wait(self, seconds: float) -> None:
+        if self.connected:
+            writers = [self._master] if self._unsent else []
+            select.select([self._master], writers, [], seconds)
+        else:
+            time.sleep(min(seconds, 0.01))  # somebody may open the pseudo-terminal
+
+    def receive(self) -> bytes:
+        self.send(b"")
+        try:
+            data = os.read(self._master, _CHUNK)
+        except BlockingIOError:
+            self.connected = True
+            return b""
+        except OSError:  # nobody has it open
+            data = b""
+        self.connected = bool(data)
+        if not data:
+            self._unsent.clear()
+        return data
+
+    def send(self, data: bytes) -> None:
+        if not self.connected:
+            return
+        self._unsent += data
+        with contextlib.suppress(BlockingIOError):
+            while self._unsent:
+                del self._unsent[: os.write(self._master, self._unsent[:_CHUNK])]
+
+    def hang_up(self) -> None:
+        """Do nothing but forget: a pseudo-terminal cannot be pulled out of a host's hands."""
+        self._unsent.clear()
+
+    def close(self) -> None:
+        os.close(self._master)

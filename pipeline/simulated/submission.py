@@ -1,0 +1,220 @@
+"""A plant as a whole submission: `submission.toml` and the data a class would have recorded."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.results import FeedbackDesign
+from pipeline.simulated import claims, runs
+from pipeline.simulated.bench import BenchRun, SimulatedBench, TrueMotion
+from pipeline.simulated.hidden import preset_bench
+from pipeline.stages.state_feedback import design_feedback
+from pipeline.submission import Design
+from pipeline.submission.toml_file import Value
+from pipeline.submission.toml_section import toml_section
+
+
+@dataclass(frozen=True, kw_only=True)
+class Students:
+    """Who measured a simulated bench, and what they write of it beside their numbers.
+
+    Attributes
+    ----------
+    authors : ids; none: two that go with the seed, so that a class has no one twice.
+    title : of the submission; "": one that names the bench and the seed.
+    springs : which springs they say there are; none: those of the chain.
+    time_decimals : of the log's stamps; 3 gives the rounded ones of an ECP export.
+    notes : text of `notes.md`; "": there is none.
+    """
+
+    authors: Sequence[str] = ()
+    title: str = ""
+    section: str = "01"
+    springs: Sequence[bool] = ()
+    time_decimals: int = 5
+    notes: str = ""
+
+
+def write_submission(
+    folder: Path,
+    bench: SimulatedBench | str,
+    *,
+    seed: int,
+    compact: bool = False,
+    reported: bool = False,
+    students: Students | None = None,
+) -> None:
+    """Write the submission of students who measured a bench; same arguments, same bytes.
+
+    Nothing written tells of the bench's effects, and the students believe in a linear chain.
+
+    Parameters
+    ----------
+    folder : made if need be; files of the same names are replaced.
+    bench : the true plant, or a preset's name.
+    compact : fewer repeats and dwells, most dwells without their transient: half the size.
+    reported : add what honest students claim, `[reported]`.
+
+    Raises
+    ------
+    ConfigError : there is no such preset, or the simulation would never end.
+    DataError : the chain never settles, has no static gain, or runs away with its effects.
+    """
+    bench = preset_bench(bench) if isinstance(bench, str) else bench
+    bench.refuse_endless()
+    students = students or Students()
+    rng = np.random.default_rng(seed)
+    believed = claims.believed_chain(bench.chain, rng)
+    task = _task(bench)
+    design = _design(believed, task)
+    programme = _programme(bench, rng, compact=compact, design=design, believed=believed)
+    logs = {}
+    for run in programme:
+        motion = bench.move(run)
+        y = bench.read(motion, run=run, rng=rng)
+        logs[_data_file(run)] = _csv_text(
+            run, motion, y, time_decimals=students.time_decimals, count=bench.count
+        )
+    sections = [
+        *_head(bench, students, seed=seed),
+        toml_section("[design]", task.model_dump()),
+        *(toml_section("[[experiments]]", _experiment(run)) for run in programme),
+    ]
+    if reported:
+        hertz = [run.frequency for run in programme if run.frequency]
+        initial = claims.initial_estimates(bench.chain, dwells_hz=hertz, rng=rng)
+        sections += [
+            toml_section("[reported.initial]", initial),
+            toml_section("[reported.final]", claims.final_estimates(believed)),
+            toml_section("[reported.state_space]", claims.state_space(believed)),
+            toml_section("[reported.feedback]", claims.feedback(design)),
+        ]
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    for file, text in logs.items():
+        _write(folder / file, text)
+    _write(folder / "submission.toml", "\n".join(sections))
+    if students.notes:
+        _write(folder / "notes.md", students.notes)
+
+
+def _task(bench: SimulatedBench) -> Design:
+    return Design(
+        cart=min(2, bench.chain.n),  # the far one of two carts; the paper's choice of three
+        reference=bench.travel,
+        overshoot_percent=10.0,
+        settling_time=1.0,
+        input_limit=bench.input_limit,
+        sample_time=bench.sample_time,
+        method="lqr",
+    )
+
+
+def _programme(
+    bench: SimulatedBench,
+    rng: np.random.Generator,
+    *,
+    compact: bool,
+    design: FeedbackDesign,
+    believed: Chain,
+) -> list[BenchRun]:
+    session = runs.SimulatedSession(
+        bench=bench,
+        repeats=2 if compact else 3,
+        n_dwells=22 if compact else 28,
+        transients=not compact,
+        sweep_time=12.0 if compact else 20.0,
+    )
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=believed)
+    return [
+        *runs.plan_decays(session, rng),
+        *runs.plan_steps(session),
+        *runs.plan_dwells(session),
+        runs.plan_sweep(session),
+        runs.plan_closed_loop(session, cart=min(2, bench.chain.n), controller=law),
+    ]
+
+
+def _head(bench: SimulatedBench, students: Students, *, seed: int) -> Iterator[str]:
+    """Yield the tables before the experiments."""
+    named = f"Simulated bench, {bench.name}, seed {seed}" if bench.name else "Simulated bench"
+    title = students.title or named
+    yield toml_section("", {"version": 1, "title": title, "section": students.section})
+    for author in students.authors or (f"s{1001 + 2 * seed}", f"s{1002 + 2 * seed}"):
+        yield toml_section("[[authors]]", {"id": author})
+    system: dict[str, Value] = {
+        "carts": bench.chain.n,
+        "springs": list(students.springs) or [bool(k > 0) for k in bench.chain.k],
+        "input": {"unit": bench.input_unit, "sign": 1},
+        "position": {"unit": bench.position_unit},
+    }
+    yield toml_section("[system]", system)
+
+
+def _design(believed: Chain, task: Design) -> FeedbackDesign:
+    """Return the controller as it is typed into the bench: gains to four digits."""
+    design = design_feedback(believed, task)
+    return replace(
+        design,
+        gains=np.array([float(f"{gain:.4g}") for gain in design.gains]),
+        prefilter=float(f"{design.prefilter:.4g}"),
+    )
+
+
+def _csv_text(
+    run: BenchRun, motion: TrueMotion, y: Array, *, time_decimals: int, count: float
+) -> str:
+    """Return the log of one run: time, input, in a closed loop the reference, and x1 … xn.
+
+    `y` is (n_carts, n) whole counts, in position units; they are written with one digit
+    more than it takes to tell a count from the next.
+    """
+    kept = run.t >= run.keep_from
+    columns = {"time": _fixed(run.t[kept] - run.t[kept][0], time_decimals)}
+    columns["input"] = _fixed(motion.u[kept], runs.INPUT_DECIMALS)
+    if run.reference is not None:
+        columns["reference"] = _fixed(run.reference[kept], runs.INPUT_DECIMALS)
+    position_decimals = max(0, math.ceil(-math.log10(count)) + 1)
+    for cart, positions in enumerate(y, start=1):
+        columns[f"x{cart}"] = _fixed(positions[kept], position_decimals)
+    rows = zip(*columns.values(), strict=True)
+    return "\n".join(",".join(row) for row in [tuple(columns), *rows]) + "\n"
+
+
+def _fixed(values: Array, decimals: int) -> list[str]:
+    """Format with fixed decimals, without the zeros that say nothing and without -0."""
+    texts = [f"{value:.{decimals}f}" for value in np.round(values, decimals) + 0.0]
+    return [text.rstrip("0").rstrip(".") for text in texts] if decimals else texts
+
+
+def _data_file(run: BenchRun) -> str:
+    return f"data/{run.id}.csv"
+
+
+def _experiment(run: BenchRun) -> dict[str, Value]:
+    """Return the keys of one `[[experiments]]`."""
+    entry: dict[str, Value] = {"id": run.id, "kind": run.kind}
+    if run.kind == "decay":
+        entry["carts"] = list(run.free)
+    if run.frequency is not None:
+        entry["frequency"] = run.frequency
+    if run.controller is not None and run.cart is not None:
+        entry["controlled_cart"] = run.cart
+        entry["controller"] = {
+            "type": "state_feedback",
+            "gains": run.controller.gains.tolist(),
+            "prefilter": run.controller.prefilter,
+        }
+    entry["file"] = _data_file(run)
+    if run.note:
+        entry["note"] = run.note
+    return entry
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")

@@ -1,0 +1,1 @@
+"""What is wrong with a recording, or contradicts another: found here, and said in one place."""

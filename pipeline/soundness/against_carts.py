@@ -1,0 +1,286 @@
+"""Recordings that do not hold what happened: a dead or exchanged channel, a wrong clock, a cut.
+
+Friction may hold a cart still, a held cart is still by right, and a coarse encoder shows nothing
+of a small motion. So a channel is called dead only where the identified carts would have moved it
+far, and where runs that follow them leave friction too small to hold it.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.estimation.chain.follow import (
+    Followed,
+    Misread,
+    force_on,
+    is_driven,
+    measured,
+    most_follow,
+    near,
+)
+from pipeline.estimation.chain.time_search import FOLLOWED
+from pipeline.estimation.units_and_clocks import FASTEST, TIME_FACTORS
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.results import Record, StepGain
+from pipeline.soundness.fault import SAME, SIGMAS, RecordingFault
+from pipeline.soundness.other_readings import find_other_readings
+
+# A reading that stays while the input changes over half its range, and for this share of the record
+# after it; meanwhile the carts, as identified, must move by so many encoder steps, and by three
+# tenths of their motion, as a delay or play may hold one for a moment.
+_STILL, _SEEN_COUNTS = 0.2, 5.0
+_FEWEST_CYCLES = 1.5  # of a dwell: with fewer there is no steady state, whatever the damping
+
+
+def standing_still(records: Sequence[Record]) -> set[str]:
+    """Return the driven records in which a free cart's reading stays while the input changes."""
+    return {
+        record.id
+        for record in records
+        if is_driven(record) and any(any(_still(record, cart)) for cart in measured(record))
+    }
+
+
+def find_faults(
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
+) -> dict[str, RecordingFault]:
+    """Return the records that do not hold what happened, by id, each with what is wrong.
+
+    Parameters
+    ----------
+    chain : the carts as identified from the records that are not in doubt; None where they could
+        not be: then only what no carts could do is found.
+    fits : how the records follow it, as `follow` has it.
+    """
+    readings = find_other_readings(records, chain=chain, fits=fits)
+    misread = readings.mistaken
+    everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
+    copied = _copies(records)
+    steps: dict[int, float] = {}  # a dead channel shows none
+    moving: set[int] = set()
+    for record in records:
+        for cart in measured(record):
+            steps[cart] = max(steps.get(cart, 0.0), record.encoder_step(cart))
+            if is_driven(record) and np.ptp(record.position(cart)) > 0:
+                moving.add(cart)
+    friction = {
+        cart: float(
+            np.median([f.friction.get(cart, np.inf) for f in fits.values() if cart in f.lost])
+        )
+        for cart in {cart for fit in fits.values() for cart in fit.lost}
+    }
+    # However many are wrong: no bench is read a thousand times as slowly in some recordings.
+    clocks = [record.sample_time for record in records]
+    usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
+    found: dict[str, RecordingFault] = {}
+    for record in records:
+        legal = record.id in misread and misread[record.id].legal
+        for fault in (
+            *_wrong_clock(record, usual=usual_clock),
+            *_short_dwell(record),
+            *([copied[record.id]] if record.id in copied else ()),
+            *([_misread(record, misread[record.id], everywhere)] if record.id in misread else ()),
+            *(
+                _frozen(record, fits[record.id], chain, friction=friction, steps=steps)
+                if chain and record.id in fits
+                else ()
+            ),
+            *_dead_channels(record, chain=chain, friction=friction, steps=steps, moving=moving),
+        ):
+            found.setdefault(record.id, replace(fault, is_wrong=not legal))
+    for name, one in readings.odd.items():
+        found.setdefault(name, one)
+    for stray in _strays(records, chain=chain, fits=fits):
+        found.setdefault(stray.run, stray)
+    return found
+
+
+def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault]:
+    """Return the steps in which a cart moves farther than the one that pulls it, by id.
+
+    The input acts on cart 1, springs do the rest: a static gain is at most that of the cart before.
+    """
+    found: dict[str, RecordingFault] = {}
+    by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
+    for (run, cart), gain in by_cart.items():
+        before = by_cart.get((run, cart - 1))
+        if before is None:
+            continue
+        least = abs(gain.gain) - SIGMAS * gain.gain_std
+        # By more than friction may hold the carts off.
+        if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
+            said = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
+            found[run] = RecordingFault(code="too_far", run=run, cart=cart, said=said)
+    return found
+
+
+# ------------------------------------------------------------------ single channels
+
+
+def _edges(y: np.ndarray) -> np.ndarray:
+    """Return where each stretch of one and the same reading starts, and where the last ends."""
+    return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
+
+
+def _still(record: Record, cart: int) -> Iterator[slice]:
+    """Yield the samples of one and the same reading over which the input changes far."""
+    u, y = record.u, record.position(cart)
+    if u is None:
+        return
+    edges = _edges(y)
+    long = _STILL * y.size
+    for i in np.flatnonzero(np.diff(edges) >= long):
+        part = slice(int(edges[i]), int(edges[i + 1]))
+        changed = np.abs(u[part] - u[part.start]) >= 0.5 * np.ptp(u)
+        if changed.any() and changed.size - np.argmax(changed) >= long:
+            yield part
+
+
+def _dead_channels(
+    record: Record,
+    *,
+    chain: Chain | None,
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+    moving: Set[int],
+) -> Iterator[RecordingFault]:
+    """Yield each free cart's reading that stays where the cart must have moved.
+
+    By cart, `friction` is the most that the records allow, `steps` has the encoder step; `moving`
+    are the carts that any input ever moved.
+    """
+    for cart in measured(record):
+        y = record.position(cart)
+        never = is_driven(record) and cart not in moving
+        if np.ptp(y) == 0 and (record.kind == "decay" or never):
+            others = [free for free in record.free if free != cart]
+            code = "never_changes_held" if others else "never_changes"
+            yield RecordingFault(code=code, run=record.id, cart=cart, said={"others": str(others)})
+        if chain is None or record.u is None or not is_driven(record):
+            continue
+        force = force_on(record, chain, cart=cart)
+        for still in _still(record, cart):
+            # Friction that holds a cart pulls at most as far to one side as then to the other.
+            if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
+                continue
+            if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
+                continue
+            code = "dead" if np.ptp(y) == 0 else "froze_at_input"
+            yield RecordingFault(code=code, run=record.id, cart=cart, said=_span(record, still))
+
+
+def _frozen(
+    record: Record,
+    fit: Followed,
+    chain: Chain,
+    *,
+    friction: Mapping[int, float],
+    steps: Mapping[int, float],
+) -> Iterator[RecordingFault]:
+    """Yield each reading that stays for a while in which the carts moved it far.
+
+    For ten samples and more, by a fifth of its motion. Before and after it follows them, and what
+    pulls at it meanwhile no friction can hold.
+    """
+    for cart, missed in fit.missed.items():
+        y = record.position(cart)
+        far = max(_SEEN_COUNTS * steps[cart], 0.2 * float(np.ptp(y)))
+        edges = _edges(y)
+        for i in np.flatnonzero(np.diff(edges) >= 10):
+            part = slice(int(edges[i]), int(edges[i + 1]))
+            moved = float(np.ptp(missed[part]))
+            if moved < far:
+                continue
+            rest, force = np.delete(missed, part), force_on(record, chain, cart=cart)
+            if not rest.size or force is None:
+                continue
+            # A cart at rest stays there for a moment after the input steps.
+            early = force[part][: (part.stop - part.start) // 2]
+            if 2 * friction.get(cart, np.inf) >= np.ptp(early):
+                continue
+            elsewhere = float(np.mean(rest**2))
+            follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
+            # It does follow them: it misses them by a quarter of that motion at most.
+            if follows and np.sqrt(elsewhere) < 0.25 * moved:
+                said = _span(record, part)
+                yield RecordingFault(code="froze_in_motion", run=record.id, cart=cart, said=said)
+
+
+def _span(record: Record, part: slice) -> dict[str, str]:
+    first, last = record.t[part.start], record.t[part.stop - 1]
+    return {"first": f"{first:.4g}", "last": f"{last:.4g}"}
+
+
+def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
+    """Whether the input moves a cart far within some samples, from rest and in steady state."""
+    assert record.u is not None
+    free = tuple(sorted(record.free))
+    y = simulate_linear(chain, record.t, record.u, free=free, hold=record.hold)[free.index(cart)]
+    far = float(np.ptp(y[still]))
+    if record.kind == "sine" and record.omega is not None:  # it may start in motion
+        G = chain.frequency_response(np.array([record.omega]))[cart - 1, 0]
+        far = min(far, float(abs(G) * np.ptp(record.u)))
+    return far >= max(_SEEN_COUNTS * step, 0.3 * float(np.ptp(y)))
+
+
+def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
+    """Return the records that hold the very samples of one of their kind before them."""
+    first: dict[tuple[object, ...], str] = {}
+    copies = {}
+    for record in records:
+        what = (record.kind, record.free, record.t.tobytes(), record.y.tobytes())
+        if first.setdefault(what, record.id) != record.id:
+            said = {"original": first[what]}
+            copies[record.id] = RecordingFault(code="copied_samples", run=record.id, said=said)
+    return copies
+
+
+def _short_dwell(record: Record) -> Iterator[RecordingFault]:
+    if record.kind == "sine" and record.omega is not None:
+        duration = float(record.t[-1] - record.t[0]) + record.sample_time
+        cycles = record.omega * duration / (2 * np.pi)
+        if cycles < _FEWEST_CYCLES:
+            said = {"cycles": f"{_FEWEST_CYCLES:g}"}
+            yield RecordingFault(code="short_dwell", run=record.id, said=said)
+
+
+def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
+    """Yield the unit of a time column that makes this record's sampling the usual one."""
+    for factor, words in TIME_FACTORS.items():
+        # A hundred times as slow is another unit of time; twice may be another setting.
+        is_unit = max(factor, 1 / factor) >= 100.0
+        if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
+            said = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
+            yield RecordingFault(code="other_clock", run=record.id, said=said)
+
+
+# ------------------------------------------------------- records that follow no carts
+
+
+def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFault:
+    code = "misread_everywhere" if everywhere else "misread"
+    said = {"look": misread.words, "remedy": misread.remedy}
+    return RecordingFault(code=code, run=record.id, said=said)
+
+
+def _strays(
+    records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
+) -> Iterator[RecordingFault]:
+    """Yield the records that follow no carts like those that most records follow, and by how far.
+
+    Any cart that follows counts for the record: another may be near its null, and hardly move.
+    One that moves less than it should says nothing: friction may hold it.
+    """
+    if chain is None or not most_follow(fits):
+        return
+    for record in records:
+        fit = fits.get(record.id)
+        # Friction makes no cart move further, so none that moves less is judged.
+        if fit is None or fit.belongs or max(fit.reach.values()) < 0.8:
+            continue
+        # More than half of the power of every cart.
+        if all(min(near_by.lost.values()) > 0.5 for near_by in near(record, chain)):
+            said = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
+            yield RecordingFault(code="stray", run=record.id, said=said, is_wrong=False)

@@ -1,0 +1,63 @@
+"""Every recording that does not hold what it should: left out, clipped, or not as stated."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from pipeline.ingest.channels import saturation
+from pipeline.ingest.inspect import line_frequency
+from pipeline.results import Analysis, Record
+from pipeline.soundness.fault import RecordingFault, say, sound_ones
+from pipeline.soundness.late_channels import late_experiments
+from pipeline.soundness.stated import find_other_scales, find_wrong_setups, why_other_frequency
+
+# Relative: a stated frequency further from that of the input is another run's.
+_OTHER_RUN = 0.08
+
+
+def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
+    """Return the recordings that do not hold what they should, each with what is wrong."""
+    found = dict(analysis.unreadable)
+    found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
+    sound = sound_ones(analysis.records, analysis.left_out)
+    setups = {
+        fault.run: fault.reason
+        for fault in (
+            *find_other_scales(sound, bench=analysis.bench),
+            *find_wrong_setups(analysis.records),
+        )
+    }
+    late = late_experiments(analysis.late_channels)
+    # A cart that sticks rests where it turns, which looks like a clipped reading.
+    sticky = analysis.fit is not None and not analysis.fit.explains_data
+    for record in analysis.records:
+        if record.id in setups:
+            found[record.id] = setups[record.id]
+            continue
+        here = [late[record.id]] if record.id in late else []
+        told = (fault.reason for fault in _channels_at_fault(record, sticky=sticky))
+        for problem in (*told, *here):
+            found.setdefault(record.id, problem)
+    return found
+
+
+def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFault]:
+    """Yield the channels that are clipped, and an input of another frequency than stated."""
+    for cart in record.carts:
+        if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
+            continue
+        if (limit := saturation(record.position(cart))) is not None:
+            said = {"limit": f"{limit:.4g}"}
+            yield RecordingFault(code="clipped_position", run=record.id, cart=cart, said=said)
+    u = record.u
+    if u is None or record.kind == "closed_loop":
+        return
+    if (limit := saturation(u)) is not None:
+        yield RecordingFault(code="clipped_input", run=record.id, said={"limit": f"{limit:.4g}"})
+    if record.kind == "sine" and record.omega is not None and np.ptp(u) > 0:
+        hertz, stated = line_frequency(record.t, u), record.omega / (2 * np.pi)
+        resolution = 1.0 / float(record.t[-1] - record.t[0])
+        if hertz is not None and abs(hertz - stated) > max(_OTHER_RUN * stated, resolution):
+            look = why_other_frequency(stated / hertz) or say("frequency_of_another")
+            said = {"found": f"{hertz:.3g}", "stated": f"{stated:.3g}", "look": look}
+            yield RecordingFault(code="other_frequency", run=record.id, said=said)

@@ -1,0 +1,74 @@
+"""What encoders alone show: that one is in another unit of length, or that it stuck."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline.estimation.chain.follow import measured
+from pipeline.estimation.units_and_clocks import LENGTH_SCALES
+from pipeline.ingest.channels import stuck_spans
+from pipeline.results import Record
+from pipeline.soundness.fault import SAME, WITNESSES, RecordingFault
+
+
+def find_other_units(
+    records: Sequence[Record], *, decays: bool = False
+) -> dict[str, RecordingFault]:
+    """Find the records whose encoder step is that of the others in another unit, by id.
+
+    A class of a dozen dwells was exported in one go, and so may all be wrong: the usual step is
+    what most kinds of experiment have, not most records. A step of 0.01 beside one of 0.001 is
+    how many decimals were written. A decay gives no length, so that it is as good in any unit:
+    those are looked for alone, with `decays`.
+    """
+    found: dict[str, RecordingFault] = {}
+    for cart in sorted({cart for record in records for cart in record.carts}):
+        steps = {r.id: r.encoder_step(cart) for r in records if cart in r.carts}
+        by_kind = [
+            float(np.median(seen))
+            for kind in dict.fromkeys(record.kind for record in records)
+            if (seen := [s for r in records if r.kind == kind and (s := steps.get(r.id, 0.0))])
+        ]
+        usual = max(by_kind, key=lambda step: sum(_alike(step, s) for s in by_kind), default=0.0)
+        if sum(_alike(step, usual) for step in by_kind) < WITNESSES:
+            continue
+        scales = [s for scale in LENGTH_SCALES for s in (scale, 1 / scale)]
+        for record in [r for r in records if r.id in steps and (r.kind == "decay") is decays]:
+            step = steps[record.id]
+            if _is_decimal(step) and _is_decimal(usual):
+                continue
+            for scale in [s for s in scales if _alike(step, s * usual)]:
+                said = {"scale": f"{scale:.3g}"}
+                fault = RecordingFault(code="other_unit", run=record.id, cart=cart, said=said)
+                found.setdefault(record.id, fault)
+    return found
+
+
+def _alike(step: float, other: float) -> bool:
+    return abs(step - other) <= SAME * other
+
+
+def _is_decimal(step: float) -> bool:
+    """Whether a step is 1 of some decimal place, as numbers are written."""
+    return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
+
+
+def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
+    """Return the records in which a free cart's encoder stuck, by id.
+
+    Static friction stops a cart from a crawl, far below the fastest 2 % of its moves from sample to
+    sample; it does not stop one at speed, nor is it elsewhere when it moves on.
+    """
+    found: dict[str, RecordingFault] = {}
+    for record in records:
+        for cart in measured(record):
+            y = record.position(cart)
+            for first, last in stuck_spans(y):
+                moves = np.abs(np.diff(y))
+                fastest = float(np.quantile(moves, 0.98))
+                away = last < moves.size and moves[last] >= 1.5 * fastest
+                if away or moves[first - 1] >= 0.6 * fastest:
+                    said = {"first": f"{record.t[first]:.4g}", "last": f"{record.t[last]:.4g}"}
+                    fault = RecordingFault(code="stuck", run=record.id, cart=cart, said=said)
+                    found.setdefault(record.id, fault)
+    return found

@@ -1,0 +1,269 @@
+"""Numbers measured more than once: whether the runs agree, which stand off, and what they did.
+
+A frequency or a gain that two runs give 10 % apart, and beyond their errors, is no number with a
+wide error: one of the runs is wrong. The fit tells which, else the majority; else nothing does.
+Runs that agree with each other may share a mistake: dwells that one chain explains tell it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.estimation.units_and_clocks import TIME_FACTORS
+from pipeline.names import gain_name, own_omega, own_zeta, read_name
+from pipeline.results import Check, Estimate, LogDecrement, StepGain
+from pipeline.soundness.fault import SAME_SIZE, SIGMAS, RecordingFault
+
+_LIKE_THE_FIT = 0.15  # relative: as far as initial and final estimates may lie apart (Throne 2005)
+# Factors by which friction, play or a soft hold may move a gain or a frequency.
+_BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repeats:
+    """Repeated measurements held against one another.
+
+    Attributes
+    ----------
+    checks : one for each number that was measured more than once.
+    odd : the runs that stand off, by id, each with what is wrong.
+    undecided : the numbers whose runs contradict one another, nobody knows which is right.
+    """
+
+    checks: tuple[Check, ...] = ()
+    odd: dict[str, RecordingFault] = field(default_factory=dict)
+    undecided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reading:
+    """One run's value, between where it lies, and the size of the step it was read from.
+
+    `tolerance` : percent that runs may differ by: the same run made twice differs by some percent
+    with dry friction.
+    """
+
+    run: str
+    value: float
+    low: float
+    high: float
+    size: float = 0.0
+    tolerance: float = 10.0
+
+
+def compare_repeats(
+    decays: Sequence[LogDecrement],
+    steps: Sequence[StepGain],
+    *,
+    carts: int,
+    fitted: Mapping[str, Estimate],
+    dwells: Mapping[str, Estimate],
+) -> Repeats:
+    """Hold the runs that give one frequency, damping or static gain against one another.
+
+    Parameters
+    ----------
+    fitted : the parameters of a fit that explains most records; else none.
+    dwells : … of one that rests on dwells alone, and explains them; else none.
+    """
+    readings = _readings(decays, steps, carts=carts)
+    # A fit's damping rests on the decays' own where its points do not tell it.
+    told = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
+    right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
+    usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
+    for name in [name for name in usual if name in dwells and not read_name(name).is_ratio]:
+        if all(_is_far(reading, dwells[name], name=name) for reading in right[name]):
+            usual[name], right[name] = dwells[name].value, []
+    by_size = {name for name, ones in right.items() if ones and _only_by_size(readings[name])}
+    of_run: dict[str, dict[str, float]] = {}
+    for name, all_ in readings.items():
+        for reading in all_:
+            of_run.setdefault(reading.run, {})[name] = reading.value
+    odd: dict[str, RecordingFault] = {}
+    for name, value in usual.items():
+        belong = {reading.run for reading in right[name]}
+        for run in [r.run for r in readings[name] if r.run not in belong and r.run not in odd]:
+            said = _wrong_clock(of_run[run], usual)
+            if said or name not in by_size:
+                wrong = said or (not right[name] and _differ_in_size(readings[name]))
+                odd[run] = RecordingFault(
+                    code="odd_number" if right[name] else "odd_beside_dwells",
+                    run=run,
+                    said={
+                        "parameter": name,
+                        "found": f"{of_run[run][name]:.3g}",
+                        "usual": f"{value:.3g}",
+                        "look": f": {said}" if said else "",
+                    },
+                    is_wrong=bool(wrong) and not _is_reversed(of_run[run], usual),
+                )
+    undecided = tuple(name for name in readings if name not in usual and name not in by_size)
+    return Repeats(
+        checks=tuple(
+            _check(name, all_, right=right[name], odd=odd, undecided=name in undecided)
+            for name, all_ in readings.items()
+            if len(all_) > 1 and (right[name] or name not in usual)
+        ),
+        odd=odd,
+        undecided=undecided,
+    )
+
+
+def _readings(
+    decays: Sequence[LogDecrement], steps: Sequence[StepGain], *, carts: int
+) -> dict[str, list[_Reading]]:
+    found: dict[str, list[_Reading]] = {}
+    for decay in decays:
+        name = own_omega(decay.cart, n=carts)
+        slack = SIGMAS * decay.omega_n_std
+        found.setdefault(name, []).append(
+            _Reading(
+                run=decay.experiment,
+                value=decay.omega_n,
+                low=decay.omega_n - slack,
+                high=decay.omega_n + slack,
+            )
+        )
+        slack = SIGMAS * decay.zeta_std
+        # Dry friction adds the more damping the less the cart swings.
+        sticks = decay.friction is not None and decay.friction.present
+        ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
+        found.setdefault(own_zeta(decay.cart, n=carts), []).append(
+            _Reading(
+                run=decay.experiment,
+                value=decay.zeta,
+                low=min(ratios) - slack,
+                high=max(ratios) + slack,
+                # A bearing's dirt moves a damping by half.
+                tolerance=50.0,
+            )
+        )
+    for step in steps:
+        name, slack = gain_name(step.cart, n=carts), SIGMAS * step.gain_std
+        low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
+        found.setdefault(name, []).append(
+            _Reading(
+                run=step.experiment,
+                value=step.gain,
+                low=min(low, step.gain - slack),
+                high=max(high, step.gain + slack),
+                size=max(abs(edge.u_after - edge.u_before) for edge in step.edges),
+            )
+        )
+    return found
+
+
+def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
+    """Return which readings (n, n) contradict one another."""
+    value, low, high = np.array([(r.value, r.low, r.high) for r in readings]).T
+    size = np.maximum(np.abs(value[:, None]), np.abs(value))
+    far = np.abs(value[:, None] - value) > readings[0].tolerance / 100 * size
+    return far & (np.maximum(low[:, None], low) > np.minimum(high[:, None], high))
+
+
+def _only_by_size(readings: Sequence[_Reading]) -> bool:
+    """Whether steps of one size agree, those of another only among themselves: dry friction."""
+    size = np.array([reading.size for reading in readings])
+    alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
+    return not np.any(_contradictions(readings) & alike)
+
+
+def _differ_in_size(readings: Sequence[_Reading]) -> bool:
+    """Whether steps are of several sizes, of which a limit or friction makes several gains."""
+    size = np.array([reading.size for reading in readings])
+    return bool(size.min() < (1 - SAME_SIZE) * size.max())
+
+
+def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
+    """Return the readings that belong together: all, those like the fit, or most; none: open."""
+    apart = _contradictions(readings)
+    if not np.any(apart):
+        return list(readings)
+    if fitted is not None and fitted.std is not None:
+        near = _LIKE_THE_FIT * abs(fitted.value)
+        like = [r for r in readings if abs(r.value - fitted.value) <= near]
+        if like and SIGMAS * fitted.std <= near:
+            near_it = np.array([reading in like for reading in readings])
+            contrary = np.any(apart[:, near_it], axis=1) & ~near_it
+            return [r for r, is_odd in zip(readings, contrary, strict=True) if not is_odd]
+    most = ~apart[np.argmin(apart.sum(axis=1))]
+    largest = [reading for reading, belongs in zip(readings, most, strict=True) if belongs]
+    return largest if 2 * len(largest) > len(readings) else []
+
+
+def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
+    """Whether a reading and its errors are of another number than one that is well known."""
+    if told.std is None or told.value <= 0 or SIGMAS * told.std > _LIKE_THE_FIT * told.value:
+        return False
+    factor = _BY_THE_BENCH[read_name(name).symbol]
+    return reading.high < told.value / factor or reading.low > told.value * factor
+
+
+def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
+    """Return how a decay's clock makes its own frequencies of the usual ones, or ""."""
+    ratios = [
+        usual[name] / value
+        for name, value in values.items()
+        if read_name(name).is_frequency and usual.get(name)
+    ]
+    looks = (
+        words
+        for factor, words in TIME_FACTORS.items()
+        if ratios and all(_near(ratio, factor) for ratio in ratios)
+    )
+    return next(looks, "")
+
+
+def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
+    """Whether all carts went the other way: a log may count its input so by right."""
+    known = [name for name in values if read_name(name).is_gain and usual.get(name)]
+    return bool(known) and all(_near(values[name], -usual[name]) for name in known)
+
+
+def _near(value: float, other: float) -> bool:
+    # What a known mistake leaves of the difference between two runs.
+    return abs(value - other) <= 0.05 * abs(other)
+
+
+def _check(
+    name: str,
+    readings: Sequence[_Reading],
+    *,
+    right: Sequence[_Reading],
+    odd: Mapping[str, RecordingFault],
+    undecided: bool,
+) -> Check:
+    values = [reading.value for reading in readings]
+    largest = max(map(abs, values))
+    spread = 100 * (max(values) - min(values)) / largest if largest > 0 else 0.0
+    # A run that another number shows to be odd may agree in this one.
+    off = [reading for reading in readings if reading.run in odd and reading not in right]
+    apart = f"from {min(values):.4g} to {max(values):.4g}"
+    count = f"{len(readings)} runs"
+    if undecided:
+        outcome, said = (
+            "fail",
+            (
+                f"contradict one another, {apart}, and nothing else tells which is right: "
+                "none of them is used"
+            ),
+        )
+    elif off:
+        runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
+        outcome, said = "fail", f"contradict one another, {apart}. Left out is {runs}"
+    elif np.any(_contradictions(readings)):
+        outcome, said = "fail", f"lie {apart}, by the size of the step, as where a cart sticks"
+    elif spread > readings[0].tolerance:
+        outcome, said = "skip", f"lie {apart}, no further apart than their errors"
+    else:
+        outcome, said = "pass", f"agree within {spread:.2g} %"
+    return Check(
+        kind="repeats",
+        parameter=name,
+        outcome=outcome,
+        value=spread,
+        limit=readings[0].tolerance,
+        message=f"{name}: {count} {said}.",
+    )

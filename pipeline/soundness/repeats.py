@@ -1,0 +1,121 @@
+"""Repeats of one experiment, and which of them stands off the others."""
+
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.results import Record
+from pipeline.soundness.fault import RecordingFault
+
+_MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody would act on
+# How many spreads of the others a repeat must stand off. Where all repeats differ by chance
+# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
+# differ in several ways; three repeats leave one difference to judge by, hence the caution.
+_SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
+_AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
+_START_SAMPLES = 3  # their median is the start: too few to move, enough to outvote a spike
+
+
+def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, RecordingFault]:
+    """Find the repeats that do not belong with the others, by id.
+
+    Repeats have the same kind, free and measured carts, and nearly the same input (the set point
+    in closed loop). Decays are left alone: a hand never releases twice from the same place. Never
+    flags one of two, nor more than a minority. `unit` is that of the positions.
+    """
+    outliers: dict[str, RecordingFault] = {}
+    for group in _groups(records):
+        differences, expected = _differences(group)
+        left = list(range(len(group)))
+        while len(left) > 2 and 2 * (len(group) - len(left) + 1) < len(group):
+            found = _farthest(differences, left, expected=expected)
+            if found is None:
+                break
+            index, distance, spread = found
+            left.remove(index)
+            name, others = group[index].id, ", ".join(group[i].id for i in left)
+            said = {"others": others, "unit": unit}
+            said |= {"distance": f"{distance:.3g}", "spread": f"{spread:.3g}"}
+            outliers[name] = RecordingFault(code="odd_repeat", run=name, said=said, is_wrong=False)
+    return outliers
+
+
+def _groups(records: Sequence[Record]) -> list[list[Record]]:
+    """Group the repeats among the records, in the order of the records."""
+    groups: list[list[Record]] = []
+    for record in records:
+        if record.kind == "decay" or not np.any(_excitation(record)):
+            continue
+        home = next((group for group in groups if _is_repeat(group[0], record)), None)
+        if home is None:
+            groups.append([record])
+        else:
+            home.append(record)
+    return groups
+
+
+def _excitation(record: Record) -> Array:
+    """Return what drove the record (n,): its set point in closed loop, else its input."""
+    if record.kind == "closed_loop" and record.reference is not None:
+        return record.reference
+    return record.t * 0 if record.u is None else record.u
+
+
+def _is_repeat(first: Record, other: Record) -> bool:
+    """Tell whether two records are repeats of one experiment."""
+    spans = np.ptp(first.t), np.ptp(other.t)
+    if (first.kind, first.free, first.carts) != (other.kind, other.free, other.carts):
+        return False
+    if min(spans) < 0.8 * max(spans):
+        return False
+    t = _common_times(first, other)
+    u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
+    # An edge logged one sample early differs by 8 %, the next usual amplitude by 33 %.
+    return bool(_rms(u[0] - u[1]) <= 0.2 * _rms(u))
+
+
+def _common_times(*records: Record) -> Array:
+    """Return the times (from each record's start) of the shortest record."""
+    shortest = min(records, key=lambda record: np.ptp(record.t))
+    return shortest.t - shortest.t[0]
+
+
+def _at(t: Array, record: Record, signal: Array) -> Array:
+    """Return a signal of the record (…, n) at times t from its start."""
+    return np.stack([np.interp(t, record.t - record.t[0], row) for row in np.atleast_2d(signal)])
+
+
+def _rms(signal: Array) -> float:
+    return float(np.sqrt(np.mean(signal**2)))
+
+
+def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
+    """Return how far the responses differ pair by pair, (n, n), and how far they may.
+
+    Root-mean-squares over carts and time. Positions count from where the record starts, as the
+    encoders need not start at zero; where a cart comes to rest is part of its response.
+    """
+    t = _common_times(*group)
+    u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
+    y = np.stack([_at(t, record, record.y) for record in group])  # (n, p, n_t)
+    y = y - np.median(y[:, :, :_START_SAMPLES], axis=2, keepdims=True)
+    by_input = np.sqrt(np.mean((u[:, None] - u) ** 2, axis=2)) / _rms(u)
+    differences = np.sqrt(np.mean((y[:, None] - y) ** 2, axis=(2, 3)))
+    return differences, (_MATERIAL + _AMPLIFICATION * by_input) * _rms(y)
+
+
+def _farthest(
+    differences: Array, left: Sequence[int], *, expected: Array
+) -> tuple[int, float, float] | None:
+    """Return index, distance and spread of the others of the repeat that stands off, if any."""
+    threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
+    candidates = []
+    for index in left:
+        others = [i for i in left if i != index]
+        distance = float(np.median(differences[index, others]))
+        spread = float(np.median([differences[pair] for pair in combinations(others, 2)]))
+        if distance > max(threshold * spread, float(np.median(expected[index, others]))):
+            candidates.append((index, distance, spread))
+    return max(candidates, key=lambda found: found[1], default=None)

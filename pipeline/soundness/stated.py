@@ -1,0 +1,116 @@
+"""Recordings that contradict what is stated of them: free carts, units, frequencies."""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from pipeline.estimation.units_and_clocks import TIME_UNITS
+from pipeline.ingest.columns import conversion
+from pipeline.results import Record
+from pipeline.set_up import Bench
+from pipeline.soundness.fault import RecordingFault, say
+
+OTHER_DWELL = 0.1  # relative: a dwell stated so far off is another one
+LEAST_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
+_HELD_FIRMLY = 0.05  # of the free carts' swing: what a firm hold yields at most
+_LONGEST = 3.0  # m from end to end: no bench has so long a track
+_LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
+_LARGEST = 100.0  # V: no amplifier at a bench gives as much
+
+
+def swings(record: Record) -> tuple[float, dict[int, float]]:
+    """Return how far the free carts move at most, and by cart how far the held ones do.
+
+    Where no free cart was measured nothing is said of those that were held.
+    """
+    swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
+    free = [swing.pop(cart) for cart in record.carts if cart in record.free]
+    return (max(free), swing) if free else (0.0, {})
+
+
+def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
+    """Find the records in which a cart that should be held moves, and the free ones do not."""
+    found = []
+    for record in records:
+        free, held = swings(record)
+        mover = max(held, key=lambda cart: held[cart], default=0)
+        if mover and free < LEAST_SHARE * held[mover]:
+            fault = RecordingFault(
+                code="wrong_setup",
+                run=record.id,
+                cart=mover,
+                said={"free": ", ".join(map(str, record.free))},
+                value=held[mover] / free if free > 0 else None,
+                limit=1 / LEAST_SHARE,
+            )
+            found.append(fault)
+    return found
+
+
+def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
+    """Find the carts that should be held and move much beside the free ones."""
+    found = []
+    for record in records:
+        free, held = swings(record)
+        for cart, swing in held.items():
+            if _HELD_FIRMLY * free < swing <= free:
+                share = swing / free
+                fault = RecordingFault(
+                    code="moves_though_held",
+                    run=record.id,
+                    cart=cart,
+                    said={"percent": f"{100 * share:.0f}"},
+                    value=share,
+                    limit=_HELD_FIRMLY,
+                )
+                found.append(fault)
+    return found
+
+
+def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[RecordingFault]:
+    """Find where positions or inputs reach further than any bench: they are in another unit.
+
+    Counts for a length, millivolts for volts: the carts that such records give explain them as
+    well as the right ones, and only every gain is off.
+    """
+    found = []
+    unit, metres = bench.units.position, conversion(bench.units.position, "m")
+    travel, run = _reached((r, float(np.ptp(r.y, axis=1).max())) for r in records)
+    whole = all(np.array_equal(record.y, np.round(record.y)) for record in records)
+    if metres and travel > (limit := (_LONGEST_WHOLE if whole else _LONGEST) / metres):
+        why = say("position_scale_whole" if whole else "position_scale_long")
+        said = {"reach": f"{travel:.4g}", "unit": unit, "quoted": repr(unit), "why": why}
+        found.append(
+            RecordingFault(code="position_scale", run=run, said=said, value=travel, limit=limit)
+        )
+    unit, volts = bench.units.input, conversion(bench.units.input, "V")
+    # Under feedback a bench may log another signal as its input.
+    driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
+    largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
+    if volts and largest * volts > _LARGEST:
+        said = {"reach": f"{largest:.4g}", "unit": unit, "quoted": repr(unit)}
+        limit = _LARGEST / volts
+        found.append(
+            RecordingFault(code="input_scale", run=run, said=said, value=largest, limit=limit)
+        )
+    return found
+
+
+def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
+    """Return how far two kinds of experiment reach, and where: one alone may be a slip."""
+    by_kind: dict[str, tuple[float, str]] = {}
+    for record, reach in reaches:
+        by_kind[record.kind] = max(by_kind.get(record.kind, (0.0, "")), (reach, record.id))
+    return sorted(by_kind.values())[-2:][0] if by_kind else (0.0, "")
+
+
+def why_other_frequency(ratio: float) -> str:
+    """Return what a dwell stated at so many times its frequency looks to be, or ""."""
+    turns = {2 * np.pi: "frequency_in_radians", 1 / (2 * np.pi): "frequency_divided"}
+    for factor, key in turns.items():
+        if abs(ratio / factor - 1) < OTHER_DWELL:
+            return say(key)
+    for factor, (unit, short) in TIME_UNITS.items():
+        if abs(ratio / factor - 1) < OTHER_DWELL:
+            return say("frequency_by_clock", unit=unit, short=short)
+    return ""

@@ -1,0 +1,287 @@
+"""Mathematics as a small tree, rendered as MathML, as plain text, or by the PDF template.
+
+A leaf is a string: a number ("24.3"), an operator ("+"), or an identifier ("ω", "s"); anything
+longer that is not a number is set upright. A node is `Math(kind, parts)`.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Literal
+
+from pipeline.names import read_name
+
+_NUMBER = re.compile(r"\d+(\.\d+)?")
+_OPERATORS = frozenset("+−=·,()[]≥≤<≈≠→")
+_RELATIONS = frozenset("=≥≤<≈≠→")
+
+Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens", "lines"]
+
+
+@dataclass(frozen=True)
+class Math:
+    """A node; `columns` is the width of a matrix, whose parts go row by row."""
+
+    kind: Kind
+    parts: tuple["Term", ...]
+    columns: int = 0
+
+
+Term = Math | str
+
+
+def row(*parts: Term) -> Math:
+    """Return terms side by side."""
+    return Math("row", parts)
+
+
+def fraction(above: Term, below: Term) -> Math:
+    """Return a fraction."""
+    return Math("fraction", (above, below))
+
+
+def sub(base: Term, index: Term) -> Math:
+    """Return a term with an index."""
+    return Math("sub", (base, index))
+
+
+def power(base: Term, exponent: Term) -> Math:
+    """Return a term with an exponent."""
+    return Math("sup", (base, exponent))
+
+
+def dot(base: Term, *, order: int = 1) -> Math:
+    """Return the first or second time derivative."""
+    return Math("dot" if order == 1 else "ddot", (base,))
+
+
+def parens(*parts: Term) -> Math:
+    """Return terms in round brackets that grow with them."""
+    return Math("parens", parts)
+
+
+def matrix(rows: Iterable[Sequence[Term]]) -> Math:
+    """Return a matrix in square brackets."""
+    filled = [tuple(r) for r in rows]
+    return Math("matrix", tuple(term for r in filled for term in r), columns=len(filled[0]))
+
+
+def lines(equations: Iterable[Term]) -> Math:
+    """Return equations one below the other."""
+    return Math("lines", tuple(equations))
+
+
+THIN_SPACE, WIDE_SPACE, NO_BREAK = "\u2009", "\u2003", "\u00a0"
+
+
+def upright(words: str) -> str:
+    """Return words inside a formula as one leaf; its spaces stay."""
+    return words.replace(" ", NO_BREAK)
+
+
+def function(name: str, *argument: Term) -> tuple[Term, ...]:
+    """Return the name of a function before its argument; one without brackets stands apart."""
+    return (THIN_SPACE, name, *(argument or (THIN_SPACE,)))
+
+
+def total(terms: Sequence[Term]) -> Term:
+    """Return the sum of terms."""
+    if len(terms) == 1:
+        return terms[0]
+    joined: list[Term] = [terms[0]]
+    for term in terms[1:]:
+        joined += ["+", term]
+    return row(*joined)
+
+
+def negative(term: Term) -> Math:
+    """Return the term with a minus sign before it."""
+    return row("−", term)
+
+
+def symbol(name: str) -> Term:
+    """Return a parameter name such as `omega_a`, `K_1` or `mass` as it is written by hand."""
+    read = read_name(name)
+    base = GREEK.get(read.symbol, read.symbol)
+    return sub(base, read.suffix) if read.suffix else base
+
+
+GREEK = {"omega": "ω", "zeta": "ζ", "delta": "δ", "mass": "m", "damping": "c"}
+
+
+def number(text: str) -> Term:
+    """Return a formatted number ("−1.2 × 10⁻³") as a term that reads as one."""
+    unsigned = text.removeprefix("−")
+    mantissa, times, exponent = unsigned.partition(" × 10")
+    term: Term = mantissa
+    if times:
+        term = row(mantissa, "·", power("10", exponent.translate(_PLAIN_DIGITS)))
+    return negative(term) if unsigned != text else term
+
+
+_PLAIN_DIGITS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789−")
+
+
+# ------------------------------------------------------------------- renderers
+
+
+def to_mathml(math: Term, *, display: bool = False) -> str:
+    """Return the mathematics as MathML, every leaf escaped."""
+    mode = ' display="block"' if display else ""
+    return f"<math{mode}>{_mathml(math)}</math>"
+
+
+def _mathml(term: Term) -> str:
+    if isinstance(term, str):
+        return _mathml_leaf(term)
+    parts = [_mathml(part) for part in term.parts]
+    inside = "".join(parts)
+    match term.kind:
+        case "row":
+            return f"<mrow>{inside}</mrow>"
+        case "parens":
+            # A bracket free to grow takes room even where it need not.
+            grow = "true" if any(map(_is_tall, term.parts)) else "false"
+            left, right = (f'<mo stretchy="{grow}">{bracket}</mo>' for bracket in "()")
+            return f"<mrow>{left}<mrow>{inside}</mrow>{right}</mrow>"
+        case "fraction":
+            return f"<mfrac>{inside}</mfrac>"
+        case "sub":
+            return f"<msub>{inside}</msub>"
+        case "sup":
+            if isinstance(base := term.parts[0], Math) and base.kind == "sub":
+                return f"<msubsup>{''.join(map(_mathml, base.parts))}{parts[1]}</msubsup>"
+            return f"<msup>{inside}</msup>"
+        case "dot" | "ddot":
+            mark = "˙" if term.kind == "dot" else "¨"
+            return f'<mover accent="true">{inside}<mo>{mark}</mo></mover>'
+        case "lines":
+            rows = "".join(f"<mtr>{_aligned(part)}</mtr>" for part in term.parts)
+            return f'<mtable class="lines" displaystyle="true">{rows}</mtable>'
+        case "matrix":
+            cells = [f"<mtd>{part}</mtd>" for part in parts]
+            rows = [
+                "<mtr>" + "".join(cells[i : i + term.columns]) + "</mtr>"
+                for i in range(0, len(cells), term.columns)
+            ]
+            return f"<mrow><mo>[</mo><mtable>{''.join(rows)}</mtable><mo>]</mo></mrow>"
+
+
+def _is_tall(term: Term) -> bool:
+    if isinstance(term, str):
+        return False
+    return term.kind in ("fraction", "matrix") or any(map(_is_tall, term.parts))
+
+
+def _aligned(line: Term) -> str:
+    """Return a line in three cells, so that all lines meet at their equals sign.
+
+    A line that begins with a plus sign goes on with the one above.
+    """
+    if isinstance(line, Math) and line.parts[:1] == ("+",):
+        return f"<mtd></mtd><mtd></mtd><mtd>{_mathml(line)}</mtd>"
+    if not isinstance(line, Math) or "=" not in line.parts:
+        return f"<mtd>{_mathml(line)}</mtd>"
+    at = line.parts.index("=")
+    left, right = row(*line.parts[:at]), row(*line.parts[at + 1 :])
+    return "".join(f"<mtd>{_mathml(part)}</mtd>" for part in (left, "=", right))
+
+
+def _mathml_leaf(leaf: str) -> str:
+    text = escape(leaf)
+    if _NUMBER.fullmatch(leaf):
+        return f"<mn>{text}</mn>"
+    if leaf in _OPERATORS:
+        return f"<mo>{text}</mo>"
+    return f"<mi>{text}</mi>"
+
+
+def to_text(term: Term) -> str:
+    """Return the mathematics in one line of text, for readers that cannot see it."""
+    if isinstance(term, str):
+        return f" {term} " if term in _RELATIONS or term in "+" else term
+    parts = [to_text(part) for part in term.parts]
+    match term.kind:
+        case "row":
+            return "".join(parts)
+        case "parens":
+            return f"({''.join(parts)})"
+        case "fraction":
+            return f"({parts[0]})/({parts[1]})"
+        case "sub":
+            return f"{parts[0]}_{parts[1]}"
+        case "sup":
+            return f"{parts[0]}^{parts[1]}"
+        case "dot":
+            return f"{parts[0]}′"
+        case "ddot":
+            return f"{parts[0]}″"
+        case "lines":
+            return "; ".join(parts)
+        case "matrix":
+            width = term.columns
+            rows = [", ".join(parts[i : i + width]) for i in range(0, len(parts), width)]
+            return f"[{'; '.join(rows)}]"
+
+
+_IN_TEX = {
+    "−": "-", "→": r"\to", "≤": r"\le", "≠": r"\ne", "·": r"\cdot", "π": r"\pi", "μ": r"\mu",
+    "τ": r"\tau", "λ": r"\lambda", "φ": r"\phi", "δ": r"\delta", WIDE_SPACE: r"\quad",
+    NO_BREAK: "\\",  # with the space that follows it
+}  # fmt: skip
+
+
+def to_tex(term: Term) -> str:
+    """Return a formula without matrices and derivations as TeX."""
+    if isinstance(term, str):
+        return _tex_leaf(term)
+    first, *others = term.parts
+    match term.kind:
+        case "row":
+            return _tex_row(term.parts)
+        case "parens":
+            left, right = (r"\left(", r"\right)") if _has_parens(term) else "()"
+            return f"{left}{_tex_row(term.parts)}{right}"
+        case "sub" | "sup":
+            mark, script = "_" if term.kind == "sub" else "^", to_tex(others[0])
+            return f"{to_tex(first)}{mark}" + (
+                script if isinstance(others[0], str) else f"{{{script}}}"
+            )
+        case "dot" | "ddot":
+            return rf"\{term.kind} {to_tex(first)}"
+    raise ValueError(f"no TeX for {term.kind}")
+
+
+def _has_parens(term: Math) -> bool:
+    return any(isinstance(part, Math) and part.kind == "parens" for part in term.parts)
+
+
+def _tex_leaf(leaf: str) -> str:
+    if leaf in ("sin", "cos", "min", "max"):
+        return rf"\{leaf}"
+    if leaf in ("sign", "clip"):
+        return rf"\operatorname{{{leaf}}}"
+    if len(leaf) > 1 and not _NUMBER.fullmatch(leaf):
+        return rf"\text{{{leaf.replace(NO_BREAK, ' ')}}}"
+    return _IN_TEX.get(leaf, leaf)
+
+
+def _tex_row(parts: Sequence[Term]) -> str:
+    """Return terms with a space between them, but where a bar, a sign or a slash joins them."""
+    text, joined, bars = "", True, 0  # joined: nothing parts what comes from what was
+    for before, part in zip((None, *parts), parts, strict=False):
+        if part == THIN_SPACE:
+            continue
+        bars += part == "|"
+        closes = part == "|" and bars % 2 == 0
+        called = isinstance(part, Math) and part.kind == "parens" and _is_called(before, part)
+        text += ("" if joined or closes or called or part in (",", "/") else " ") + to_tex(part)
+        signs = part == "−" and (before is None or before == "," or before in _RELATIONS)
+        joined = signs or part == "/" or (part == "|" and not closes)
+    return text
+
+
+def _is_called(name: Term | None, brackets: Math) -> bool:
+    """Whether brackets hold what a function is of: its name is a word, or they begin with time."""
+    return brackets.parts[0] == "t" or (isinstance(name, str) and len(name) > 1)

@@ -1,0 +1,104 @@
+"""Sentences that an instructor may edit or translate: `templates/words/SUBJECT.toml`, by key.
+
+A sentence names the values it takes in braces, marks **strong** words, `code` and [links](#here).
+Code decides which sentence is said and passes the values, already written as text; what stands in
+a value is never markup. A file is read when its first sentence is said: a slip in it is then told
+like any other mistake.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+from pipeline.errors import ConfigError
+from pipeline.resources import TEMPLATES
+from pipeline.submission.toml_file import parse_toml, read_text
+from pipeline.words.spans import Span, Spans
+
+_MARK = re.compile(r"\*\*(?P<strong>.+?)\*\*|`(?P<code>.+?)`|\[(?P<link>.+?)\]\((?P<url>#.+?)\)")
+_VALUE = re.compile(r"\{(\w+)\}")
+_LARGEST = 1_000_000  # bytes of a file
+
+
+@dataclass(frozen=True)
+class Phrases:
+    """The sentences of one file; each raises a `ConfigError` where the file does not serve it."""
+
+    path: Path
+
+    @cached_property
+    def by_key(self) -> Mapping[str, str]:
+        """The sentences as they stand in the file."""
+        where = self._where()
+        text = read_text(self.path, where=where, limit=_LARGEST, error=ConfigError)
+        found = parse_toml(text, where=where, error=ConfigError)
+        for key, sentence in found.items():
+            if not isinstance(sentence, str):
+                raise ConfigError(f"{where}: {key} needs a sentence in quotes, found {sentence!r}")
+        return found
+
+    def text(self, key: str, **values: object) -> str:
+        """Return a sentence without marks, its values put in."""
+        return _filled_in(self._template(key, values), values)
+
+    def cells(self, key: str, **values: object) -> list[str]:
+        """Return the headings of a table, which stand between bars."""
+        template = self._template(key, values)
+        return [_filled_in(part, values) for part in template.split(" | ")]
+
+    def spans(self, key: str, **values: str | Spans) -> Spans:
+        """Return a sentence with its marks; values may be marked as well."""
+        return tuple(span for span in _spans(self._template(key, values), values) if span.text)
+
+    def _template(self, key: str, values: Mapping[str, object]) -> str:
+        """Return a sentence that asks for nothing but these values."""
+        known = f"it may name {', '.join(f'{{{v}}}' for v in sorted(values)) or 'no values'}"
+        if key not in self.by_key:
+            raise ConfigError(f"{self._where()}: the sentence {key} is missing; {known}")
+        template = self.by_key[key]
+        for name in _VALUE.findall(template):
+            if name not in values:
+                raise ConfigError(f"{self._where()}: {key} names {{{name}}}; {known}")
+        return template
+
+    def _where(self) -> str:
+        return f"templates/words/{self.path.name}"
+
+
+def phrases(subject: str) -> Phrases:
+    """Return the sentences of a subject."""
+    return Phrases(TEMPLATES / "words" / f"{subject}.toml")
+
+
+def _filled_in(template: str, values: Mapping[str, object]) -> str:
+    return _VALUE.sub(lambda name: str(values[name[1]]), template)
+
+
+def _spans(template: str, values: Mapping[str, str | Spans]) -> Iterator[Span]:
+    end = 0
+    for mark in _MARK.finditer(template):
+        yield from _filled(template[end : mark.start()], Span(""), values)
+        if mark["strong"]:
+            yield from _filled(mark["strong"], Span("", "strong"), values)
+        elif mark["code"]:
+            yield from _filled(mark["code"], Span("", "code"), values)
+        else:
+            yield from _filled(mark["link"], Span("", url=mark["url"]), values)
+        end = mark.end()
+    yield from _filled(template[end:], Span(""), values)
+
+
+def _filled(text: str, like: Span, values: Mapping[str, str | Spans]) -> Iterator[Span]:
+    """Yield the text in the style of a span; text values join it, marked ones stand alone."""
+    said = ""
+    for i, part in enumerate(_VALUE.split(text)):
+        value = values[part] if i % 2 else part
+        if isinstance(value, str):
+            said += value
+        else:
+            yield replace(like, text=said)
+            yield from value
+            said = ""
+    yield replace(like, text=said)

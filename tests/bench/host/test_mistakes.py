@@ -1,0 +1,162 @@
+"""What people get wrong at a bench is said, and harms nothing that was recorded."""
+
+import re
+import signal
+import socket
+import time
+from collections.abc import Sequence
+
+import pytest
+from typer.testing import CliRunner
+
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.experiments import cart_remarks, prepare_submission
+from pipeline.bench.host.serial_line import open_line
+from pipeline.bench.live.observer import Anomalies
+from pipeline.bench.protocol.messages import EXTENSIONS, WATCHDOG, Description, Reading
+from pipeline.cli import app
+from pipeline.errors import ConfigError, HardwareError
+from pipeline.experiments.plan import PlanLimits
+from pipeline.simulated.emulator.links import open_link
+from pipeline.submission import load_submission
+from tests.helpers.acquisitions import Notes, host, sine, until_bytes, write_work
+from tests.helpers.benches import emulator
+
+
+def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
+    """A submission of two carts takes nothing from a bench that states one."""
+    work = write_work(tmp_path, [sine("dwell", seconds=1)])
+    with emulator("--speed", "20", preset="throne-1dof") as bench:
+        with pytest.raises(ConfigError, match=r"has 2 carts, the bench 'throne-1dof' has 1: is"):
+            acquire(work, port=bench.address, observers=[Notes()])
+    assert not (work / "raw").exists()
+
+
+def test_a_bench_of_more_carts_is_said(tmp_path):
+    """Whoever holds the third cart by hand may go on; the wrong cable is named."""
+    submission = load_submission(write_work(tmp_path, []))
+    bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
+    (remark,) = cart_remarks(submission, bench)
+    assert "carts = 2, the bench 'three' has 3: if this is not the wrong bench" in remark
+    assert cart_remarks(submission, Description(name="stock", encoders=3, carts=3)) == []
+
+
+def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
+    """Two encoders that are not plugged in make no dwell; it is offered again, twice."""
+    work = write_work(tmp_path, [sine("dwell", seconds=2)])
+    notes = Notes()
+    dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
+    with emulator("--speed", "20", *dead) as bench:
+        outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert [o.partial[:26] for o in outcomes] == ["no cart that is free moved"] * 3
+    assert load_submission(work).experiments == ()
+
+
+def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
+    """It is told which process records there, and what that one records stays whole."""
+    work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
+    with host(work, real.address, "--only", "dwell", "--yes") as process:
+        until_bytes(work / "raw" / "dwell-1.raw", process)
+        refused = rf"another cartlab \(process {process.pid}\) writes"
+        with pytest.raises(ConfigError, match=refused):
+            acquire(work, port=fast.address, observers=[Notes()])
+        process.communicate()
+    assert process.returncode == 0
+    assert sorted(path.name for path in (work / "data").iterdir()) == ["dwell.txt"]
+
+
+class Late(Notes):
+    """Keeps the computer busy once, for longer than a watchdog waits."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines, and be slow after the first of them."""
+        if not self.readings_seen:
+            time.sleep(0.3)
+        super().readings(batch, anomalies)
+
+
+def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
+    """A host that sends no heartbeat for too long says so, not only that the bench is silent."""
+    work = write_work(tmp_path, [sine("dwell", seconds=5)])
+    notes = Late()
+    with emulator(watchdog=WATCHDOG) as bench:
+        outcome, *_ = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
+    assert "fell silent" in outcome.partial
+    late = re.search(r"too busy and sent no heartbeat for (\d+) ms", outcome.partial)
+    assert late is not None
+    assert int(late[1]) >= 1e3 * WATCHDOG
+
+
+class LastMoment(Notes):
+    """Presses Ctrl-C when the last lines are there."""
+
+    def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
+        """Note the lines."""
+        super().readings(batch, anomalies)
+        if batch[-1].ms >= 1999:
+            signal.raise_signal(signal.SIGINT)
+
+
+def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
+    """A run that was over when Ctrl-C came is recorded; the session ends all the same."""
+    work = write_work(tmp_path, [sine("first", seconds=2), sine("second", seconds=2)])
+    notes = LastMoment()
+    with emulator("--speed", "4") as bench, pytest.raises(KeyboardInterrupt):
+        acquire(work, port=bench.address, observers=[notes])
+    assert [experiment.id for experiment in load_submission(work).experiments] == ["first"]
+    assert [outcome.partial for outcome in notes.outcomes] == [""]
+    assert not (work / "data" / "first.partial.txt").exists()
+
+
+def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
+    """Neither a number nor HOST:PORT is a device; the form that works is named."""
+    for port in ("41001", "127.0.0.1:41001"):
+        with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
+            open_line(port, baud=115_200)
+
+
+def test_a_port_that_is_taken_says_what_to_choose():
+    """A second emulator on the port of the first is told that 0 takes any."""
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        with pytest.raises(ConfigError, match="choose another port, or 0 for any"):
+            open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
+
+
+def test_one_is_not_many():
+    """One line, one encoder, two resets."""
+    assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
+    assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
+
+
+def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
+    """Springs stand there to be checked; authors and goal need but their # taken away."""
+    bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
+    folder = tmp_path / "new"
+    assert prepare_submission(folder, bench, stock=False).authors == ()
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false where" in text
+    path.write_text(re.sub(r"(?m)^#(?! )", "", text), encoding="utf-8")
+    submission = load_submission(folder)
+    assert [author.id for author in submission.authors] == ["s1024"]
+    assert submission.design is not None
+
+
+def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
+    """A limit that is too small is said with what to do; `report` would have nothing to read."""
+    near = PlanLimits(input=0.5, travel=0.05)
+    work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
+    with host(work, fast.address, "--only", "dwell", "--yes") as process:
+        _, said = process.communicate()
+    assert process.returncode == 1
+    assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
+    assert "again: taken as done" not in said
+    assert "cartlab report" not in said
+
+
+def test_files_need_a_submission_to_go_to(tmp_path):
+    """A folder that is not there is told how to be made."""
+    where = str(tmp_path / "new")
+    done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
+    assert isinstance(done.exception, ConfigError)
+    assert f"begin with `cartlab new {where} --carts N`" in str(done.exception)

@@ -1,0 +1,316 @@
+"""Whatever state a session is in, a bench that misbehaves is stopped and not started again."""
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from pipeline.bench.host.acquire import acquire
+from pipeline.bench.host.orders import make_order
+from pipeline.bench.host.run_watch import LineWatch
+from pipeline.bench.protocol.messages import EXTENSIONS, Reading
+from pipeline.errors import HardwareError
+from pipeline.experiments.exploring.at_bench import explore_bench
+from pipeline.experiments.exploring.error_goal import ErrorGoal
+from pipeline.experiments.gains import CountScales
+from pipeline.experiments.plan import PlanLimits, Recording
+from pipeline.submission import System, load_submission
+from tests.helpers.acquisitions import Notes, sine, write_work
+from tests.helpers.runaway import BENCH, PER_COUNT, RunawayBench
+from tests.helpers.waiting import until
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+
+AT_ONCE = 20  # ms of the bench, as docs/bench.md promises
+FULL = 4096
+FAR = round(11.0 / PER_COUNT)  # counts, of a limit of 2.5 cm
+BY_HANDS = EXTENSIONS - {"h"}  # people move the carts
+Wrong = Callable[[RunawayBench], bool]
+
+
+def plan() -> list[Recording]:
+    """Return two dwells, each after a rest."""
+    return [sine(name, seconds=0.5, settle=0.6) for name in ("first", "second")]
+
+
+def decay(name: str) -> Recording:
+    """Return a decay that a hand starts."""
+    return Recording(
+        id=name,
+        kind="decay",
+        carts=(1, 2),
+        wave="delta",
+        amplitude=0.0,
+        frequency=2.0,
+        release=1,
+        settle=0.6,
+    )
+
+
+def before_start(bench: RunawayBench) -> bool:
+    """From its first answer until the first run."""
+    return bench.resets > 0 and not bench.starts
+
+
+def resting(bench: RunawayBench) -> bool:
+    """While the carts come to rest."""
+    return bench.run_on is not None and bench.run_on.amplitude == 0 and bench.run_on.frequency < 2
+
+
+def resting_again(bench: RunawayBench) -> bool:
+    """Likewise before the second recording: the carts have been zeroed at rest."""
+    return resting(bench) and len(bench.starts) > 2
+
+
+def running(bench: RunawayBench) -> bool:
+    """While the motor is to move the carts."""
+    return bench.run_on is not None and bench.run_on.amplitude != 0
+
+
+def between(bench: RunawayBench) -> bool:
+    """From the stop after the first recording on, before the rest for the second."""
+    return bench.is_stopped and len(bench.starts) == 2
+
+
+def tried(bench: RunawayBench) -> bool:
+    """In the run of nothing in which a host looks whether a stock bench is there."""
+    return bench.run_on is not None and len(bench.starts) == 1
+
+
+def ended(bench: RunawayBench) -> bool:
+    """Once a stock bench, which nobody stops then, has carried out its first recording."""
+    return bench.run_on is None and len(bench.starts) == 3
+
+
+def at_the_end(bench: RunawayBench) -> bool:
+    """After the last recording."""
+    return bench.is_stopped and len(bench.starts) == 4
+
+
+def assert_over(bench: RunawayBench) -> None:
+    """It misbehaved, was told to stop at once, and was not started again."""
+    assert bench.offence is not None
+    assert bench.told is not None
+    assert bench.told - bench.offence <= AT_ONCE
+    assert bench.started_after == []
+
+
+def session(
+    work: Path, bench: RunawayBench, *, notes: Notes | None = None, only: Sequence[str] = ()
+) -> tuple[list[str], str]:
+    """Acquire; return why the runs ended that were not whole, and what ended the session."""
+    notes, error = notes or Notes(), ""
+    everything = [recording.id for recording in plan()]
+    try:
+        acquire(work, port=bench.address, observers=[notes], only=only or everything)
+    except HardwareError as raised:
+        error = str(raised)
+    return [outcome.partial for outcome in notes.outcomes if outcome.partial], error
+
+
+@pytest.mark.parametrize("wrong", [before_start, between, at_the_end])
+@pytest.mark.parametrize("commands", [EXTENSIONS, BY_HANDS], ids=["hands", "people"])
+def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, commands):
+    """Before the first run, between two and after the last the line is looked at as well."""
+    work = write_work(tmp_path, plan())
+    with RunawayBench(wrong, duty=FULL, commands=commands) as bench:
+        partial, error = session(work, bench)
+    assert_over(bench)
+    (said,) = {*partial, error} - {""}
+    assert said.startswith("stopped: the bench drives its motor with 4096 duty counts while it")
+    done = {before_start: 0, between: 1, at_the_end: 2}[wrong]
+    assert len(load_submission(work).experiments) == done
+
+
+@pytest.mark.parametrize("duty", [FULL, 3])
+@pytest.mark.parametrize("wrong", [resting, resting_again, running])
+def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, duty):
+    """In a rest, in a run: full duty and a few counts that nothing asked for."""
+    work = write_work(tmp_path, plan())
+    with RunawayBench(wrong, duty=duty) as bench:
+        (partial,), error = session(work, bench)
+    assert_over(bench)
+    assert error == ""
+    assert "stopped: " in partial
+    assert partial.startswith("while the carts came to rest") == (wrong is not running)
+    assert len(load_submission(work).experiments) == (wrong is resting_again)
+
+
+def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
+    """Once the carts were zeroed at rest their travel is watched in every rest."""
+    work = write_work(tmp_path, plan())
+    with RunawayBench(resting_again, out=FAR) as bench:
+        (partial,), _ = session(work, bench)
+    assert_over(bench)
+    assert partial.startswith("while the carts came to rest, stopped: cart 1 was 11 cm from its ze")
+
+
+def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
+    """Where a cart was when the line was opened is no zero: nobody is stopped for that."""
+    work = write_work(tmp_path, plan())
+    with RunawayBench(lambda bench: bench.resets < 3, out=FAR) as bench:
+        assert session(work, bench) == ([], "")
+    assert len(load_submission(work).experiments) == 2
+
+
+def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
+    """After a run that was stopped for its travel the next one waits for them, and is recorded."""
+    near = PlanLimits(
+        input=0.5, travel=70 * PER_COUNT
+    )  # one count for two of duty: 82 of it at most
+
+    def swinging(bench: RunawayBench) -> bool:
+        return resting_again(bench) and bench.ms - bench_began.setdefault("at", bench.ms) < 50
+
+    bench_began: dict[str, int] = {}
+    first, second = plan()
+    work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
+    with RunawayBench(swinging, out=2 * FAR) as bench:
+        partial, error = session(work, bench)
+    assert error == ""
+    assert [why[:20] for why in partial] == ["stopped: cart 2 was "]
+    assert [e.id for e in load_submission(work).experiments] == ["second"]
+
+
+def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
+    """Once a rest is over the cart must be back, or the motor is not started."""
+    near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
+    first, second = plan()
+    work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
+    with RunawayBench(resting_again, out=FAR) as bench:
+        partial, _ = session(work, bench)
+    assert partial[1].startswith("stopped: at rest, cart 1 was 11 cm from its zero")
+    assert bench.started_after == []
+
+
+def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
+    """A bench that goes on after its run was stopped is told again, and not started again."""
+    near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
+    first, second = plan()
+    work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
+
+    def goes_on(bench: RunawayBench) -> bool:
+        return bench.is_stopped and len(bench.starts) == 2
+
+    with RunawayBench(goes_on, duty=FULL) as bench:
+        (partial,), error = session(work, bench)
+    assert_over(bench)
+    assert partial.startswith("stopped: cart 2 was ")
+    assert error.startswith("stopped: the bench drives its motor with 4096 duty counts while it")
+
+
+@pytest.mark.parametrize("period", [1, 2, 5, 10])
+def test_a_bench_of_few_lines_is_stopped_as_soon(period):
+    """What lasts is told in ms, not in lines: two of them do where they are far apart."""
+    order = make_order(
+        plan()[0],
+        limits=PlanLimits(input=0.5, travel=2.5),
+        scales=CountScales(input=BENCH.input_per_count, position=PER_COUNT),
+        system=System(carts=2, springs=(True,) * 3),
+        bench=BENCH,
+    )
+    watch = LineWatch(order.rest(), carts=0, period=period)
+    lines = [Reading(counts=(0, 0), target=0, duty=9, ms=ms) for ms in range(0, 100, period)]
+    told = next(line.ms for line in lines if watch.check([line]))
+    assert told <= AT_ONCE / 2
+    assert watch.is_astray
+
+
+class Pulling(Notes):
+    """A person who pulls a cart out, and is not done before the bench was told to stop."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bench: RunawayBench | None = None
+
+    def confirm(self, instruction: str) -> None:
+        """Take one's time where the cart is to be pulled out."""
+        super().confirm(instruction)
+        if instruction.startswith("Pull"):
+            bench = self.bench
+            assert bench is not None
+            until(lambda: bench.told is not None, "a stop")
+
+    def is_pulling(self, bench: RunawayBench) -> bool:
+        """Tell whether the cart is being pulled out."""
+        return any(instruction.startswith("Pull") for instruction in self.confirmed)
+
+
+def test_a_motor_that_comes_on_while_a_person_is_awaited_is_stopped(tmp_path):
+    """However long somebody holds the cart: the stop does not wait for the Enter key."""
+    work, notes = write_work(tmp_path, [decay("decay")]), Pulling()
+    with RunawayBench(notes.is_pulling, duty=FULL, commands=BY_HANDS) as notes.bench:
+        (partial,), _ = session(work, notes.bench, notes=notes, only=["decay"])
+    assert_over(notes.bench)
+    assert partial.startswith("stopped: the bench drives its motor")
+    assert partial in notes.remarks  # at once, not after the key
+
+
+def test_a_motor_that_comes_on_while_a_virtual_hand_pulls_is_stopped(tmp_path):
+    """The hands of a virtual bench take their time as well."""
+    work = write_work(tmp_path, [decay("decay")])
+    with RunawayBench(lambda bench: bench.is_pulled, duty=FULL) as bench:
+        (partial,), _ = session(work, bench, only=["decay"])
+    assert_over(bench)
+    assert partial.startswith("stopped: the bench drives its motor")
+
+
+def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):
+    """A run that only a hand moves has no duty at all."""
+
+    def in_the_decay(bench: RunawayBench) -> bool:
+        return bench.run_on is not None and len(bench.starts) == 2
+
+    work = write_work(tmp_path, [decay("decay"), *plan()])
+    with RunawayBench(in_the_decay, duty=FULL, commands=BY_HANDS) as bench:
+        partial, _ = session(work, bench, only=["decay", "first"])
+    assert_over(bench)
+    assert len(partial) == 1
+
+
+def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
+    """A line that is opened anew is watched from its first answer on."""
+
+    def mute(bench: RunawayBench) -> bool:
+        return bench.resets == 3 and bench.lines > 800  # in the first run
+
+    def reconnected(bench: RunawayBench) -> bool:
+        return bench.resets > 4 and resting(bench)
+
+    work = write_work(tmp_path, plan())
+    with RunawayBench(reconnected, duty=FULL, mute=mute) as bench:
+        partial, _ = session(work, bench)
+    assert_over(bench)
+    assert "fell silent" in partial[0]
+    assert "came to rest, stopped: " in partial[-1]
+
+
+@pytest.mark.parametrize("wrong", [resting, running])
+def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
+    """What explores does not choose another experiment for a bench that does as it likes."""
+    with RunawayBench(wrong, duty=FULL) as bench:
+        with pytest.raises(HardwareError, match=r"stopped: .*; the exploration ends here"):
+            explore_bench(
+                tmp_path / "new",
+                port=bench.address,
+                observers=[Notes()],
+                buttons=None,
+                goal=ErrorGoal(),
+                seconds=900.0,
+            )
+    assert_over(bench)
+
+
+@pytest.mark.parametrize("wrong", [tried, resting, running, ended])
+def test_a_stock_bench_that_misbehaves_is_stopped(tmp_path, wrong):
+    """One that answers nothing is watched as well."""
+    scales = f'input = {{ unit = "V", per_count = {0.5 / FULL} }}\n'
+    work = write_work(tmp_path, plan(), scales=scales)
+    text = (work / "submission.toml").read_text(encoding="utf-8")
+    stated = f'{{ unit = "cm", per_count = {PER_COUNT} }}'
+    (work / "submission.toml").write_text(text.replace('{ unit = "cm" }', stated), encoding="utf-8")
+    with RunawayBench(wrong, duty=FULL, commands=frozenset()) as bench:
+        partial, error = session(work, bench)
+    assert_over(bench)
+    assert partial or error

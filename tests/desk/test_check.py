@@ -1,0 +1,208 @@
+"""The check at the desk: what students see who find the numbers themselves, and hand in."""
+
+import io
+import re
+import zipfile
+from html import unescape
+from urllib.parse import urlsplit
+
+import pytest
+
+from pipeline.desk.app import ROUTES, DeskServer
+from pipeline.desk.users import read_users
+from pipeline.errors import ConfigError
+from pipeline.grading.self_check.log import FILE, read_answers
+from pipeline.resources import RUBRICS
+from pipeline.submission import load_submission
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, write_users
+from tests.helpers.waiting import until
+
+HERE = "/student/0/"
+pytestmark = pytest.mark.usefixtures("work_here")
+OPEN = {  # what of the room shows no computed number
+    "", "files", "fill", "aside", "save", "experiments", "check", "hand-in", "hand-in.zip",
+    "events", "stop",
+}  # fmt: skip
+USERS = """
+[[users]]
+name = "s1"
+role = "student"
+folders = ["team"]
+rubric = "lab.toml"
+[[users]]
+name = "s2"
+role = "student"
+folders = ["other"]
+[[users]]
+name = "i"
+role = "instructor"
+folders = ["team"]
+"""
+
+
+def retype(folder, old, new):
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+@pytest.fixture
+def root(tmp_path):
+    """A lab server's folders; of the first team one number is in Hz, and a report was made."""
+    for name in ("team", "other"):
+        retype(a_submission(tmp_path / name), "omega_n = 13.1", "omega_n = 2.085")
+        (tmp_path / name / "report").mkdir()
+        for file in ("report.html", "results.json", "report.pdf"):
+            (tmp_path / name / "report" / file).write_text("13.1", encoding="utf-8")
+    text = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    (tmp_path / "lab.toml").write_text(text + '\n[students]\nsee = "check"\n', encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def lab(root):
+    """A desk for them, who come through a proxy; who asks, by name."""
+    with DeskServer(users=write_users(root, USERS)) as server:
+        port = urlsplit(server.url).port or 0
+        yield lambda name: through_proxy(port, name)
+
+
+def ask_check(visitor: Visitor, **fields: str) -> Answer:
+    """Ask the check, wait for it, and return its page."""
+    assert visitor.post(f"{HERE}check", **fields).status == 303
+    until(lambda: "data-events" not in visitor.get(f"{HERE}check").text)
+    return visitor.get(f"{HERE}check")
+
+
+def words_of(page: Answer) -> str:
+    """Return what a page says, without its frame."""
+    main = re.search(r"<main.*</main>", page.text, re.DOTALL)
+    assert main
+    return " ".join(unescape(re.sub(r"<[^>]*>", " ", main[0])).split())
+
+
+def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
+    """Every page, file and task of the room that may show a number: 403, which names the check."""
+    student, other, instructor = lab("s1"), lab("s2"), lab("i")
+    for path in ("report/report.html", "report/results.json", "report/report.pdf", "gap/gap.json"):
+        refused = student.get(HERE + path)
+        assert refused.status == 403
+        assert "the report is for your TA" in refused.text
+    for path, method, _ in ROUTES:
+        if path.startswith("/student/") and path.split("/")[3] not in OPEN:
+            address = re.sub(r"\{\w+:(\w+)\}", "0", path)
+            ask = student.get if method == "GET" else student.post
+            assert ask(address).status == 403, path
+    assert student.get("/solution/0/").status == 403
+    assert other.get(f"{HERE}report").status == 200
+    assert instructor.get(f"{HERE}report").status == 200
+    assert other.get(f"{HERE}report/results.json").status == 200
+
+
+def test_their_room_offers_the_check_in_place_of_the_report(lab):
+    """And says nothing that a report said."""
+    page = lab("s1").get(HERE).text
+    assert f'href="{HERE}check"' in page
+    assert f"{HERE}report" not in page
+    assert f"{HERE}make-report" not in page
+    assert f"{HERE}compare" not in page
+    assert f'href="{HERE}check"' not in lab("s2").get(HERE).text
+
+
+def test_first_which_then_where_and_the_count_is_shown(lab, root):
+    """Names with a mark, a hint for the number asked about; no digit of the value anywhere."""
+    student = lab("s1")
+    assert "not checked yet" in words_of(student.get(f"{HERE}check"))
+    which = ask_check(student)
+    assert "ω, first estimate" in words_of(which) or "ω_n, first estimate" in words_of(which)
+    assert "Asked 1 time." in words_of(which)
+    assert "Where should I look?" in which.text
+    where = ask_check(student, number="initial.omega_n")
+    assert "Hz where rad/s is asked" in words_of(where)
+    assert "Asked 2 times." in words_of(where)
+    for page in (which, where):
+        said = words_of(page).replace("2.085", "").replace("2π", "")
+        said = re.sub(
+            r"\d+ of \d+ numbers|\d+ agree|Asked \d+ times?|[a-z]+-\d+|[AB]\([\d, ]+\)", "", said
+        )
+        assert re.findall(r".{0,20}\d.{0,20}", re.sub(r"\b1 of \d+", "", said)) == []
+    assert [one.stage for one in read_answers(root / "team")] == ["which", "where"]
+
+    retype(root / "team", "omega_n = 2.085", "omega_n = 13.1")
+    assert "changed since the last check" in words_of(student.get(f"{HERE}check"))
+    assert "agree with your own recordings" in words_of(ask_check(student))
+
+
+def test_the_zip_has_the_asks_and_no_report(lab, root):
+    """Though a report lies in the folder; of a class that sees reports it has both."""
+    student = lab("s1")
+    ask_check(student)
+    assert student.post(f"{HERE}hand-in").status == 303
+    page = student.get(f"{HERE}hand-in")
+    assert (FILE in page.text, "report.pdf" in page.text) == (True, False)
+    with zipfile.ZipFile(io.BytesIO(student.get(f"{HERE}hand-in.zip").body)) as archive:
+        names = archive.namelist()
+        assert FILE in names
+        assert not [name for name in names if name.startswith(("report", "gap"))]
+        assert archive.read(FILE) == (root / "team" / FILE).read_bytes()
+
+
+def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
+    """A submission that names the results as its data is not handed in, and the zip lacks them."""
+    team = root / "team"
+    first = load_submission(team).experiments[0].file
+    retype(team, f'"{first}"', '"report/results.json"')
+    assert "report/results.json is computed" in list_missing(team)[0]
+    assert "report/results.json" not in list_held(team, report=False)
+
+
+def test_no_upload_replaces_the_asks(lab, root):
+    """The file is no recording: an upload of one is refused, also in a zip."""
+    student = lab("s1")
+    ask_check(student)
+    before = (root / "team" / FILE).read_bytes()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr(FILE, "")
+    student.upload(f"{HERE}files", [(FILE, b""), ("work.zip", packed.getvalue())])
+    student.post(f"{HERE}aside", file=FILE)
+    assert (root / "team" / FILE).read_bytes() == before
+
+
+def test_on_ones_own_computer_the_submission_says_it(tmp_path):
+    """It is an agreement: whoever has the folder may take the line away."""
+    folder = a_submission(tmp_path / "team")
+    retype(folder, "[system]", '[students]\nsee = "check"\n\n[system]')
+    with DeskServer(folder=folder) as server:
+        owner = Visitor.of(server.url)
+        assert owner.get(f"{HERE}report").status == 403
+        assert owner.post(f"{HERE}make-report").status == 403
+        retype(folder, '[students]\nsee = "check"\n', "")
+        assert owner.get(f"{HERE}report").status == 200
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ('role = "ta"\nrubric = "lab.toml"', "a ta has no rubric"),
+        ('role = "student"\nfolders = ["team"]\nrubric = "none.toml"', "there is no such rubric"),
+    ],
+)
+def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
+    """Nothing is served."""
+    with pytest.raises(ConfigError, match=said):
+        read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
+
+
+def test_the_ta_reads_the_count_beside_the_grade(root):
+    """On the team's page, of a class that is graded with the file in it."""
+    for _ in range(2):
+        cartlab_here("check", root / "other")
+    cartlab_here("grade", root / "other", "--rubric", RUBRICS / "throne-1dof.toml",
+                 "--out", root / "grades", "--jobs", 1, "--no-figures")  # fmt: skip
+    with DeskServer() as server:
+        ta = Visitor.of(server.url)
+        ta.post("/open", folder=str(root / "grades"))
+        assert "cartlab check was asked 2 times." in ta.get("/grades/0/team?of=other").text

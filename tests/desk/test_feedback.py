@@ -1,0 +1,311 @@
+"""A student's own feedback over plain forms: who reads what, who asks, and how TAs answer."""
+
+import re
+from html import unescape
+from urllib.parse import quote, urlencode, urlsplit
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.desk.users import read_users
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN
+from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, write_users
+from tests.helpers.grades import two_cart_rubric, write_class
+from tests.helpers.hostile import SECRET
+
+pytestmark = pytest.mark.usefixtures("work_here")
+HERE, ROOM, QUEUE = "/feedback/0/", "/grades/0/", "/grades/0/again"
+USERS = """
+[[users]]
+name = "s4"
+role = "student"
+grades = [{ gradebook = "grades", submission = "team-04" }]
+[[users]]
+name = "s5"
+role = "student"
+folders = ["five"]
+grades = [{ gradebook = "grades", submission = "team-05", assignment = "lab" }]
+[[users]]
+name = "s6"
+role = "student"
+grades = [
+  { gradebook = "grades", submission = "team-06" },
+  { gradebook = "grades", submission = "team-06", assignment = "another" },
+  { gradebook = "grades", submission = "s5" },
+]
+[[users]]
+name = "s0"
+role = "student"
+[[users]]
+name = "Ada"
+role = "ta"
+gradebooks = ["grades"]
+[[users]]
+name = "Bob"
+role = "ta"
+gradebooks = ["grades"]
+[[users]]
+name = "prof"
+role = "instructor"
+gradebooks = ["grades"]
+"""
+HOSTILE = (
+    "<script>alert(1)</script> {{ 7 * 7 }} '\"><img src=x onerror=alert(1)> \u202egnp.\x1b[31m"
+)
+
+
+@pytest.fixture
+def lab(tmp_path, request):
+    """A graded class, not released; who asks, by name."""
+    write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
+    a_submission(tmp_path / "five")
+    with DeskServer(users=write_users(tmp_path, USERS)) as server:
+        port = urlsplit(server.url).port or 0
+        yield lambda name: through_proxy(port, name)
+
+
+@pytest.fixture
+def released(lab):
+    """The same, released."""
+    assert lab("prof").post(ROOM + "release", do="release").status == 303
+    return lab
+
+
+@pytest.fixture
+def book(tmp_path, lab):
+    """Its gradebook."""
+    with RequestBook(tmp_path / "grades") as book:
+        yield book
+
+
+def ask(who: Visitor, criterion: str = "laws", why: str = "see page 3") -> Answer:
+    """Send the form of a criterion."""
+    return who.post(HERE + "ask", criterion=criterion, why=why)
+
+
+def fields(answer: Answer, at: int = 0) -> dict[str, str]:
+    """Return what the form of a request on the queue sends along."""
+    names = ("team", "criterion", "seen")
+    found = [re.findall(rf'name="{name}" value="(.*?)"', answer.text)[at] for name in names]
+    return dict(zip(names, map(unescape, found), strict=True))
+
+
+# ------------------------------------------------------------------------- who reads what
+
+
+def test_students_see_nothing_before_the_release(lab):
+    """The instructor lets them, not a TA; and can hide it again."""
+    student = lab("s4")
+    for path in (HERE, HERE + "whole"):
+        assert "points" not in student.get(path).text
+    assert student.get(HERE + "whole").status == 404
+    assert "Your feedback is not out." in student.get(HERE).text
+    assert ask(student).status == 422
+    for name in ("Ada", "s4"):
+        assert lab(name).post(ROOM + "release", do="release").status == 403
+    assert "cannot read their feedback yet" in lab("Ada").get(ROOM).text
+    lab("prof").post(ROOM + "release", do="release")
+    assert "17 of 20 points" in student.get(HERE).text
+    whole = student.get(HERE + "whole")
+    assert "omega_1" in whole.text or "is off" in whole.text
+    assert "default-src 'none'" in whole.headers["content-security-policy"]
+    lab("prof").post(ROOM + "release", do="hide")
+    assert "Your feedback is not out." in student.get(HERE).text
+
+
+def test_of_another_s_feedback_there_is_no_address(released):
+    """By number, by path, by role; nor a form for it."""
+    student = released("s4")
+    assert student.get("/").headers["location"] == HERE
+    assert "team-04" in student.get(HERE).text
+    for path in ("/feedback/1/", "/feedback/-1/", "/feedback/1/whole", "/feedback/0/team-05",
+                 "/feedback/0/../1/", "/feedback/0/whole?of=team-05", "/feedback/x/"):  # fmt: skip
+        answer = student.get(path)
+        assert answer.status == 404 or "team-05" not in answer.text, path
+    assert student.post("/feedback/1/ask", criterion="laws", why="x").status == 404
+    for path in (ROOM, QUEUE, ROOM + "team?of=team-04", ROOM + "feedback/team-04/feedback.html"):
+        assert student.get(path).status == 403
+        assert student.post(path).status in (403, 405)
+    for name in ("Ada", "prof"):
+        assert released(name).get(HERE).status == 403
+        assert ask(released(name)).status == 403
+    assert released("s0").get(HERE).status == 404
+
+
+def test_the_grade_is_the_one_that_the_list_names(released):
+    """By its very name in the class that it names; nothing of the server is told."""
+    six = released("s6")
+    assert "team-06" in six.get(HERE).text
+    assert "Your feedback is not out." in six.get("/feedback/1/").text
+    wrong = six.get("/feedback/2/")  # an author's name is not the submission's
+    assert (wrong.status, "your grade cannot be read now" in wrong.text) == (422, True)
+    assert [f'href="/feedback/{n}/"' in six.get("/").text for n in range(3)] == [True] * 3
+    home = released("s5").get("/").text
+    assert '<a href="/feedback/0/">Feedback</a>' in home
+    assert "/student/0/" in home
+
+
+@pytest.mark.parametrize(
+    ("users", "why"),
+    [
+        ('role = "ta"\ngrades = [{ gradebook = "g", submission = "a" }]', "a ta has no grades"),
+        ('role = "student"\ngrades = [{ gradebook = "h", submission = "a" }]', "no folder"),
+        ('role = "student"\ngrades = [{ gradebook = "g" }]', "submission"),
+        ('role = "student"\ngrades = [{ gradebook = "g", submission = "" }]', "submission"),
+        (
+            'role = "student"\ngrades = [{ gradebook = "postgresql://h/d", submission = "a" }]',
+            "a database may hold several classes; add assignment",
+        ),
+    ],
+)
+def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
+    """Before anything is served."""
+    (tmp_path / "g").mkdir()
+    path = write_users(tmp_path, f'[[users]]\nname = "s"\n{users}\n')
+    with pytest.raises(ConfigError, match=why):
+        read_users(path)
+
+
+# ---------------------------------------------------------------------- asked and answered
+
+
+def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
+    """The queue, its number everywhere, an answer with points; both see every step."""
+    student, ta = released("s4"), released("Ada")
+    assert 'href="/grades/0/again">0' not in ta.get(ROOM).text
+    assert ask(student).status == 303
+    assert "waits for an answer" in student.get(HERE).text
+    assert "1 request waits" in ta.get(ROOM).text
+    assert "(1 asked)" in ta.get(ROOM).text.split("</nav>")[0]
+    queue = ta.get(QUEUE)
+    assert "see page 3" in queue.text
+    assert "s4 asked" in queue.text
+    assert f"{ROOM}team?of=team-04&criterion=laws#chosen" in unescape(queue.text)
+    sent = fields(queue)
+    done = ta.post(QUEUE, do="answer", points="0.5", text="Page 3\nis right.", **sent)
+    assert (done.status, done.headers["location"]) == (303, QUEUE)
+    page = student.get(HERE).text
+    assert "Ada answered: 0.5 points" in page
+    assert "Page 3\nis right." in page
+    assert book.entry("team-04").overrides["laws"].points == 0.5
+    assert "No request waits" in ta.get(QUEUE).text
+    team = ta.get(ROOM + "team?of=team-04&criterion=laws").text
+    assert "Another look: answered" in team
+    for step in ("asked     laws: by s4: see page 3", "answered  laws: 0.5 by hand, by Ada"):
+        assert step in team
+    assert ask(student).status == 422
+    reopened = ta.post(QUEUE, do="reopen", **fields(ta.get(QUEUE)))
+    assert reopened.status == 303
+    assert "you may ask once more" in student.get(HERE).text
+    assert ask(student, why="and page 4").status == 303
+
+
+def test_what_cannot_be_is_said_beside_the_field(released, book):
+    """What was typed stays, and nothing is written."""
+    student, ta = released("s4"), released("Ada")
+    long = "x" * (MOST_LETTERS + 1)
+    refused = ask(student, why=long)
+    assert refused.status == 422
+    assert long in refused.text
+    assert 'id="why-laws-wrong"' in refused.text
+    assert book.n_waiting() == 0
+    ask(student)
+    sent = fields(ta.get(QUEUE))
+    for typed, status in (
+        ({"points": "99", "text": "kept words"}, 422),
+        ({"points": "auto", "text": "kept words"}, 422),
+        ({"points": "1", "text": ""}, 422),
+        ({"points": "1", "text": long}, 422),
+    ):
+        answer = ta.post(QUEUE, do="answer", **typed, **sent)
+        assert answer.status == status
+        assert 'role="alert"' in answer.text
+        assert typed["text"] in answer.text
+    assert ta.post(QUEUE, do="drop", **sent).status == 400
+    assert ta.post(QUEUE, do="answer", **sent | {"team": "team-99"}).status == 404
+    assert ta.post(QUEUE, do="answer", text="x", **sent | {"criterion": "pieces"}).status == 422
+    assert ta.post(QUEUE, do="answer", text="x", **sent | {"seen": ""}).status == 409
+    assert book.n_waiting() == 1
+    assert not book.entry("team-04").overrides
+
+
+def test_few_requests_wait_at_once(released):
+    """The next is refused beside its own field."""
+    criteria = [criterion.id for criterion in two_cart_rubric().criteria]
+    for criterion in criteria[:MOST_OPEN]:
+        assert ask(released("s4"), criterion).status == 303
+    refused = ask(released("s4"), criteria[MOST_OPEN])
+    assert refused.status == 422
+    assert f"{MOST_OPEN} requests of yours wait" in refused.text
+
+
+def test_the_second_of_two_answers_sees_both(released, book):
+    """Nothing of the second is written, and what was written is shown beside theirs."""
+    ask(released("s4"))
+    seen = {name: fields(released(name).get(QUEUE)) for name in ("Ada", "Bob")}
+    first = {"points": "0.5", "text": "ada's words"}
+    assert released("Ada").post(QUEUE, do="answer", **first, **seen["Ada"]).status == 303
+    second = {"points": "1", "text": "bob's words"}
+    answer = released("Bob").post(QUEUE, do="answer", **second, **seen["Bob"])
+    assert answer.status == 409
+    cells = [unescape(cell) for cell in re.findall(r"<td>(.*?)</td>", answer.text)]
+    assert cells == ["1", "0.5", "bob's words", "ada's words", "Bob", "Ada"]
+    assert [e.what for e in book.history("team-04")[1]].count("answered") == 1
+    assert book.entry("team-04").overrides["laws"].by == "Ada"
+
+
+def test_hostile_words_are_words(released):
+    """Markup, templates and control marks, on every page that has a reason or an answer."""
+    student, ta = released("s4"), released("Ada")
+    assert ask(student, why=HOSTILE).status == 303
+    assert ask(student, "pieces", why="\u202e" * 40 + SECRET).status == 303
+    pages = [ta.get(QUEUE), student.get(HERE)]
+    ta.post(QUEUE, do="answer", points="", text=HOSTILE, **fields(pages[0]))
+    pages += [
+        ta.get(QUEUE), ta.get(QUEUE + "?of=team-04"),
+        ta.get(ROOM), ta.get(ROOM + "team?of=team-04"),
+        student.get(HERE), student.get(HERE + "whole"),
+    ]  # fmt: skip
+    for page in pages:
+        assert page.status == 200
+        body = page.text.split("<main")[-1]
+        assert not re.search(r"<(?!/?script src=\"/static/)script>alert|<img src=x", body)
+        assert not [mark for mark in "\u202e\x1b" if mark in body]
+    assert "{{ 7 * 7 }}" in student.get(HERE).text
+    assert ta.get(f"{QUEUE}?{urlencode({'of': HOSTILE})}").status == 404
+
+
+@pytest.mark.parametrize("lab", [True], indirect=True)
+def test_an_anonymous_class_has_anonymous_requests(released, book):
+    """No page of a TA names who asked; the student reads their own all the same."""
+    student, ta = released("s5"), released("Ada")
+    assert "do not write your name" in student.get(HERE).text
+    assert ask(student, why="I am S5 of team-05, see page 3").status == 303
+    queue = ta.get(QUEUE)
+    sent = fields(queue)
+    assert sent["team"].startswith("anon-")
+    team = f"{ROOM}team?{urlencode({'of': sent['team']})}"
+    ta.post(QUEUE, do="answer", points="1", text="yes", **sent)
+    for page in (queue, ta.get(QUEUE), ta.get(team), ta.get(f"{QUEUE}?of={quote(sent['team'])}")):
+        assert page.status == 200
+        for name in ("team-05", "s5", "S5"):
+            assert not re.search(rf"\b{name}\b", page.text), name
+        assert "see page 3" in page.text
+    assert "Ada answered: 1 point" in student.get(HERE).text
+    whole = student.get(HERE + "whole").text
+    assert "team-05" in whole
+    assert book.entry("team-05").overrides["laws"].points == 1.0
+    for other in ("team-01", "team-04"):
+        assert other not in whole + student.get(HERE).text
+
+
+def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path):
+    """Neither where it was nor why it cannot be read."""
+    (tmp_path / "grades").rename(tmp_path / "elsewhere")
+    for answer in (released("s4").get(HERE), ask(released("s4"))):
+        assert answer.status == 422
+        assert "your grade cannot be read now; tell your instructor" in answer.text
+        assert str(tmp_path) not in answer.text
+        assert "gradebook" not in answer.text

@@ -1,0 +1,145 @@
+"""The first page, the line of rooms, and the list of folders that the owner chooses from."""
+
+import re
+from html import unescape
+from pathlib import Path
+from urllib.parse import urlencode, urlsplit
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.desk.browse import MOST, find_root, list_folders
+from pipeline.errors import ConfigError
+from tests.helpers.desks import Visitor, a_submission, through_proxy, write_users
+from tests.helpers.grades import write_class
+
+pytestmark = pytest.mark.usefixtures("work_here")
+
+
+@pytest.fixture
+def root(tmp_path, monkeypatch) -> Path:
+    """The folder that a desk is started in: of every kind one, hidden ones, links."""
+    root, outside = tmp_path / "course", tmp_path / "outside"
+    a_submission(root / "team")
+    write_class(root / "grades")
+    (root / "empty").mkdir()
+    (root / "years" / "2026").mkdir(parents=True)
+    (root / ".hidden" / "inner").mkdir(parents=True)
+    outside.mkdir()
+    (root / "way-out").symlink_to(outside)
+    (root / "to-hidden").symlink_to(root / ".hidden" / "inner")
+    (root / "same").symlink_to(root / "empty")
+    (root / "loop").symlink_to(root / "loop")
+    (root / "file.txt").write_text("x", encoding="utf-8")
+    monkeypatch.chdir(root)
+    return root
+
+
+def links(page: str) -> list[str]:
+    """Return the names in the line of rooms."""
+    line = re.findall(r'<nav aria-label="Rooms">.*?</nav>', page, re.DOTALL)[0]
+    return [unescape(name) for name in re.findall(r">([^<>]+)</a>", line)]
+
+
+def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
+    """Each folder once, with what it is; links that lead out or to hidden folders are left out."""
+    found = {one.inside: one.kind for one in list_folders(root, "").found}
+    assert found == {"grades": "grading", "team": "submission", "empty": "empty", "years": "folder"}
+    assert list(found)[:2] == ["grades", "team"]
+    below = list_folders(root, "years/2026")
+    assert below.above == ((root.name, ""), ("years", "years"))
+    assert (below.here.kind, below.found) == ("empty", ())
+
+
+@pytest.mark.parametrize(
+    "inside",
+    ["..", "../outside", "/", "way-out", ".hidden", ".hidden/inner", "to-hidden", "file.txt",
+     "nowhere", "years/../..", "a\x00b", "loop"],
+)  # fmt: skip
+def test_no_folder_outside_of_the_root_is_listed(root, inside):
+    """Nor a hidden one, nor what is no folder; the desk answers with one sentence."""
+    with pytest.raises(ConfigError):
+        list_folders(root, inside)
+    with DeskServer() as server:
+        answer = Visitor.of(server.url).get(f"/open?{urlencode({'in': inside})}")
+    assert answer.status == 422
+
+
+def test_a_large_folder_is_cut_and_says_so(root):
+    """The first of them are listed; the page says how to open another."""
+    for number in range(MOST + 5):
+        (root / "years" / f"team-{number:03d}").mkdir()
+    listed = list_folders(root, "years")
+    assert (len(listed.found), listed.left_off) == (MOST, True)
+    with DeskServer() as server:
+        page = Visitor.of(server.url).get("/open?in=years").text
+    assert f"Only the first {MOST} folders are listed" in page
+
+
+def test_the_whole_disk_is_no_root(monkeypatch):
+    """A desk that was started from an icon lists the home folder."""
+    monkeypatch.chdir(Path(Path.cwd().anchor))
+    assert find_root() == Path.home()
+
+
+def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
+    """From the card to the room: report, bench, solution; a graded class opens as a class."""
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        assert "Nothing is open yet." in visitor.get("/").text
+        page = visitor.get("/open?to=bench").text
+        assert re.search(r"Record here<span[^>]*> team<", page)
+        for to, folder, address in (
+            ("bench", "team", "/bench/0/"),
+            ("solution", "team", "/solution/0/"),
+            ("", "empty", "/student/1/"),
+            ("bench", "grades", "/grades/0/"),
+            ("open", "team", "/student/0/"),
+        ):
+            answer = visitor.post("/open", folder=str(root / folder), to=to)
+            assert (answer.status, answer.headers["location"]) == (303, address)
+        home = unescape(visitor.get("/").text)
+    assert "2 submissions and 1 class are open." in home
+    assert re.search(r">team</a>\s*<span>\d+ files</span> <span[^>]*>no report<", home)
+    assert re.search(r">grades</a> <span[^>]*>0 of \d+ looked at<", home)
+    assert "no plan yet" in home
+
+
+def test_the_line_of_rooms_stays_short(root):
+    """Those opened last and the one that is shown; its bench only where it is shown."""
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        for number in range(9):
+            visitor.post("/open", folder=str(root / "years" / f"t{number}"))
+        assert links(visitor.get("/").text) == ["Desk", "t6", "t7", "t8"]
+        assert links(visitor.get("/student/2/").text) == ["Desk", "t2", "Bench", "t6", "t7", "t8"]
+        assert links(visitor.get("/solution/8/").text)[-3:] == ["t8", "Bench", "Solution"]
+        assert links(visitor.get("/effects/").text)[-1] == "Effects"
+        assert unescape(visitor.get("/").text).count(">t0</a>") == 3  # each card lists all
+
+
+def test_a_student_sees_nothing_of_the_instructor_s(root):
+    """No card, no link, no list of folders; neither does a TA."""
+    users = """
+    [[users]]
+    name = "s"
+    role = "student"
+    folders = ["team", "empty"]
+    [[users]]
+    name = "t"
+    role = "ta"
+    gradebooks = ["grades", "grades"]
+    """
+    with DeskServer(users=write_users(root, users)) as server:
+        port = urlsplit(server.url).port or 0
+        student, ta = through_proxy(port, "s"), through_proxy(port, "t")
+        pages = [student.get("/").text, student.get("/student/0/").text, ta.get("/").text]
+        for page in pages:
+            for address in ("/exercises/", "/rubric/", "/effects/", "/bench/", "/solution/"):
+                assert f'href="{address}' not in page
+            assert "/open" not in page
+        assert links(pages[0]) == ["Desk", "team", "empty"]
+        assert "Write a report" in pages[0]
+        assert "Grade a class" in pages[2]
+        for who in (student, ta):
+            assert who.get("/open").status == who.get("/open?in=team").status == 403

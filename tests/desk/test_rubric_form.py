@@ -1,0 +1,274 @@
+"""The rubric over plain forms: which there are, its numbers and text, its preview on a class."""
+
+import json
+import re
+from collections.abc import Iterator
+from html import unescape
+from pathlib import Path
+from urllib.parse import urlencode
+
+import pytest
+
+from pipeline.desk.app import DeskServer
+from pipeline.desk.instructor.rubric_shelf import own_rubrics
+from pipeline.desk.users import User
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.resources import RUBRICS
+from tests.helpers.desks import Answer, Visitor, wrongs
+from tests.helpers.grades import write_class_of_two
+
+pytestmark = pytest.mark.usefixtures("work_here")
+ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def visitor() -> Iterator[Visitor]:
+    """Somebody at a desk."""
+    with DeskServer() as server:
+        yield Visitor.of(server.url)
+
+
+@pytest.fixture
+def lab(tmp_path) -> Path:
+    """A rubric of one's own."""
+    path = tmp_path / "lab.toml"
+    path.write_text(ONE_CART, encoding="utf-8")
+    return path
+
+
+def editor(visitor: Visitor, path: Path) -> Answer:
+    """Return the page of a rubric."""
+    page = visitor.get(f"/rubric/?{urlencode({'file': path})}")
+    assert page.status == 200, page.text
+    return page
+
+
+def sent(page: Answer, path: Path, **changed: str) -> dict[str, str]:
+    """Return what a page's form sends once some of it was changed."""
+    shown = unescape(page.value("shown"))
+    typed = re.search(r'<textarea name="text"[^>]*>\n?(.*?)</textarea>', page.text, re.DOTALL)
+    assert typed
+    fields = {"file": str(path), "seen": page.value("seen"), "shown": shown}
+    fields["text"] = unescape(typed[1])
+    return fields | json.loads(shown) | changed
+
+
+# --------------------------------------------------------------------------- the file
+
+
+def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
+    """A new one begins with a shipped one; a mistake stands at its line, and is not written."""
+    path = tmp_path / "rubric.toml"
+    page = visitor.get(f"/rubric/?{urlencode({'file': path, 'start': 'throne-2dof'})}")
+    text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
+    assert unescape(page.text).count(text.strip()) == 1
+    line = next(i for i, one in enumerate(text.split("\n"), 1) if one.startswith("title"))
+    spoilt = text.replace("title", "titel", 1)
+    answer = visitor.post("/rubric/save", file=str(path), text=spoilt, seen=page.value("seen"))
+    assert answer.status == 422
+    assert f'<li value="{line}" class="bad" id="line-{line}"><code>titel' in answer.text
+    assert f'<p class="result">Line {line}: titel: unknown key' in unescape(answer.text)
+    assert f'href="#line-{line}"' in answer.text
+    assert not path.exists()
+    crlf = text.replace("\n", "\r\n")  # as browsers send it
+    saved = visitor.post("/rubric/save", file=str(path), text=crlf, seen=page.value("seen"))
+    assert saved.status == 303
+    assert path.read_text(encoding="utf-8").rstrip() == text.rstrip()
+    assert load_rubric(path) == load_rubric(Path("throne-2dof"))
+
+
+def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
+    """Both versions are shown; what is on disk stays."""
+    seen = editor(visitor, lab).value("seen")
+    lab.write_text(f"# by another\n{ONE_CART}", encoding="utf-8")
+    mine = f"# mine\n{ONE_CART}"
+    answer = visitor.post("/rubric/save", file=str(lab), text=mine, seen=seen)
+    assert answer.status == 409
+    assert "# by another" in answer.text
+    assert "# mine" in answer.text
+    assert lab.read_text(encoding="utf-8").startswith("# by another")
+    new = visitor.post("/rubric/save", file=str(lab), text=mine, seen="new")
+    assert new.status == 409  # begun as a new file, which is there now
+
+
+@pytest.mark.parametrize(
+    "file",
+    ["", "rubric.txt", "/nowhere/at/all/rubric.toml", "a\x00.toml", "~nosuch/r.toml",
+     "a" * 300 + ".toml"],
+)  # fmt: skip
+def test_a_rubric_lies_where_it_can(visitor, file):
+    """A name that is none is one clear sentence."""
+    assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
+
+
+def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
+    """A name with the signs of an address: the page after saving is of the same file."""
+    folder = tmp_path / "R+D & co #2 100%"
+    folder.mkdir()
+    path = folder / "rubric.toml"
+    saved = visitor.post("/rubric/save", file=str(path), text=ONE_CART, seen="new")
+    page = visitor.get(saved.headers["location"])
+    assert page.value("file") == str(path)
+
+
+def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):
+    """With its title, carts and points; those of the folder can be opened; a free name is taken."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "rubric.toml").write_text(ONE_CART.replace("points", "pionts"), encoding="utf-8")
+    (tmp_path / "other.toml").write_text("a = 1\n", encoding="utf-8")
+    page = unescape(visitor.get("/rubric/").text)
+    for path in RUBRICS.glob("*.toml"):
+        assert f'href="/rubric/?start={path.stem}"' in page
+    assert "20 points in 14 criteria; fits submissions with 3 carts." in page
+    assert "Open lab.toml" in page
+    assert "It has mistakes." in page
+    assert "other.toml" not in page
+    begun = visitor.get("/rubric/?start=throne-3dof")
+    assert begun.value("file") == str(tmp_path / "rubric-2.toml")
+    assert begun.value("seen") == "new"
+
+
+def test_a_workshop_shows_its_own_files_alone(tmp_path):
+    """Neither those beside it, nor those that a link in it leads to."""
+    shop = tmp_path / "shop"
+    for path in (shop / "deep" / "a.toml", shop / ".hidden" / "b.toml", tmp_path / "c.toml"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(ONE_CART, encoding="utf-8")
+    (shop / "d.toml").symlink_to(tmp_path / "c.toml")
+    user = User(name="Ada", role="instructor", workshop=shop.resolve())
+    assert [one.name for one in own_rubrics(user)] == ["deep/a.toml"]
+
+
+# --------------------------------------------------------------------------- the form
+
+
+def test_a_page_begins_with_what_the_rubric_is(visitor, lab):
+    """Its points, criteria and carts."""
+    page = editor(visitor, lab).text
+    assert '<p class="result">20 points in 13 criteria; fits submissions with 1 cart</p>' in page
+
+
+def test_late_work_at_half_is_one_number(visitor, lab):
+    """One line of the file is another, its neighbours and comments are not."""
+    page = editor(visitor, lab)
+    answer = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "50"}))
+    assert answer.status == 303
+    expected = ONE_CART.replace("percent_per_day = 10", "percent_per_day = 50")
+    assert lab.read_text(encoding="utf-8") == expected
+
+
+def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
+    """What was typed in the text stays; a number of the form is put into that."""
+    page = editor(visitor, lab)
+    text = ONE_CART.replace("points are rounded to it", "quarters")
+    fields = sent(page, lab, **{"criteria.pieces.points": "1,5", "text": text})
+    assert visitor.post("/rubric/save", **fields).status == 303
+    written = lab.read_text(encoding="utf-8")
+    assert written == text.replace("points = 1\n", "points = 1.5\n", 1)
+
+
+def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
+    """Nothing is written, and what was typed is still there."""
+    page = editor(visitor, lab)
+    answer = visitor.post("/rubric/save", **sent(page, lab, **{"criteria.pieces.points": "1.1"}))
+    line = ONE_CART.split("\n").index("points = 1") + 1
+    assert answer.status == 422
+    assert f'<p class="result">Line {line}: ' in answer.text
+    assert f"see line {line}" in wrongs(answer.text)
+    assert re.search(r'name="criteria.pieces.points"[^>]*value="1.1"[^>]*aria-invalid', answer.text)
+    none = visitor.post("/rubric/save", **sent(page, lab, step="half"))
+    assert "needs a number, found 'half'" in wrongs(none.text)
+    assert lab.read_text(encoding="utf-8") == ONE_CART
+
+
+def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
+    """The form is away while the text is wrong, and its number is put in once it is right."""
+    page = editor(visitor, lab)
+    wrong = ONE_CART.replace("version = 1", "version = one")
+    fields = sent(page, lab, **{"late.percent_per_day": "50", "text": wrong})
+    answer = visitor.post("/rubric/check", **fields)
+    assert "The form comes back when the text is valid." in answer.text
+    again = sent(answer, lab, **{"late.percent_per_day": answer.value("late.percent_per_day")})
+    assert visitor.post("/rubric/save", **(again | {"text": ONE_CART})).status == 303
+    assert load_rubric(lab).late.percent_per_day == 50
+
+
+@pytest.mark.parametrize("shown", ["", "no JSON", "[]", '{"criteria.none.points": "1"}', "7"])
+def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
+    """What a page never showed changes nothing."""
+    seen = editor(visitor, lab).value("seen")
+    fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
+    answer = visitor.post("/rubric/check", **fields, **{"criteria.none.points": "2"})
+    assert answer.status == 200
+    assert "the desk itself failed" not in answer.text
+
+
+# ------------------------------------------------------------------------ the preview
+
+
+def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
+    """What changes and by how much, the largest first; then the rubric is saved and applied."""
+    write_class_of_two(tmp_path / "graded")
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        visitor.post("/open", folder=str(tmp_path / "graded"))
+        page = editor(visitor, lab)
+        fields = sent(page, lab, **{"late.percent_per_day": "50", "criteria.data.points": "2"})
+        shown = visitor.post("/rubric/preview", **fields, **{"class": "0"})
+        assert shown.status == 200, shown.text
+        text = " ".join(re.sub(r"<[^>]+>", " ", unescape(shown.text)).split())
+        assert "2 of 2 teams would have other points." in text
+        assert "of 20 to " in text
+        rows = re.findall(r'<tr>\s*<th scope="row">.*?</tr>', shown.text, re.DOTALL)
+        assert ["team-2" in rows[0], "team-1" in rows[1]] == [True, True]
+        assert "late: −" in rows[0]
+        assert "20 → 21" in rows[1]
+        assert lab.read_text(encoding="utf-8") == ONE_CART
+        drawn = re.search(r'src="(/rubric/preview.svg[^"]*)"', shown.text)
+        assert drawn
+        assert visitor.get(unescape(drawn[1])).body.startswith(b"<svg")
+        kept = {name: unescape(shown.value(name)) for name in ("file", "seen")}
+        typed = re.search(r"<textarea[^>]*>\n?(.*?)</textarea>", shown.text, re.DOTALL)
+        assert typed
+        saved = visitor.post("/rubric/save", **kept, text=unescape(typed[1]))
+        assert load_rubric(lab).late.percent_per_day == 50
+        after = visitor.get(saved.headers["location"]).text
+        assert 'action="/grades/0/regrade"' in after
+        assert "Grade graded again with it" in after
+
+
+def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
+    """A tolerance of the laws, or what must be handed in, is not guessed from kept findings."""
+    write_class_of_two(tmp_path / "graded")
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        visitor.post("/open", folder=str(tmp_path / "graded"))
+        page = editor(visitor, lab)
+        text = ONE_CART.replace("at_least = 8", "at_least = 9")
+        shown = visitor.post("/rubric/preview", **sent(page, lab, text=text), **{"class": "0"})
+    assert "<li><code>required</code></li>" in shown.text
+    assert "No team of graded would have other points." in shown.text
+
+
+def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
+    """Nor does the order of the names."""
+    write_class_of_two(tmp_path / "graded", anonymous=True)
+    with DeskServer() as server:
+        visitor = Visitor.of(server.url)
+        visitor.post("/open", folder=str(tmp_path / "graded"))
+        page = editor(visitor, lab)
+        fields = sent(page, lab, **{"criteria.data.points": "2"})
+        shown = visitor.post("/rubric/preview", **fields, **{"class": "0"}).text
+    assert "anon-" in shown
+    assert "team-1" not in shown
+
+
+def test_a_preview_is_of_a_class_that_is_open_and_a_rubric_that_is_valid(visitor, lab):
+    """Addresses of nothing are told as such; a mistake leads back to the editor."""
+    page = editor(visitor, lab)
+    for number in ("", "0", "-1", "²", "9" * 30):
+        assert visitor.post("/rubric/preview", **sent(page, lab), **{"class": number}).status == 404
+    spoilt = sent(page, lab, text="version = 2\n")
+    assert visitor.post("/rubric/preview", **spoilt, **{"class": "0"}).status == 422
+    for query in ("", "before=1", "before=1.2&after=1.2.3", "before=1.x&after=1.2"):
+        assert visitor.get(f"/rubric/preview.svg?{query}").status == 404

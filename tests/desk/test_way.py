@@ -1,0 +1,53 @@
+"""The way of a student: every step's state, by plain facts."""
+
+import pytest
+
+from pipeline.desk.student.way import Facts, find_steps, next_step
+
+READY = Facts(recordings=33, sound=True, report="current", questions=3)
+
+
+@pytest.mark.parametrize(
+    ("facts", "states", "following"),
+    [
+        (Facts(), "needs none none none none", "files"),
+        (Facts(recordings=33, to_look_at=2, sound=True), "needs done none none none", "files"),
+        (
+            Facts(recordings=33, missing=("The bench",), sound=True),
+            "done needs none none none",
+            "set-up",
+        ),
+        (Facts(recordings=33), "done needs none none none", "set-up"),
+        (Facts(recordings=33, sound=True), "done done needs none none", "report"),
+        (Facts(recordings=33, sound=True, making=True), "done done none none none", "report"),
+        (Facts(recordings=33, sound=True, report="older"), "done done old done none", "report"),
+        (
+            Facts(recordings=33, sound=True, report="current", questions=3, unanswered=1),
+            "done done done needs none",
+            "questions",
+        ),
+        (READY, "done done done done needs", "hand-in"),
+        (
+            Facts(recordings=33, sound=True, check=("needs", "some disagree")),
+            "done done needs none",
+            "check",
+        ),
+        (
+            Facts(recordings=33, sound=True, check=("done", "all agree")),
+            "done done done needs",
+            "hand-in",
+        ),
+    ],
+)
+def test_each_step_follows_from_the_facts(facts, states, following):
+    """A step is done, needs somebody, is out of date, or not yet; the first not done is next."""
+    steps = find_steps(facts)
+    assert " ".join(step.state for step in steps) == states
+    assert next_step(steps).key == following
+
+
+def test_a_zip_that_was_downloaded_as_it_is_now_ends_the_way():
+    """Then nothing is left to do, and the last step stays the one to go to."""
+    facts = Facts(recordings=1, sound=True, report="current", handed=True)
+    assert {step.state for step in find_steps(facts)} == {"done"}
+    assert next_step(find_steps(facts)).key == "hand-in"

@@ -1,0 +1,362 @@
+"""A bench that investigates itself, on the emulator's carts and over a real line."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from pipeline.bench.host.signals import Stopped
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.by_hand import add_recording
+from pipeline.experiments.candidates import propose_candidates
+from pipeline.experiments.discriminate import propose_for
+from pipeline.experiments.exploring.choice import choose_recording
+from pipeline.experiments.exploring.error_goal import ErrorGoal, read_error_goal, read_time
+from pipeline.experiments.exploring.exploration import Exploration, Recorded
+from pipeline.experiments.goal import find_goal
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.plan import PlanLimits
+from pipeline.experiments.plan_file import load_plan, save_plan
+from pipeline.experiments.propose import propose_plan
+from pipeline.report.exploration.diary import NAME
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.submission import load_submission
+from pipeline.words.progress import silent
+from pipeline.workflow import analyse
+from tests.helpers.benches import emulator
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.desks import a_recorded_cart
+from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
+
+
+@pytest.mark.parametrize(
+    ("text", "wish"),
+    [
+        ("zeta 1%", ErrorGoal(prefix="zeta", error=0.01)),
+        ("1 %", ErrorGoal(error=0.01)),
+        ("all 0.5%", ErrorGoal(error=0.005)),
+        ("omega_1 0.05 %", ErrorGoal(prefix="omega_1", error=0.0005)),
+    ],
+)
+def test_wishes_are_read_as_one_says_them(text, wish):
+    """A name or none, and a percentage."""
+    assert read_error_goal(text) == wish
+
+
+def test_durations_are_read_as_one_says_them():
+    """In seconds, minutes or hours."""
+    assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
+
+
+@pytest.mark.parametrize(
+    "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
+)
+def test_what_is_no_wish_is_refused(text):
+    """With an example of one."""
+    with pytest.raises(ConfigError, match="expected a name and a percentage"):
+        read_error_goal(text)
+
+
+@pytest.mark.parametrize(
+    "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
+)
+def test_what_is_no_duration_is_refused(text):
+    """With an example of one."""
+    with pytest.raises(ConfigError, match="expected a duration"):
+        read_time(text)
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory):
+    """A stop far out to one side, where no step goes, explored until all is known well."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
+    folder = tmp_path_factory.mktemp("explored") / "work"
+    said: list[str] = []
+    session = VirtualSession(folder, VirtualBench(bench, seed=2))
+    turns = Exploration(
+        folder=folder,
+        record=session,
+        goal=read_error_goal("all 1%"),
+        seconds=400.0,
+        tell=said.append,
+    ).run()
+    return folder, turns, said, bench
+
+
+def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
+    """The stop is named on its cart, every parameter is known, and as it is."""
+    folder, turns, said, bench = explored
+    last = turns[-1]
+    assert last.verdict == "named"
+    assert last.reached
+    assert last.recorded == ("sweep-2",)  # one that swings the cart out shows what acts there
+    assert "the worst of all to ±" in last.said
+    (explanation,) = last.explanations
+    assert "cart 1" in explanation.name
+    assert all(error is not None and error < 0.01 for error in last.errors.values())
+    gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+    assert [one["effect"] for one in gap["effects"]] == ["end_stop"]
+    m = gap["chain"]["m"][0]
+    assert m == pytest.approx(bench.chain.m[0], rel=0.01)
+    assert said == [turn.said for turn in turns]
+
+
+def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
+    """Every record stands in submission.toml and plan.toml; each turn in the diary."""
+    folder, turns, _, _ = explored
+    recorded = [name for turn in turns for name in turn.recorded]
+    submission = load_submission(folder)
+    assert [experiment.id for experiment in submission.experiments] == recorded
+    assert analyse(submission).records
+    diary = (folder / NAME).read_text(encoding="utf-8")
+    for turn in turns:
+        assert f"{turn.seconds:.0f} s" in diary
+
+
+@pytest.fixture
+def no_gap(monkeypatch):
+    """Only the carts are identified: where the gap is of no concern, or cannot be looked for."""
+
+    def none(analysis, **other):
+        raise DataError("no run can be held out")
+
+    monkeypatch.setattr("pipeline.experiments.exploring.exploration.investigate", none)
+
+
+@pytest.mark.usefixtures("no_gap")
+def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
+    """No recording is begun that would go beyond; what it would have been is said.
+
+    Where the gap cannot be looked for the carts are identified, and no word says that nothing
+    else acts.
+    """
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    (turn,) = Exploration(
+        folder=tmp_path / "work",
+        record=session,
+        goal=ErrorGoal(error=1e-7),
+        seconds=90.0,
+        tell=silent,
+    ).run()
+    assert turn.seconds <= 90.0
+    assert (turn.verdict, turn.reached) == ("", False)
+    assert turn.errors
+    assert "allowed are up" in turn.said
+
+
+def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
+    """Nothing is recorded, and what it would take is said."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    virtual = VirtualBench(bench, seed=1)
+    session = VirtualSession(tmp_path / "work", virtual)
+    with pytest.raises(ConfigError, match="the first sweep takes"):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(),
+            seconds=10.0,
+            tell=silent,
+        ).run()
+    assert virtual.seconds == 0.0
+
+
+def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored, tmp_path):
+    """With the name that is nearest; nothing is recorded, nothing is claimed."""
+    asked: list[str] = []
+
+    def record(ids):
+        asked.extend(ids)
+        return Recorded(ids=(), seconds=0.0)
+
+    wish = read_error_goal("Zeta 1%")
+    for folder in (explored[0], tmp_path):  # whose carts are known, and not yet
+        with pytest.raises(ConfigError, match="did you mean 'zeta'"):
+            Exploration(folder=folder, record=record, goal=wish, seconds=900.0, tell=silent).run()
+    assert not asked
+    with pytest.raises(ConfigError, match="no such parameter"):
+        ErrorGoal(prefix="zeta_7").missing({"zeta_1": 0.1, "zeta_2": None})
+
+
+def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
+    """Nobody has said yet whether springs hold the carts: the first sweep is made."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+    with pytest.raises(ConfigError, match="the first sweep takes"):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(prefix="mass"),
+            seconds=10.0,
+            tell=silent,
+        ).run()
+
+
+@pytest.mark.usefixtures("no_gap")
+def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
+    """Each time another recording is chosen; the diary says what did not come off, and why."""
+    asked = []
+
+    def record(ids):
+        asked.extend(ids)
+        return Recorded(ids=(), seconds=20.0, why="the line is silent")
+
+    turns = Exploration(
+        folder=a_recorded_cart(tmp_path / "work"),
+        record=record,
+        goal=ErrorGoal(error=1e-7),
+        seconds=900.0,
+        tell=silent,
+    ).run()
+    assert len(set(asked)) == 3
+    assert [turn.said.split("; ")[0] for turn in turns[1:]] == [
+        f"{name} did not come off (the line is silent)" for name in asked
+    ]
+    assert not turns[-1].reached
+
+
+def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
+    """Another is chosen than what is vetoed; what is added comes next; the diary says both.
+
+    gap.json is written anew, with what decides if not what was vetoed: then and from then on.
+    """
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    folder, offered, said = tmp_path / "work", [], []
+    session = VirtualSession(folder, VirtualBench(bench, seed=1))
+
+    def proposed(gap, submission, *, without=()):
+        found = propose_for(gap, submission, without=without)
+        return replace(found, next_experiment="another") if without else found
+
+    def vetoes(recording):
+        offered.append(recording)
+        gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
+        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # looked anew, too
+        if len(offered) == 1:
+            step = next(one for one in load_plan(load_submission(folder)).recordings
+                        if one.kind == "step")  # fmt: skip
+            add_recording(folder, step.model_copy(update={"id": "mine", "amplitude": 0.015}))
+        elif len(offered) == 3:
+            raise Stopped("by hand")
+        return len(offered) == 1
+
+    monkeypatch.setattr("pipeline.experiments.exploring.exploration.propose_for", proposed)
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=folder,
+            record=session,
+            goal=ErrorGoal(error=1e-7),
+            seconds=400.0,
+            tell=said.append,
+            vetoes=vetoes,
+        ).run()
+    first, mine, other = offered
+    assert mine.id == "mine"
+    assert not other.resembles(first)
+    recorded = {experiment.id for experiment in load_submission(folder).experiments}
+    assert mine.id in recorded
+    assert first.id not in recorded
+    assert said[1].startswith(f"{first.id} was vetoed; ")
+    assert "mine, which was added by hand" in said[1]
+    assert f"{first.id} was vetoed" in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_what_is_added_counts_whatever_it_is_called(tmp_path):
+    """An id that the program would give its own first step, where the plan had none at first."""
+    bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
+    folder = new_folder(tmp_path / "work", bench, springs=[True, True])
+    submission = load_submission(folder)
+    usual = propose_plan(submission, bench=bench.description)
+    sweep, step = (next(one for one in usual.recordings if one.id == name)
+                   for name in ("sweep", "step-1"))  # fmt: skip
+    save_plan(usual.model_copy(update={"recordings": (sweep,)}), submission)
+    session, offered = VirtualSession(folder, bench), []
+    session(["sweep"])
+
+    def add(stage):
+        if stage == "what to record next":
+            add_recording(folder, step)
+
+    def enough(recording):
+        offered.append(recording)
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=folder,
+            record=session,
+            goal=ErrorGoal(error=1e-7),
+            seconds=400.0,
+            tell=silent,
+            progress=add,
+            vetoes=enough,
+        ).run()
+    assert offered == [step]
+
+
+def test_where_all_that_tells_more_was_refused_the_large_step_is_left(tmp_path):
+    """Carts that were driven gently only may hide what acts far out."""
+    submission = load_submission(a_recorded_cart(tmp_path / "work"))
+    analysis = analyse(submission)
+    plan = propose_plan(submission)
+    plan = plan.model_copy(update={"limits": PlanLimits(input=100.0, travel=100.0)})
+    goal = find_goal("zeta", known := Knowledge.of(analysis), feedback=None)
+    refused = propose_candidates(known, limits=plan.limits, commands=frozenset("c"), goal=goal)
+    step, why = choose_recording(
+        analysis, None, plan, missing={"zeta": 0.1}, refused=refused, commands=frozenset("c")
+    )
+    assert step is not None
+    assert step.aim == "far"
+    assert "no input was above" in why
+
+
+def test_thinking_can_be_ended(tmp_path):
+    """What watches the progress raises; what is recorded stays."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
+
+    def enough(stage):
+        raise Stopped("by hand")
+
+    with pytest.raises(Stopped):
+        Exploration(
+            folder=tmp_path / "work",
+            record=session,
+            goal=ErrorGoal(),
+            seconds=90.0,
+            tell=silent,
+            progress=enough,
+        ).run()
+    assert len(load_submission(tmp_path / "work").experiments) == 3
+
+
+def test_the_command_explores_a_bench_over_its_line(tmp_path):
+    """From no folder at all to a submission with its diary, over a socket, faster than real.
+
+    Time bounds the first recordings too: the sweep fits and the steps do not.
+    """
+    folder = tmp_path / "work"
+    with emulator("--speed", "8", "--port", "socket://127.0.0.1:0", preset="throne-1dof") as bench:
+        done = cartlab_here(
+            "explore", folder, "--port", bench.address, "--until", "all 5%", "--time", "40s"
+        )
+    assert done.returncode == 1, done.stderr
+    assert (folder / NAME).exists()
+    assert [e.kind for e in load_submission(folder).experiments] == ["sweep"]
+    assert "allowed are up" in done.stderr
+
+
+@pytest.mark.slow
+def test_one_large_step_shows_what_acts_far_out(tmp_path):
+    """Carts that drag holds back do not reach the distance wanted: the step is made once."""
+    bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
+    session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
+    turns = Exploration(
+        folder=tmp_path / "work",
+        record=session,
+        goal=ErrorGoal(),
+        seconds=300.0,
+        tell=silent,
+    ).run()
+    assert [turn.verdict for turn in turns] == ["named"] * 2
+    assert turns[-1].recorded == ("step-3",)

@@ -1,0 +1,95 @@
+"""A recording in the few numbers in which a person says it."""
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.experiments.by_hand import WantedRecording, add_recording, make_recording
+from pipeline.experiments.plan_file import add_recordings, load_plan
+from pipeline.submission import load_submission
+from tests.helpers.acquisitions import sine, write_work
+
+
+@pytest.fixture
+def work(tmp_path):
+    """Two carts with a dwell planned, 0.5 V and 2.5 cm at most."""
+    return write_work(tmp_path / "work", [sine("sine-1", seconds=5, settle=7.0)])
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "expected"),
+    [
+        ("step", {"amplitude": -0.1}, {"wave": "square", "duration": 20.0, "settle": 7.0}),
+        (
+            "sweep",
+            {"amplitude": 0.1, "frequency": 0.5, "frequency_end": 5.0},
+            {"wave": "chirp", "duration": 20.0, "frequency_end": 5.0, "carts": (1, 2)},
+        ),
+        ("sine", {"amplitude": 0.1, "frequency": 0.7}, {"wave": "sine", "cycles": 14}),
+        ("decay", {"cart": 2}, {"carts": (2,), "release": 2, "duration": 20.0, "amplitude": 0.0}),
+    ],
+)
+def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbers, expected):
+    """Of each kind, with an id of its own and the rest of the plan's other runs."""
+    submission = load_submission(work)
+    plan = load_plan(submission)
+    wanted = make_recording(
+        WantedRecording(kind=kind, seconds=20.0, **numbers), plan=plan, submission=submission
+    )
+    new = add_recording(work, wanted)
+    assert load_plan(submission).recordings == (*plan.recordings, new)
+    assert {name: getattr(new, name) for name in expected} == expected
+    assert new.id not in {one.id for one in plan.recordings}
+
+
+@pytest.mark.parametrize(
+    ("kind", "numbers", "words"),
+    [
+        ("step", {"amplitude": 0.6}, "amplitude: expected at most the limit of 0.5 V, found 0.6"),
+        ("step", {"amplitude": 0.0}, "amplitude: 0 moves nothing"),
+        ("sine", {"amplitude": 0.1}, "frequency: expected 0.001 to 1000 Hz, found 0"),
+        ("sine", {"amplitude": 0.1, "frequency": 1e308}, "frequency: expected"),
+        ("sweep", {"amplitude": 0.1, "frequency": 1.0}, "to: expected 0.001 to 1000 Hz, found 0"),
+        ("sweep", {"amplitude": 0.1, "frequency": 1.0, "frequency_end": -3.0}, "to: expected"),
+        (
+            "sweep",
+            {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0},
+            "to: a chirp needs another",
+        ),
+        ("decay", {"cart": 1, "seconds": 1e-320}, "how long: expected 1 to 120 s"),
+        ("decay", {"cart": 1, "seconds": 121.0}, "how long: .* found 121"),
+        ("sine", {"amplitude": 0.1, "frequency": 0.005}, "frequency: expected at least 0.0083 Hz"),
+    ],
+)
+def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers, words):
+    """With what was expected; nothing is written."""
+    submission = load_submission(work)
+    plan = load_plan(submission)
+    given = {"seconds": 20.0, **numbers}
+    with pytest.raises(ConfigError, match=words):
+        make_recording(WantedRecording(kind=kind, **given), plan=plan, submission=submission)
+    assert load_plan(submission) == plan
+
+
+@pytest.mark.parametrize(
+    ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
+)
+def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
+    """100 s at 0.07 Hz are 7, which 64 bits make 7.000000000000001; none goes beyond 120 s."""
+    submission = load_submission(work)
+    made = make_recording(
+        WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),
+        plan=load_plan(submission),
+        submission=submission,
+    )
+    assert made.cycles == cycles
+
+
+def test_what_others_added_meanwhile_stays(work):
+    """Whoever extends the plan may have thought of it for minutes, on the plan as it was."""
+    old = load_plan(load_submission(work))
+    theirs = add_recording(work, sine("theirs", seconds=5))
+    new = [sine(name, seconds=4) for name in ("sine-1", "theirs")]
+    plan = add_recordings(work, new, otherwise=old)
+    assert plan == load_plan(load_submission(work))
+    assert plan.recordings[:-2] == (*old.recordings, theirs)
+    assert [one.id for one in plan.recordings[-2:]] == ["sine-2", "theirs-2"]

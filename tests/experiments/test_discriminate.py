@@ -1,0 +1,400 @@
+"""The recording that tells two explanations apart: where they differ most, fitted or not."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.discriminate import (
+    _candidates,
+    _left,
+    _predict,
+    _tell_apart,
+    propose_for,
+    with_proposal,
+)
+from pipeline.experiments.next_recordings import plan_next
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_file import load_plan, save_plan
+from pipeline.gap.explain import investigate
+from pipeline.gap.types import Contender, Gap, Trace, read_gap
+from pipeline.ingest.read import read_data
+from pipeline.json_files import json_text
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects import find_effect
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.report.gap.story import build_gap_document
+from pipeline.report.render.html import render_html
+from pipeline.resources import EXAMPLES
+from pipeline.results import Provenance
+from pipeline.set_up import Bench, Units
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.submission import Submission, load_submission
+from pipeline.words.progress import silent
+from pipeline.workflow import analyse
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.effects import make_term
+from tests.helpers.virtual import VirtualBench, VirtualSession
+from tests.report.test_gap import make_gap, two_cart_analysis
+
+BENCH = Bench(springs=(True, True, True))
+LIMITS = PlanLimits(input=0.5, travel=2.5)
+CHAIN = Chain(m=np.array([3e-4, 1.8e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.0, 0.127, 0.061]))
+
+
+def model(key: str, *, place: int, **values: float) -> AugmentedChain:
+    term = make_term(find_effect(key), place=place, values=values, chain=CHAIN)
+    return AugmentedChain(chain=CHAIN, terms=(term,))
+
+
+DRY = model("coulomb_friction", place=1, force=0.002)
+DRAG = model("quadratic_drag", place=1, coefficient=4e-5)
+STIFF = model("cubic_spring", place=2, coefficient=0.02)
+
+
+def disputed(*models: AugmentedChain) -> Gap:
+    """A gap that these models explain alike."""
+    t = np.arange(0.0, 4.0, 0.01)
+    y = simulate_augmented(models[0], t, np.full(t.size, 0.03))
+    traces = tuple(
+        Trace(
+            experiment="step-a", cart=i + 1, held_out=True, t=t, u=t * 0 + 0.03, measured=y[i],
+            baseline=y[i], final=y[i],
+        )
+        for i in range(2)
+    )  # fmt: skip
+    return Gap(
+        bench=BENCH,
+        verdict="ambiguous",
+        effects=(),
+        baseline=0.1,
+        final=0.01,
+        noise_floor=0.002,
+        repeatability=None,
+        by_record=(),
+        where=(),
+        next_experiment="Steps of three sizes.",
+        linear=AugmentedChain(chain=CHAIN),
+        model=models[0],
+        training=("step-a",),
+        held_out=("step-a",),
+        traces=traces,
+        contenders=tuple(
+            Contender(chain=one.chain, terms=one.terms, weight=1 / len(models)) for one in models
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def proposed() -> Gap:
+    return with_proposal(disputed(DRY, DRAG), limits=LIMITS)
+
+
+def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
+    """The two laws of friction differ by many noises in it; nothing passes the travel limit."""
+    found = proposed.proposal
+    assert found is not None
+    recording = Recording.model_validate({**found.recording, "carts": (1, 2)}, strict=True)
+    assert recording.aim == "gap"
+    assert abs(recording.amplitude) <= LIMITS.input
+    assert found.prediction is not None
+    assert np.abs(found.prediction.positions).max() <= LIMITS.travel
+    assert found.separation > 3
+    assert np.ptp(found.prediction.positions[:2], axis=0).max() > 0
+
+
+def test_what_the_parameters_can_take_up_is_no_difference():
+    """A model against itself with other parameters: of the difference next to nothing is left."""
+    heavier = replace(DRY, chain=replace(CHAIN, m=CHAIN.m * 1.002, k=CHAIN.k * 0.999))
+    gap = with_proposal(disputed(DRY, heavier), limits=LIMITS)
+    other = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
+    assert other.proposal is not None
+    assert gap.proposal is None or gap.proposal.separation < 0.05 * other.proposal.separation
+    J = np.random.default_rng(0).standard_normal((3, 2, 50))
+    difference = J[0].ravel() * 2 - J[2].ravel()
+    assert _left(difference, J, np.full(2, np.inf)) == pytest.approx(0.0, abs=1e-20)
+    # What the records before pin costs its change over its error, squared.
+    known = np.array([1e-6, np.inf])
+    assert _left(difference, J, known) == pytest.approx(_left(2 * J[0].ravel(), J[1:], known[1:]))
+    assert _left(difference, J, np.array([1e3, np.inf])) == pytest.approx((2 / 1e3) ** 2, rel=1e-3)
+
+
+def test_what_is_held_elsewhere_starts_there():
+    """A constant force shifts the carts, no more: another force or spring makes no transient."""
+    pushed = model("force_offset", place=1, force=0.004)
+    recording = Recording(
+        id="quiet", kind="step", carts=(1, 2), wave="square", amplitude=0.1, frequency=0.2, cycles=1
+    )
+    t = np.arange(0.0, 3.0, 5e-3)
+    x, by = _predict(pushed, t, np.zeros(t.size), recording, None)
+    assert np.abs(x[:, 0]).max() > 0.01
+    moved = np.ptp(by, axis=2).max(axis=1)
+    assert np.all(moved <= 5e-3 * np.abs(by).max())
+
+
+def test_another_dispute_gets_another_recording(proposed):
+    """Three explanations count by pairs; where nothing is disputed nothing is proposed."""
+    three = with_proposal(disputed(DRY, DRAG, STIFF), limits=LIMITS).proposal
+    assert three is not None
+    assert three.prediction is not None
+    assert three.prediction.positions.shape[0] == 3
+    assert with_proposal(disputed(DRY), limits=LIMITS).proposal is None
+
+
+def test_a_hopeless_contender_decides_nothing():
+    """One far beyond what is close has no say; the pair that decides is the one that is told."""
+    gap = disputed(DRY, DRAG, STIFF)
+    hopeless = replace(gap.contenders[2], weight=1e-12)
+    two = with_proposal(replace(gap, contenders=(*gap.contenders[:2], hopeless)), limits=LIMITS)
+    alone = with_proposal(disputed(DRY, DRAG), limits=LIMITS)
+    assert two.proposal is not None
+    assert alone.proposal is not None
+    assert two.proposal.recording == alone.proposal.recording
+    assert two.proposal.prediction is not None
+    assert two.proposal.prediction.pair == (0, 1)
+    assert two.proposal.separation == pytest.approx(alone.proposal.separation)
+    chosen = replace(gap.contenders[0], weight=1e-40)  # by held-out runs, against the criterion
+    against = with_proposal(replace(gap, contenders=(chosen, gap.contenders[1])), limits=LIMITS)
+    assert against.proposal is not None
+    assert against.proposal.recording == alone.proposal.recording
+    swapped = (*gap.contenders[1:2], hopeless, gap.contenders[0])
+    other = with_proposal(replace(gap, contenders=swapped), limits=LIMITS).proposal
+    assert other is not None
+    assert other.prediction is not None
+    assert other.prediction.pair == (0, 2)
+    assert other.separation == pytest.approx(alone.proposal.separation)
+
+
+def test_what_is_settled_has_little_say():
+    """Of two nearly settled pairs and an open one the recording is for the open one."""
+    late, lagged = (
+        model("input_delay", place=0, delay=2e-3),
+        model("actuator_lag", place=0, time_constant=2e-3),
+    )
+    gap = disputed(late, lagged, DRY)
+    weighed = (*gap.contenders[:2], replace(gap.contenders[2], weight=1e-8))
+    three = with_proposal(replace(gap, contenders=weighed), limits=LIMITS).proposal
+    two = with_proposal(disputed(late, lagged), limits=LIMITS).proposal
+    assert two is not None
+    assert three is not None
+    assert three.recording == two.recording
+
+
+def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
+    """No other candidate sets the two further apart."""
+    assert proposed.proposal is not None
+    known = np.full(6, np.inf)
+    sigma = np.full(2, proposed.noise_floor * 0.1)
+    told: list[float] = []
+    mine = 0.0
+    for recording, height in _candidates(CHAIN, LIMITS):
+        found = _tell_apart([DRY, DRAG], recording, height, sigma=sigma, pinned=known)
+        if found is not None and np.abs(found[3]).max() <= LIMITS.travel:
+            told.append(found[0][0, 1])
+            entry = recording.model_dump(mode="json", exclude_defaults=True)
+            if entry == proposed.proposal.recording:
+                mine = told[-1]
+    assert mine == max(told)
+
+
+def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
+    """A lag and a delay of a tenth of a millisecond differ too little in twelve seconds."""
+    late, lagged = (
+        model("input_delay", place=0, delay=1e-4),
+        model("actuator_lag", place=0, time_constant=1e-4),
+    )
+    short, long = (
+        Recording.model_validate_json(json.dumps(gap.proposal.recording))
+        for gap in (proposed, with_proposal(disputed(late, lagged), limits=LIMITS))
+        if gap.proposal is not None
+    )
+    assert short.duration < 20
+    assert 40 < long.duration < 60
+    assert long.resembles(long.model_copy(update={"cycles": long.cycles // 4}))
+
+
+def test_what_acts_on_the_input_alone_shows_in_no_decay():
+    """A lag and a delay part where there is an input, whatever bounces beside them."""
+    late, lagged = (
+        model("input_delay", place=0, delay=2e-3),
+        model("actuator_lag", place=0, time_constant=3e-3),
+    )
+    softer = replace(lagged, chain=replace(CHAIN, k=CHAIN.k * 0.9))
+    decay = next(r for r, _ in _candidates(CHAIN, LIMITS) if r.release)
+    for other, apart in ((softer, False), (DRY, True)):
+        told = _tell_apart(
+            [late, other], decay, 0.5, sigma=np.full(2, 1e-3), pinned=np.full(6, 1e-6)
+        )
+        assert told is not None
+        assert (told[0][0, 1] > 0) == apart
+
+
+def test_a_release_says_how_far_out_and_is_drawn_from_there():
+    """Each height is weighed by itself, and stands in the entry."""
+    heights = set()
+    for recording, height in _candidates(CHAIN, LIMITS):
+        assert (height > 0) == (recording.kind == "decay")
+        if recording.release:
+            heights.add(height)
+            assert f"{height:g} from the zero" in recording.note
+            unknown = np.full(6, np.inf)
+            told = _tell_apart(
+                [DRY, DRAG], recording, height, sigma=np.full(2, 1e-3), pinned=unknown
+            )
+            assert told is not None
+            predicted = told[3]
+            assert predicted[:, recording.release - 1, 0] == pytest.approx(height)
+    assert heights == {1.5, 0.5}
+
+
+@pytest.fixture
+def swept(tmp_path) -> Callable[[list[str]], Callable[..., Gap]]:
+    """What makes a sweep of one cart with hidden effects, and hands out what looks for its gap."""
+    folder = tmp_path / "work"
+
+    def sweep(hide: list[str]) -> Callable[..., Gap]:
+        hidden = prepare_bench(preset="throne-1dof", model=None, hide=hide)
+        bench = VirtualBench(hidden, seed=1)
+        VirtualSession(folder, bench)(["sweep"])
+
+        def look(gap: Gap | None = None) -> Gap:
+            submission = load_submission(folder)
+            if gap is not None and gap.proposal is not None:
+                proposed = Recording.model_validate_json(json.dumps(gap.proposal.recording))
+                bench.record(folder, [proposed], limits=load_plan(submission).limits)
+                submission = load_submission(folder)
+            return propose_for(
+                investigate(analyse(submission), progress=lambda _: None), submission
+            )
+
+        return look
+
+    return sweep
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_an_effect_that_the_held_out_end_does_not_show_is_found_all_the_same(swept):
+    """The end of a sweep, far beyond the resonance, says nothing of a spring: nor against it."""
+    slack = "slack_spring:spring=1,stiffness_change=0.0065,stretch=-0.55"
+    gap = swept(["input_delay:delay=0.00167", slack])()
+    found = {one.effect.key for one in gap.effects}
+    assert found & {"slack_spring", "cubic_spring"}
+    assert found & {"input_delay", "actuator_lag"}
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+def test_a_fast_sweep_tells_a_lag_from_a_delay(swept):
+    """Beside a cubic spring they are in dispute, until the cart is driven beyond its resonance."""
+    hide = ["actuator_lag:time_constant=0.0028", "cubic_spring:coefficient=0.00016"]
+    look = swept(hide)
+    gap = look()
+    assert gap.verdict == "ambiguous"
+    assert gap.proposal is not None
+    omega_n = np.abs(gap.model.chain.poles).max()
+    assert gap.proposal.recording["frequency"] > 2 * omega_n / (2 * np.pi)
+    then = look(gap)
+    assert then.verdict == "named"
+    assert {one.effect.key for one in then.effects} == {"actuator_lag", "cubic_spring"}
+
+
+def shipped(folder: Path) -> Submission:
+    """The shipped two carts in a folder of their own, with a plan of these limits."""
+    shutil.copytree(EXAMPLES / "two-cart", folder, dirs_exist_ok=True)
+    submission = load_submission(folder)
+    save_plan(Plan(limits=LIMITS), submission)
+    return submission
+
+
+def write_gap(gap: Gap, submission: Submission, **other: object) -> str:
+    """Write gap.json about the submission's data, with some entries of its own."""
+    system, files = submission.system, read_data(submission).files
+    bench = replace(BENCH, units=Units(position=system.position.unit, input=system.input.unit))
+    text = json_text(replace(gap, bench=bench, provenance=Provenance(files=files)))
+    text = json.dumps(json.loads(text) | other)
+    (submission.folder / "gap").mkdir(exist_ok=True)
+    (submission.folder / "gap" / "gap.json").write_text(text, encoding="utf-8")
+    return text
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"verdict": "perhaps"},
+        {"next_recording": {"id": "apart-square"}},
+        {"next_limits": {"input": 5.0, "travel": 2.5}},
+        {"next_limits": None},
+        {"provenance": {"version": "1", "files": {"data/step-1.csv": 64 * "0"}}},
+    ],
+)
+def test_a_proposal_of_other_data_or_limits_is_refused(proposed, tmp_path, other):
+    """So is a gap.json that is none: one line, exit 2, and the plan stays as it was."""
+    submission = shipped(tmp_path)
+    write_gap(proposed, submission, **other)
+    before = (tmp_path / "plan.toml").read_bytes()
+    done = cartlab_here("plan", tmp_path, "--next", 1, "--for", "gap")
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "again" in done.stderr
+    assert (tmp_path / "plan.toml").read_bytes() == before
+
+
+def test_nothing_is_added_that_would_break_the_plan(proposed, tmp_path):
+    """What passes a limit, or frees a cart that is not there, is not written."""
+    submission = shipped(tmp_path)
+    plan = load_plan(submission)
+    entry = Recording.model_validate_json(json.dumps(proposed.proposal.recording))
+    for spoilt in (
+        entry.model_copy(update={"amplitude": 0.6}),
+        entry.model_copy(update={"carts": (1, 2, 3)}),
+    ):
+        with pytest.raises(ConfigError):
+            save_plan(plan.model_copy(update={"recordings": (spoilt,)}), submission)
+        assert load_plan(submission) == plan
+
+
+def test_a_spoilt_plan_costs_the_proposal_only(tmp_path):
+    """The gap stays what it is, and a note says why nothing is proposed."""
+    submission = shipped(tmp_path)
+    assert propose_for(disputed(DRY, DRAG), submission).proposal is not None
+    (tmp_path / "plan.toml").write_text("version = [", encoding="utf-8")
+    gap = propose_for(disputed(DRY, DRAG), submission)
+    assert gap.proposal is None
+    assert "plan.toml" in gap.notes[-1]
+
+
+def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
+    """From gap.json to plan.toml, once, however often it is asked for; the page draws it."""
+    analysis = two_cart_analysis()
+    submission = shipped(tmp_path)
+    with pytest.raises(DataError, match="run `cartlab gap"):
+        plan_next(submission, n=1, goal="gap", commands=frozenset(), progress=silent)
+    text = write_gap(proposed, submission)
+    again = read_gap(text)
+    assert [one.terms[0].effect.key for one in again.contenders] == [
+        "coulomb_friction",
+        "quadratic_drag",
+    ]
+    for _ in range(2):
+        made = plan_next(submission, n=1, goal="gap", commands=frozenset(), progress=silent)
+        plan = load_plan(submission)
+        assert [r.id for r in plan.recordings if r.aim == "gap"] == [made.recordings[0].id]
+        assert made.separation == pytest.approx(proposed.proposal.separation)
+    with pytest.raises(ConfigError, match="expected --next 1"):
+        plan_next(submission, n=3, goal="gap", commands=frozenset(), progress=silent)
+    html = render_html(
+        build_gap_document(
+            replace(
+                make_gap("ambiguous"), proposal=proposed.proposal, contenders=proposed.contenders
+            ),
+            analysis,
+        )
+    )
+    assert "tells best which of these acts" in html

@@ -1,0 +1,298 @@
+"""Gains in counts do on a bench what they do in the submission's units, or are not sent."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from pipeline.arrays import Array
+from pipeline.bench.protocol.messages import Description, Start, StateGains, Wave, encode
+from pipeline.errors import DataError
+from pipeline.experiments.gains import (
+    CountScales,
+    bench_gains,
+    bench_scales,
+    controller_table,
+    propose_pid,
+)
+from pipeline.experiments.plan import PidLoop, PlanLimits, Recording, StateLoop
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import (
+    LoopSetup,
+    Pid,
+    StateFeedback,
+    discretise,
+    simulate_loop,
+)
+from pipeline.resources import EXAMPLES
+from pipeline.results import Analysis, FeedbackDesign
+from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.submission import Submission, load_submission
+from pipeline.workflow import analyse
+
+COUNT = 0.00227  # cm
+DUTY = 0.5 / 4096  # V
+BENCH = Description(
+    name="bench",
+    encoders=2,
+    carts=2,
+    commands=frozenset("cfhkms"),
+    input_per_count=DUTY,
+    position_unit="cm",
+    position_per_count=COUNT,
+)
+LIMITS = PlanLimits(input=0.5, travel=2.5)
+SECONDS = 2.0
+
+
+@pytest.fixture(scope="module", params=["one-cart", "two-cart"])
+def identified(request) -> tuple[Submission, Analysis]:
+    """A shipped example, and what its decays, steps and sweep tell."""
+    submission = load_submission(EXAMPLES / request.param)
+    kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
+    submission = submission.model_copy(update={"experiments": kept})
+    return submission, analyse(submission)
+
+
+def closing(loop, *, carts=2, amplitude=1.0) -> Recording:
+    return Recording(
+        id="control",
+        kind="closed_loop",
+        carts=tuple(range(1, carts + 1)),
+        wave="square",
+        amplitude=amplitude,
+        frequency=0.5 / SECONDS,
+        controller=loop,
+    )
+
+
+def gains_of(identified, loop, *, limits=LIMITS, **changes):
+    submission, analysis = identified
+    return bench_gains(
+        closing(loop, carts=analysis.bench.n, **changes),
+        submission=submission,
+        analysis=analysis,
+        bench=BENCH,
+        limits=limits,
+    )
+
+
+def design_of(analysis: Analysis) -> FeedbackDesign:
+    assert analysis.feedback is not None
+    return analysis.feedback
+
+
+def state_gains_of(identified, loop) -> StateGains:
+    gains = gains_of(identified, loop)
+    assert isinstance(gains, StateGains)
+    return gains
+
+
+def on_the_bench(chain: Chain | None, gains, *, encoder: int) -> tuple[Array, Array]:
+    """Drive the chain by the bench's own controller; positions (n_carts, n) and inputs (n,)."""
+    assert chain is not None
+    core, period = ReferenceCore(BENCH), BENCH.period
+    core.receive(encode(gains))
+    step = Start(
+        wave=Wave.SQUARE, encoder=encoder, frequency=0.5 / SECONDS, amplitude=round(1.0 / COUNT)
+    )
+    core.receive(encode(step))
+    phi, gamma = discretise(chain, period)
+    x, ticks = np.zeros(2 * chain.n), round(2 * SECONDS / period)
+    positions, inputs = np.zeros((chain.n, ticks)), np.zeros(ticks)
+    for tick in range(ticks):
+        counts = np.rint(x[0::2] / COUNT).astype(int).tolist()
+        duty = core.tick([*counts, *[0] * (BENCH.encoders - chain.n)], stamp=tick, now=tick)
+        positions[:, tick], inputs[tick] = x[0::2], duty * DUTY
+        x = phi @ x + gamma * duty * DUTY
+    return positions, inputs
+
+
+def simulated(chain: Chain | None, law, *, delay: int) -> tuple[Array, Array]:
+    assert chain is not None
+    t = BENCH.period * np.arange(round(2 * SECONDS / BENCH.period), dtype=np.float64)
+    run = simulate_loop(
+        chain,
+        law,
+        t=t,
+        reference=np.where(t >= SECONDS, round(1.0 / COUNT) * COUNT, 0.0),
+        setup=LoopSetup(sample_time=BENCH.period, delay=delay, encoder_step=COUNT, input_limit=0.5),
+    )
+    return run.x, run.u
+
+
+def test_the_designed_loop_runs_on_the_bench_as_simulated(identified):
+    """Counts in, duty out: the carts go where the same gains in V and cm take them."""
+    _, analysis = identified
+    design, chain = design_of(analysis), analysis.chain
+    gains = state_gains_of(identified, StateLoop(cart=analysis.bench.n))
+    assert len(gains.gains) == 2 * BENCH.encoders
+
+    x, u = on_the_bench(chain, gains, encoder=1)
+
+    law = StateFeedback(gains=design.gains, prefilter=design.prefilter)
+    expected_x, expected_u = simulated(chain, law, delay=1)
+    # Whole duty counts are off by half a count each, 0.06 mV at up to 29 cm/V; and that may make
+    # an encoder flicker one tick earlier, which the velocity gain turns into a pulse of a tick.
+    assert_allclose(x, expected_x, atol=2 * COUNT)
+    velocity_gain = np.abs(gains.gains[1::2]).max()
+    assert_allclose(u, expected_u, atol=DUTY * (2 + velocity_gain * 2 / BENCH.period))
+    assert abs(u - expected_u).mean() < 0.05 * abs(expected_u).max()
+    assert abs(x[analysis.bench.n - 1, -1] - 1.0) < 0.02
+
+
+def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
+    """Duty counts of counts: 0.05 is 2.7 mV/cm here; the plant model in V and cm agrees."""
+    _, analysis = identified
+    loop = PidLoop(kp=0.05, ki=0.1, kd=0.005)
+    gains = gains_of(identified, loop)
+
+    x, u = on_the_bench(analysis.chain, gains, encoder=1)
+
+    law = Pid(kp=0.05, ki=0.1, kd=0.005, scale=DUTY / COUNT, cart=1)
+    expected_x, expected_u = simulated(analysis.chain, law, delay=0)
+    assert_allclose(x, expected_x, atol=3 * COUNT)
+    assert abs(u - expected_u).mean() < 0.05 * abs(expected_u).max()
+
+
+def test_the_submission_is_told_what_ran(identified):
+    """The table holds the design again, in V and cm; a PID comes with the volts of a count."""
+    submission, analysis = identified
+    scales = bench_scales(submission, bench=BENCH, analysis=analysis)
+    assert scales == CountScales(input=DUTY, position=COUNT)
+    sent = gains_of(identified, StateLoop(cart=analysis.bench.n))
+    table = controller_table(sent, cart=analysis.bench.n, scales=scales, carts=analysis.bench.n)
+    assert table["type"] == "state_feedback"
+    assert_allclose(table["gains"], design_of(analysis).gains, rtol=1e-5)  # six digits
+    assert_allclose(table["prefilter"], design_of(analysis).prefilter, rtol=1e-5)
+    pid = gains_of(identified, PidLoop(kp=0.05))
+    assert controller_table(pid, cart=1, scales=scales, carts=2) == {
+        "type": "pid", "kp": 0.05, "ki": 0.0, "kd": 0.0, "scale": DUTY, "cart": 1,
+    }  # fmt: skip
+
+
+def test_an_input_that_pushes_the_other_way_turns_the_gains_round(identified):
+    """The design is for a positive push; where the records show the opposite, duties turn."""
+    submission, analysis = identified
+    turned = tuple(replace(r, input_scale=-r.input_scale) for r in analysis.records)
+    reversed_ = replace(analysis, records=turned)
+    loop = StateLoop(cart=analysis.bench.n)
+    straight = state_gains_of(identified, loop)
+    back = state_gains_of((submission, reversed_), loop)
+    assert_allclose(back.gains, -np.array(straight.gains))
+    assert back.prefilter == -straight.prefilter
+    with pytest.raises(DataError, match="unstable"):
+        gains_of((submission, reversed_), PidLoop(kp=0.5, ki=10.0))
+
+
+def test_what_the_submission_states_wins_over_what_the_bench_says(identified):
+    """`per_count` of the submission scales its records, so it scales its gains."""
+    submission, analysis = identified
+    stated = submission.system.input.model_copy(update={"per_count": 2 * DUTY})
+    system = submission.system.model_copy(update={"input": stated})
+    other = submission.model_copy(update={"system": system})
+    assert bench_scales(other, bench=BENCH, analysis=analysis).input == 2 * DUTY
+
+
+@pytest.mark.parametrize(
+    ("loop", "limits", "amplitude", "message"),
+    [
+        (PidLoop(kp=0.1, kd=20.0), LIMITS, 1.0, "the loop is unstable"),
+        (PidLoop(kp=0.01, kd=-0.05), LIMITS, 1.0, "the loop is unstable"),
+        (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "takes an input of"),
+        (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "takes an input of .* is 0.01"),
+        (StateLoop(), PlanLimits(input=0.5, travel=0.9), 1.0, "moves a cart by 1.* travel limit"),
+        (StateLoop(), LIMITS, 40.0, "(moves a cart|takes an input|would overshoot)"),
+        (StateLoop(gains=(0.0, -1.0), prefilter=1.0), LIMITS, 1.0, "unstable"),
+        (StateLoop(cart=2), LIMITS, 1.0, "designed for cart 1, the plan has cart 2"),
+    ],
+)
+def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
+    """Unstable, past a limit, or not the designed one: one clear line, and nothing is sent."""
+    submission = load_submission(EXAMPLES / "one-cart")
+    kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
+    submission = submission.model_copy(update={"experiments": kept})
+    with pytest.raises(DataError, match=message) as caught:
+        gains_of((submission, analyse(submission)), loop, limits=limits, amplitude=amplitude)
+    assert "control: " not in str(caught.value)  # the name that it is told with
+
+
+def test_a_slow_bench_that_misses_the_goal_is_refused(identified):
+    """At a tenth of the rate the delay eats the design; the message tells what to set."""
+    submission, analysis = identified
+    slow = replace(BENCH, period=0.05)
+    with pytest.raises(DataError, match=r"set design.sample_time = 0\.05 in submission.toml"):
+        bench_gains(
+            closing(StateLoop(cart=analysis.bench.n), carts=analysis.bench.n),
+            submission=submission,
+            analysis=analysis,
+            bench=slow,
+            limits=LIMITS,
+        )
+
+
+@pytest.mark.parametrize(
+    ("kd", "stable"), [(-0.02, False), (-0.005, True), (0.0, True), (20.0, False)]
+)
+def test_a_pid_is_refused_where_it_swings_up(identified, kd, stable):
+    """What is sent dies down from a step within 40 s; what is refused swings up."""
+    _, analysis = identified
+    assert analysis.chain is not None
+    loop = PidLoop(kp=0.02, kd=kd)
+    if stable:
+        gains_of(identified, loop, amplitude=0.01)
+    else:
+        with pytest.raises(DataError, match="unstable"):
+            gains_of(identified, loop, amplitude=0.01)
+    law = Pid(kp=0.02, kd=kd, scale=DUTY / COUNT)
+    with np.errstate(over="ignore", invalid="ignore"):
+        t = np.arange(0, 40, BENCH.period)
+        x = simulate_loop(
+            analysis.chain, law, t=t, reference=1.0, setup=LoopSetup(delay=0, input_limit=1e9)
+        ).x
+    early, late = np.ptp(x[0, : t.size // 4]), np.ptp(x[0, -t.size // 4 :])
+    assert (late < early) if stable else (late > 1000)
+
+
+@pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
+def test_a_proposed_pid_brings_cart_1_to_the_level(example):
+    """On the carts it was made for: within 2 % of 1 cm after 5 s, no further than 1.1 cm."""
+    submission = load_submission(EXAMPLES / example)
+    kept = tuple(e for e in submission.experiments if e.kind in ("step", "sweep"))
+    submission = submission.model_copy(update={"experiments": kept})
+    analysis = analyse(submission)
+    bench = replace(BENCH, encoders=max(2, analysis.bench.n), carts=analysis.bench.n)
+    recording = closing(None, carts=analysis.bench.n)
+    pid = propose_pid(
+        recording, submission=submission, analysis=analysis, bench=bench, limits=LIMITS
+    )
+    law = Pid(kp=pid.kp, ki=pid.ki, kd=pid.kd, scale=DUTY / COUNT)
+    assert analysis.chain is not None
+    t = np.arange(0, 5, BENCH.period)
+    run = simulate_loop(
+        analysis.chain,
+        law,
+        t=t,
+        reference=1.0,
+        setup=LoopSetup(delay=0, encoder_step=COUNT, input_limit=0.5),
+    )
+    assert abs(run.x[0, -1] - 1.0) < 0.02
+    assert run.x[0].max() < 1.1
+    weak = PlanLimits(input=0.001, travel=2.5)
+    with pytest.raises(DataError, match=r"no PID is proposed: .*input"):
+        propose_pid(recording, submission=submission, analysis=analysis, bench=bench, limits=weak)
+
+
+def test_a_scale_that_nobody_states_is_asked_for(identified):
+    """Centimetres of the submission and counts of the bench do not go together by themselves."""
+    submission, analysis = identified
+    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
+        bench_scales(submission, bench=replace(BENCH, position_unit="count"), analysis=analysis)
+
+
+def test_without_a_model_no_loop_is_closed(identified):
+    """Carts that are not identified get no gains."""
+    submission, analysis = identified
+    with pytest.raises(DataError, match="identified carts only"):
+        gains_of((submission, replace(analysis, fit=None)), StateLoop())

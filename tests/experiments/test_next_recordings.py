@@ -1,0 +1,422 @@
+"""The next experiment: what a record will tell, which are chosen, what is promised and kept."""
+
+import itertools
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.bench.protocol.messages import (
+    EXTENSIONS,
+    Description,
+    Start,
+    Tone,
+    Wave,
+    encode,
+    parse_reading,
+)
+from pipeline.bench.protocol.waves import target_at
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.candidates import propose_candidates
+from pipeline.experiments.goal import Goal, choose, find_goal
+from pipeline.experiments.information import Knowledge
+from pipeline.experiments.multisine import (
+    low_peak_phases,
+    optimal_tones,
+    schroeder_phases,
+)
+from pipeline.experiments.next_recordings import STATISTICAL, _doubt, choose_next, tells_nothing
+from pipeline.experiments.plan import Plan, PlanLimits, Recording
+from pipeline.experiments.plan_file import load_plan
+from pipeline.experiments.propose import extend_plan, propose_plan, renamed
+from pipeline.experiments.weigh import weigh
+from pipeline.plant.limits import CALIBRATION
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
+from pipeline.resources import EXAMPLES
+from pipeline.simulated.emulator.core import ReferenceCore
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.submission import load_submission
+from pipeline.workflow import analyse
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.examples import analysed
+from tests.helpers.virtual import VirtualBench, new_folder
+
+LIMITS = PlanLimits(input=0.5, travel=2.5)
+COMMANDS = frozenset("cm")
+
+
+@pytest.fixture(scope="module")
+def analysis():
+    """The shipped two carts as steps and a sweep tell of them."""
+    submission = load_submission(EXAMPLES / "two-cart")
+    kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
+    return analyse(submission.model_copy(update={"experiments": kept}))
+
+
+@pytest.fixture(scope="module")
+def known(analysis):
+    return Knowledge.of(analysis)
+
+
+def multisine(known: Knowledge, goal: Goal) -> Recording:
+    tones = optimal_tones(known, base=0.1, seconds=20.0, travel=2.0, goal=goal)
+    return Recording(
+        id="multisine-1",
+        kind="sweep",
+        carts=(1, 2),
+        wave="multisine",
+        amplitude=0.1,
+        frequency=0.1,
+        cycles=2,
+        tones=tones,
+    )
+
+
+# ------------------------------------------------------------------- what a record tells
+
+
+def test_what_is_known_is_what_the_fit_says(known, analysis):
+    """H and S give back the fit's standard error of every named parameter."""
+    half = known.by_parameters() @ np.linalg.inv(known.told[0])
+    std = np.sqrt(np.diag(half @ known.told[1] @ half.T))
+    fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
+    np.testing.assert_allclose(std, fitted, rtol=1e-3)  # differences of one step either way
+
+
+@pytest.mark.slow
+def test_what_is_promised_is_kept(tmp_path):
+    """On the emulator's carts the fit afterwards states what was promised, and the truth is there.
+
+    A stated error is itself uncertain by some 20 %, and the worst of ten by more.
+    """
+    bench = VirtualBench(prepare_bench(preset="throne-2dof", model=None, hide=[]), seed=3)
+    n = bench.description.carts
+    folder = new_folder(tmp_path / "work", bench, springs=[True] * (n + 1))
+    plan = propose_plan(load_submission(folder), bench=bench.description)
+    sweep = [r for r in plan.recordings if r.kind == "sweep"]
+    bench.record(folder, sweep, limits=plan.limits)
+    before = analyse(load_submission(folder))
+    alone = Plan(limits=plan.limits)  # the plan's open steps are not recorded here
+    chosen = choose_next(before, alone, n=1, goal="worst", commands=EXTENSIONS)
+    recordings = renamed(chosen.recordings, taken=["sweep", "sweep-1"])
+    bench.record(folder, recordings, limits=plan.limits)
+
+    fit = analyse(load_submission(folder)).fit
+    assert fit is not None
+    error = max((e.std or 0.0) / e.value for e in fit.parameters.values())
+    assert chosen.errors[1] < 0.5 * chosen.errors[0]
+    assert error == pytest.approx(chosen.errors[1], rel=0.35)
+    true = bench.carts._bench.chain.parameters()
+    off = [abs(e.value - true[name]) / (e.std or np.inf) for name, e in fit.parameters.items()]
+    assert max(off) < 4
+
+
+def test_steady_sines_tell_what_a_long_record_does(known):
+    """Twice the time, twice as much; and so much more does a record tell that is so much longer."""
+    omega = known.chain.omega_carts
+    once = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=10.0)
+    twice = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=20.0)
+    np.testing.assert_allclose(twice, 2 * once, rtol=1e-12)
+    hertz = float(omega[0] / (2 * np.pi))
+    short, long = (
+        known.of_recording(
+            Recording(
+                id="x",
+                kind="sweep",
+                carts=(1, 2),
+                wave="multisine",
+                amplitude=0.05,
+                frequency=hertz,
+                cycles=cycles,
+                tones=((1, 1.0, 0.0),),
+            )
+        )[0]
+        for cycles in (100, 200)
+    )
+    expected = known.of_lines(omega[:1], amplitude=np.full(1, 0.05), seconds=100 / hertz)[0, 0]
+    np.testing.assert_allclose(np.diag(long - short), np.diag(expected), rtol=0.02)
+
+
+# ------------------------------------------------------------------------ which are chosen
+
+
+@pytest.mark.parametrize("mean", ["largest", "root mean square", "volume"])
+def test_the_exchange_finds_the_best_of_all_sets(mean):
+    """As good as the best of all 220 choices of three among ten, for every criterion."""
+    rng = np.random.default_rng(5)
+    J = rng.standard_normal((10, 3, 4))
+    H = np.einsum("cjp,cjq->cpq", J, J)
+    candidates, told = np.stack([H, H], axis=1), 1e-3 * np.tile(np.eye(4), (2, 1, 1))
+    goal = Goal(name="x", words="x", rows=np.eye(4), mean=mean)
+    chosen = choose(candidates, told, n=3, goal=goal)
+    sets = itertools.combinations_with_replacement(range(10), 3)
+    best = min(float(goal.of(told + candidates[list(one)].sum(axis=0))) for one in sets)
+    assert float(goal.of(told + candidates[list(chosen)].sum(axis=0))) <= 1.02 * best
+
+
+def test_the_goals_are_errors_of_what_they_name(known, analysis):
+    """One parameter's is its standard error; the worst is the largest of them all."""
+    fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
+    for name in ("zeta_2", "K_1"):
+        goal = find_goal(name, known, feedback=None)
+        assert float(goal.of(known.told)) == pytest.approx(fitted[name], rel=1e-3)
+    worst = find_goal("worst", known, feedback=None)
+    assert float(worst.of(known.told)) == pytest.approx(max(fitted.values()), rel=1e-3)
+    assert list(fitted)[worst.worst(known.told)] == max(fitted, key=lambda name: fitted[name])
+    with pytest.raises(ConfigError, match="did you mean 'zeta_2'"):
+        find_goal("zeta2", known, feedback=None)
+
+
+def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
+    """As many carts drawn from the covariance overshoot under the same controller."""
+    feedback = analysis.feedback
+    goal = find_goal("design", known, feedback=feedback)
+    covariance = np.linalg.inv(known.told[0]) @ known.told[1] @ np.linalg.inv(known.told[0])
+    rng, peaks, widened = np.random.default_rng(1), [], 30.0  # errors so small hide in rounding
+    P, p = known.parametrisation, known.parametrisation.physical(known.chain)
+    for change in rng.multivariate_normal(np.zeros(p.size), widened**2 * covariance, size=300):
+        loop = simulate_loop(
+            P.chain(p * (1 + change)),
+            feedback.controller(known.chain),
+            t=feedback.t,
+            reference=np.full(feedback.t.size, feedback.reference),
+            setup=LoopSetup(sample_time=feedback.sample_time),
+        )
+        peaks.append(loop.x[feedback.cart - 1].max() / feedback.reference)
+    # 300 draws tell a spread to 4 %; the rest is what is not linear.
+    assert np.std(peaks) / widened == pytest.approx(float(goal.of(known.told)), rel=0.2)
+
+
+def test_each_choice_serves_its_own_goal(analysis):
+    """What is chosen for one parameter leaves it no worse known than what is chosen for another."""
+    plan = Plan(limits=LIMITS)
+    left = {}
+    for goal in ("K_1", "zeta_2"):
+        found = choose_next(analysis, plan, n=1, goal=goal, commands=COMMANDS)
+        (left[goal],) = found.recordings
+        assert found.recordings[0].aim == goal
+    known = Knowledge.of(analysis)
+    for goal, other in (("K_1", "zeta_2"), ("zeta_2", "K_1")):
+        of = find_goal(goal, known, feedback=None).of
+        own, theirs = (float(of(known.told + known.of_recording(left[g]))) for g in (goal, other))
+        assert own < theirs
+
+
+def test_no_choice_passes_a_limit(analysis):
+    """Simulated from rest on the carts as identified, travel and input stay inside."""
+    for commands in (frozenset(), frozenset("c"), COMMANDS):
+        found = choose_next(analysis, Plan(limits=LIMITS), n=3, goal="mean", commands=commands)
+        assert {r.wave for r in found.recordings} <= {"square", "chirp", "multisine"}
+        assert ("m" in commands) or all(r.wave != "multisine" for r in found.recordings)
+        known = Knowledge.of(analysis)
+        for recording in found.recordings:
+            t, u = known.input(recording)
+            x = simulate_linear(known.chain, t, recording.amplitude * u)
+            assert np.abs(x).max() <= 0.8 * LIMITS.travel
+            assert abs(recording.amplitude) <= LIMITS.input
+        assert list(found.errors) == sorted(found.errors, reverse=True)
+
+
+def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
+    """Theirs alone, its own alone; the one is what `choose_next` promises of an open recording."""
+    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
+                     frequency=0.4, cycles=8)  # fmt: skip
+    plan = Plan(limits=LIMITS)
+    found = weigh(analysis, mine, plan, goal="zeta_2", commands=COMMANDS)
+    alone = choose_next(analysis, plan, n=1, goal="zeta_2", commands=COMMANDS)
+    assert (found.now, found.best) == (alone.now, alone.errors[-1])
+    assert found.chosen == alone.recordings[0]
+    assert found.now > found.proposed > found.best
+    error = find_goal("zeta_2", known, feedback=None).of
+    assert found.proposed == pytest.approx(error(known.told + known.of_recording(mine)))
+    assert not found.why
+
+
+def test_what_makes_the_fit_know_worse_says_so(analysis):
+    """Minutes of rest whose rounding does not average out weigh more than what they tell."""
+    mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
+                     frequency=2 / 120, cycles=4)  # fmt: skip
+    found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
+    assert found.proposed > 1.01 * found.now
+    assert "know it worse" in found.why
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "this is a decay"),
+        ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, and this is a dwell"),
+        ({"carts": (1,)}, "all of them free"),
+        ({"amplitude": 0.5}, "stopped at the travel limit: an amplitude up to"),
+    ],
+)
+def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
+    """It is of another kind than the fit takes, holds a cart, or goes too far."""
+    mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
+                     frequency=0.4, cycles=8)  # fmt: skip
+    assert tells_nothing(mine, known, limits=LIMITS) == ""
+    assert words in tells_nothing(mine.model_copy(update=change), known, limits=LIMITS)
+
+
+def test_where_dwells_identify_dwells_are_chosen():
+    """The carts are then fitted to dwells alone: another sweep would change nothing."""
+    analysis = analysed("two-cart")
+    found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
+    assert {r.kind for r in found.recordings} == {"sine"}
+    assert found.errors[2] < found.errors[1] < found.errors[0]
+
+
+def test_a_new_dwell_lies_as_far_off_as_those_before():
+    """Where friction, say, puts every point off the carts, one more tells what they tell."""
+    known = Knowledge.of(analysed("two-cart"))
+    dwell = Recording(
+        id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
+        cycles=40,
+    )  # fmt: skip
+    exact, off = (replace(known, misfit=share).of_recording(dwell)[0] for share in (0.0, 0.1))
+    twice = replace(known, misfit=0.2).of_recording(dwell)[0]
+    assert np.trace(off) < 0.1 * np.trace(exact)
+    assert off == pytest.approx(4 * twice, rel=0.05, abs=1e-3 * np.abs(off).max())
+
+
+def test_carts_that_hardly_settle_get_no_dwells():
+    """A transient of a slow mode would pass for a steady state: it is said, and none is chosen."""
+    known = Knowledge.of(analysed("two-cart"))
+    slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
+    goal = find_goal("worst", slow, feedback=None)
+    with pytest.raises(DataError, match="do not settle"):
+        propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
+
+
+def test_a_promise_below_any_calibration_says_so(analysis):
+    """And the worst parameter is named before and after, where that is another."""
+    found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
+    assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
+    assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
+    known = Knowledge.of(analysis)
+    worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())
+    after = known.told + known.of_recording(found.recordings[0])
+    assert names[worst.worst(known.told)] in found.words
+    assert names[worst.worst(after)] in found.words
+
+
+# --------------------------------------------------------------------------- multisines
+
+
+def test_clipped_phases_keep_the_swing_low():
+    """Of twelve lines on three carts the motion peaks lower than for the best of 500 by chance."""
+    lines = np.arange(10, 70, 5)
+    omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
+    G = PRESETS["throne-3dof"].frequency_response(omega)
+    size = 1 / np.abs(G).max(axis=0)
+    turning = np.exp(1j * omega[:, None] * np.linspace(0, 10, 2048, endpoint=False))
+
+    def peak(phases) -> float:
+        return float(np.abs(((size * G * np.exp(1j * phases)) @ turning).imag).max())
+
+    found, rng = peak(low_peak_phases(lines, size, G)), np.random.default_rng(0)
+    assert found < min(peak(rng.uniform(0, 2 * np.pi, 12)) for _ in range(500))
+    assert found < 0.9 * peak(schroeder_phases(np.ones(12)))
+
+
+def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
+    """Whatever the goal, the sum of shares as rounded for the file reaches one."""
+    for name in ("mean", "K_1"):
+        recording = multisine(known, find_goal(name, known, feedback=None))
+        h, share, phase = np.array(recording.tones).T[:, :, None]
+        u = (share * np.sin(2 * np.pi * h * np.linspace(0, 1, 8192) + phase)).sum(axis=0)
+        assert np.abs(u).max() == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_bench_adds_the_tones_it_is_told():
+    """The sum of the last ones told, forgotten on harmonic zero and on a reset."""
+    core = ReferenceCore(Description(name="x", encoders=2, carts=2, commands=EXTENSIONS))
+    tones = (Tone(harmonic=3, share=0.5, phase=0.25), Tone(harmonic=7, share=-0.25, phase=1.0))
+    start = Start(wave=Wave.MULTISINE, frequency=2.0, amplitude=1000, cycles=2)
+    told = [Tone(harmonic=5, share=1.0), Tone(harmonic=0), *tones, start]
+    core.receive(b"".join(map(encode, told)))
+    for k in range(1001):
+        core.tick((0, 0), stamp=k, now=k)
+    lines = [parse_reading(line) for line in core.take().splitlines()]
+    t = 1e-3 * np.arange(1000)
+    exact = 500 * np.sin(2 * np.pi * 6 * t + 0.25) - 250 * np.sin(2 * np.pi * 14 * t + 1.0)
+    np.testing.assert_allclose([line.target for line in lines if line], exact, atol=0.5 + 1e-9)
+    assert target_at(start, 0.1, tones=tones) == round(exact[100])
+    core.receive(b"z;" + encode(start))
+    core.tick((0, 0), stamp=1001, now=1001)
+    core.tick((0, 0), stamp=1002, now=1002)
+    assert b":0:0:1" in core.take()
+
+
+# ------------------------------------------------------------------------ the command
+
+
+@pytest.fixture
+def work(tmp_path):
+    """The shipped one-cart submission without its dwells, in a folder of its own."""
+    source = load_submission(EXAMPLES / "one-cart")
+    text = (EXAMPLES / "one-cart" / "submission.toml").read_text(encoding="utf-8")
+    head, *tables = text.split("[[experiments]]")
+    kept = [t for t in tables if 'kind = "sweep"' in t]
+    (tmp_path / "submission.toml").write_text(
+        head + "[[experiments]]" + "[[experiments]]".join(kept), encoding="utf-8"
+    )
+    for experiment in source.experiments:
+        if experiment.kind == "sweep":
+            there = tmp_path / experiment.file
+            there.parent.mkdir(exist_ok=True)
+            there.write_bytes((source.folder / experiment.file).read_bytes())
+    return tmp_path
+
+
+def test_the_command_adds_what_it_chose_to_the_plan(work):
+    """What it promises is said, in the plan, and in JSON; a plan of choices gets no dwells."""
+    done = cartlab_here("plan", work, "--next", 2, "--for", "zeta", "--json")
+    data = json.loads(done.stdout)
+    assert data["next"]["errors"] == sorted(data["next"]["errors"], reverse=True)
+    assert "ζ: ± " in done.stderr
+    submission = load_submission(work)
+    plan = load_plan(submission)
+    chosen = [r for r in plan.recordings if r.aim]
+    assert len(chosen) == 2
+    assert {r.aim for r in chosen} == {"zeta"}
+    assert [r["id"] for r in data["recordings"] if r["new"]] == [r.id for r in chosen]
+    assert extend_plan(plan, submission) == plan
+    again = json.loads(cartlab_here("plan", work, "--next", 1, "--for", "zeta", "--json").stdout)
+    planned = again["next"]["planned"]
+    assert set(planned) >= {r.id for r in chosen}
+    # What was promised for the first of two is what it would leave by itself.
+    assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
+    # What is planned is not promised twice.
+    assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
+    assert again["next"]["now"] == pytest.approx(data["next"]["now"], rel=1e-9)
+
+
+def test_what_is_written_is_counted(work):
+    """With the recordings that every bench begins with, where there was no plan yet."""
+    done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
+    usual = len(propose_plan(load_submission(work)).recordings)
+    assert f"the {usual} recordings that a bench begins with, and 2 chosen beside" in done.stderr
+    done = cartlab_here("plan", work, "--next", 1, "--for", "zeta")
+    assert "plan.toml: 1 recording added" in done.stderr
+    assert ", 1 new (+); " in done.stdout
+    assert done.stdout.count("\n + ") == 1
+
+
+def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
+    """They count noise, and tell nothing where more than noise is left."""
+    for chi_square, doubted in ((556.0, True), (1.0, False)):
+        fit = replace(analysis.fit, chi_square_per_dof=chi_square)
+        assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted
+
+
+@pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
+def test_what_cannot_be_chosen_is_one_line(work, words, monkeypatch):
+    """A goal without a number, a name that is none: before the data are asked."""
+    monkeypatch.setattr("pipeline.experiments.next_recordings.analyse", None)
+    done = cartlab_here("plan", work, *words)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1

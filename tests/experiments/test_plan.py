@@ -1,0 +1,473 @@
+"""What is proposed for a session at the bench, and the file it stands in."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.bench.protocol.messages import FULL_SCALE, Description, Start, Wave
+from pipeline.bench.protocol.waves import target_at
+from pipeline.cli import main
+from pipeline.errors import ConfigError, DataError
+from pipeline.experiments.by_hand import add_recording
+from pipeline.experiments.plan import PidLoop, Plan, PlanLimits, Recording, StateLoop
+from pipeline.experiments.plan_file import load_plan, plan_path, plan_text, save_plan
+from pipeline.experiments.propose import AIM, extend_plan, let_go, make_plan, propose_plan
+from pipeline.plant.linear.chain import quadratic_factors
+from pipeline.plant.linear.dwells import SETTLED_DWELL, settling_wait
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.resources import EXAMPLES
+from pipeline.submission import (
+    Design,
+    InputScale,
+    PositionScale,
+    Submission,
+    System,
+    load_submission,
+    new_submission,
+)
+from tests.helpers.desks import a_recorded_cart
+
+EXAMPLE_OF = {"throne-1dof": "one-cart", "throne-2dof": "two-cart", "throne-3dof": "three-cart"}
+STOCK = Description(name="stock", encoders=2, carts=2)
+FIRST = ("decay", "step", "sweep")
+
+
+def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
+    """A submission of which nothing is recorded yet."""
+    springs = (True,) * (carts + 1) if springs is None else springs
+    system = System(
+        carts=carts, springs=springs, **{"position": PositionScale(unit="cm"), **system}
+    )
+    return Submission(version=1, system=system, design=design)
+
+
+def recorded(example: str, *kinds: str) -> Submission:
+    """A shipped example with some kinds of its runs only."""
+    submission = load_submission(EXAMPLES / example)
+    kept = tuple(e for e in submission.experiments if e.kind in kinds)
+    return submission.model_copy(update={"experiments": kept})
+
+
+def of_kind(plan: Plan, kind: str) -> list[Recording]:
+    return [recording for recording in plan.recordings if recording.kind == kind]
+
+
+# ------------------------------------------------------- before anything is known
+
+
+def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
+    """Each cart is let go alone, then small steps to both sides and one sweep, all carts free."""
+    plan = propose_plan(bare(carts=3))
+
+    runs = [(r.kind, r.carts, r.release) for r in plan.recordings]
+    assert runs[:6] == [("decay", (cart,), cart) for cart in (1, 1, 2, 2, 3, 3)]
+    assert runs[6:] == [(kind, (1, 2, 3), None) for kind in ("step", "step", "sweep")]
+    up, down = of_kind(plan, "step")
+    assert up.amplitude == -down.amplitude > 0
+    assert max(abs(r.amplitude) for r in plan.recordings) <= 0.05 * plan.limits.input
+
+
+def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_aside():
+    """What cannot swing is not released; what rests anywhere gets no step, only the sweep."""
+    plan = propose_plan(bare(carts=1, springs=(False, False)))
+    assert [r.kind for r in plan.recordings] == ["sweep"]
+    plan = propose_plan(bare(carts=2, springs=(False, True, False)))
+    assert [r.kind for r in plan.recordings] == ["decay"] * 4 + ["sweep"]
+
+
+def test_a_stock_bench_gets_no_command_it_does_not_know():
+    """The sweep is a square wave then, and after the dwells it runs its own PID on cart 1."""
+    (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
+    assert (sweep.wave, sweep.frequency_end) == ("square", None)
+    whole = recorded("two-cart", *FIRST, "sine")
+    with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):
+        extend_plan(propose_plan(whole, bench=STOCK), whole, bench=STOCK)
+    position = whole.system.position.model_copy(update={"per_count": 0.00227})
+    system = whole.system.model_copy(update={"position": position})
+    whole = whole.model_copy(update={"system": system})
+    (loop,) = extend_plan(propose_plan(whole, bench=STOCK), whole, bench=STOCK).recordings
+    assert isinstance(loop.controller, PidLoop)
+    assert loop.controller.cart == 1
+
+
+def test_what_is_recorded_is_not_proposed():
+    """A submission with its decays, steps and sweep is asked for nothing of the first stage."""
+    assert propose_plan(recorded("two-cart", *FIRST)).recordings == ()
+
+
+@pytest.mark.parametrize(
+    ("system", "design", "expected"),
+    [
+        ({}, None, (5.0, 2.5)),
+        ({"input": InputScale(per_count=1e-4)}, None, (0.4096, 2.5)),
+        ({"position": PositionScale(unit="mm")}, Design(input_limit=2.0), (2.0, 25.0)),
+        ({}, Design(input_limit=9.0, reference=-4.0), (5.0, 5.0)),
+        (
+            {"position": PositionScale(unit="rad"), "input": InputScale(unit="N")},
+            Design(reference=0.5, input_limit=7.0),
+            (7.0, 1.2),
+        ),
+    ],
+)
+def test_limits_come_from_what_is_stated(system, design, expected):
+    """The design, the scale of the input, the unit of the positions; else usual ones."""
+    limits = propose_plan(bare(**system, design=design)).limits
+    assert (limits.input, limits.travel) == expected
+
+
+@pytest.mark.parametrize("preset", sorted(PRESETS))
+def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
+    """On a bench whose full scale holds the carts some 12 cm out: over 0.2 cm, under the limit."""
+    chain, per_count = PRESETS[preset], 0.5 / FULL_SCALE
+    plan = propose_plan(bare(carts=chain.n, input=InputScale(per_count=per_count)))
+    for recording in (*of_kind(plan, "step"), *of_kind(plan, "sweep")):
+        start = Start(
+            wave=Wave[recording.wave.upper()],
+            frequency=recording.frequency,
+            amplitude=round(recording.amplitude / per_count),
+            cycles=recording.cycles,
+        )
+        t = np.arange(0.0, recording.duration, 2e-3)
+        targets = [target_at(start, at, chirp_end=recording.frequency_end) for at in t]
+        x = np.abs(simulate_linear(chain, t, per_count * np.array(targets, dtype=np.float64)))
+        assert 0.2 < x.max(axis=1).min(), recording.id
+        assert x.max() < plan.limits.travel, recording.id
+
+
+# --------------------------------------------------------- from what is recorded
+
+
+@pytest.fixture(scope="module", params=sorted(PRESETS))
+def extended(request):
+    """A preset's chain and the plan that its decays, steps and sweep lead to."""
+    submission = recorded(EXAMPLE_OF[request.param], *FIRST)
+    plan = propose_plan(submission)
+    return PRESETS[request.param], extend_plan(plan, submission), submission
+
+
+def test_dwells_bracket_every_resonance_and_null(extended):
+    """A dwell lies within 1 % of each or within its bandwidth, and within 15 % on either side."""
+    chain, plan, _ = extended
+    dwells = np.array([2 * np.pi * r.frequency for r in of_kind(plan, "sine")])
+    for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
+        for omega, zeta in zip(*quadratic_factors(roots), strict=True):
+            away = dwells / omega - 1
+            assert np.abs(away).min() < max(0.01, zeta)
+            assert 0 < away[away > 0].min() < 0.15
+            assert -0.15 < away[away < 0].max() < 0
+
+
+def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended):
+    """On the true plant, by steady state: 0.3 to 1.3 of the aim; from rest: within the limit."""
+    chain, plan, _ = extended
+    aim = AIM * plan.limits.travel
+    wait = settling_wait(chain, time_constants=SETTLED_DWELL)
+    for run in of_kind(plan, "sine"):
+        t = np.arange(0, run.duration, 1e-3 * max(1.0, 5 / run.frequency))
+        u = run.amplitude * np.sin(2 * np.pi * run.frequency * t)
+        x = np.abs(simulate_linear(chain, t, u))
+        steady = x[:, t >= wait].max()
+        assert 0.3 * aim < steady < 1.3 * aim, run.id
+        assert x.max() < plan.limits.travel, run.id
+        assert abs(run.amplitude) <= plan.limits.input
+        # Enough of the dwell is left for six periods in steady state.
+        assert (run.duration - wait) * run.frequency > 6
+
+
+def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
+    """Both signs; on the true plant they end 0.5 to 1 of the aim away."""
+    chain, plan, _ = extended
+    aim, amplitudes = AIM * plan.limits.travel, [r.amplitude for r in of_kind(plan, "step")]
+    assert amplitudes[0] == -amplitudes[1]
+    for run in of_kind(plan, "step"):
+        t = np.arange(0, run.duration, 5e-3)
+        on = (t * run.frequency) % 1 >= 0.5
+        x = np.abs(simulate_linear(chain, t, np.where(on, run.amplitude, 0.0)))
+        assert x.max() < plan.limits.travel
+        assert 0.5 * aim < x[:, -1].max() < 1.05 * aim
+
+
+def test_extending_twice_changes_nothing(extended):
+    """Nor does it once the person at the bench changed or removed a dwell."""
+    _, plan, submission = extended
+    assert extend_plan(plan, submission) == plan
+    first, *rest = plan.recordings
+    edited = plan.model_copy(
+        update={"recordings": (first.model_copy(update={"amplitude": 1e-3}), *rest[:-3])}
+    )
+    assert extend_plan(edited, submission) == edited
+
+
+def test_the_loop_comes_once_the_dwells_are_recorded():
+    """Not with the dwells, but after them, for the designed controller, within the travel."""
+    before, after = recorded("two-cart", *FIRST), recorded("two-cart", *FIRST, "sine")
+    plan = propose_plan(before)
+    assert of_kind(extend_plan(plan, before), "closed_loop") == []
+    extended = extend_plan(plan, after)
+    (loop,) = extended.recordings
+    assert loop.controller == StateLoop(cart=2)
+    assert loop.amplitude == 1.0
+    assert extend_plan(extended, after) == extended
+
+
+def test_a_long_set_point_is_cut_to_the_travel():
+    """A reference beyond the travel limit is not asked of the carts."""
+    submission = recorded("two-cart", *FIRST, "sine")
+    plan = Plan(limits=PlanLimits(input=5.0, travel=0.5))
+    (loop,) = extend_plan(plan, submission).recordings
+    assert 0.2 < loop.amplitude < 0.4
+
+
+def test_new_recordings_take_names_of_their_own():
+    """Steps go on counting where the submission's end; ids never clash."""
+    submission = recorded("two-cart", *FIRST)
+    taken = {e.id for e in submission.experiments}
+    plan = extend_plan(propose_plan(submission), submission)
+    ids = [r.id for r in plan.recordings]
+    assert not taken & set(ids)
+    assert len(set(ids)) == len(ids)
+    assert ids[:3] == ["step-5", "step-6", "sine-01"]
+
+
+def test_data_that_identify_nothing_say_so():
+    """A lone sweep of carts that no spring ties gives a reason in place of dwells."""
+    submission = recorded("one-cart", "sweep")
+    rigid = submission.system.model_copy(update={"springs": (False, False)})
+    submission = submission.model_copy(update={"system": rigid})
+    with pytest.raises(DataError, match="the carts are not identified"):
+        extend_plan(propose_plan(submission), submission)
+
+
+def test_counts_in_the_plural_are_counts():
+    """A travel limit in "counts" is that of an ECP 210, not two and a half counts."""
+    assert propose_plan(bare(position=PositionScale(unit="counts"))).limits.travel == 1100.0
+
+
+# --------------------------------------------------------------------- the file
+
+finite = st.floats(-1e6, 1e6, allow_nan=False).map(lambda x: round(x, 6))
+positive = st.floats(1e-3, 1e3).map(lambda x: round(x, 6))
+
+
+@given(
+    input=positive,
+    travel=positive,
+    frequency=st.floats(0.01, 50).map(lambda x: round(x, 4)),
+    kp=finite,
+    cycles=st.integers(1, 5),
+    note=st.text(st.characters(exclude_categories=["Cs"]), max_size=20),
+)
+def test_a_plan_reads_back_as_it_was_written(
+    tmp_path_factory, input, travel, frequency, kp, cycles, note
+):
+    """Every key survives the file, and the same plan gives the same bytes."""
+    submission = bare().model_copy(update={"folder": tmp_path_factory.mktemp("plan")})
+    common = {"frequency": frequency, "cycles": cycles, "note": note}
+    loop = {"kind": "closed_loop", "carts": (1, 2), "wave": "square", "amplitude": travel}
+    plan = Plan(
+        baud=9600,
+        limits=PlanLimits(input=input, travel=travel),
+        recordings=(
+            Recording(
+                id="d", kind="decay", carts=(2,), wave="delta", amplitude=0, release=2, **common
+            ),
+            Recording(
+                id="s",
+                kind="sweep",
+                carts=(1, 2),
+                wave="chirp",
+                amplitude=-input,
+                frequency_end=60.0,
+                settle=0.0,
+                **common,
+            ),
+            Recording(id="p", controller=PidLoop(kp=kp, cart=2), **loop, **common),
+            Recording(id="f", controller=StateLoop(cart=2), **loop, **common),
+            Recording(
+                id="g",
+                controller=StateLoop(gains=(kp, 0.0, 1.0, 2.0), prefilter=-1.0),
+                **loop,
+                **common,
+            ),
+        ),
+    )
+    path = save_plan(plan, submission)
+    assert load_plan(submission) == plan
+    assert path.read_text(encoding="utf-8") == plan_text(plan, submission.system)
+
+
+def test_adding_keeps_every_byte_that_stood_there(tmp_path):
+    """Comments, order and numbers of the person at the bench stay; new tables come at the end."""
+    example = recorded("two-cart", *FIRST)
+    submission = example.model_copy(update={"folder": tmp_path})
+    plan_path(submission).write_text(
+        "version = 1 # mine\n[limits] # measured\ntravel = 3\r\ninput = 4.5",
+        encoding="utf-8",
+        newline="",
+    )
+    old = load_plan(submission)
+    assert old.limits == PlanLimits(input=4.5, travel=3.0)
+
+    save_plan(extend_plan(old, example), submission)
+
+    text = plan_path(submission).read_bytes().decode("utf-8")
+    assert text.startswith("version = 1 # mine\n[limits] # measured\ntravel = 3\r\ninput = 4.5\n")
+    assert len(of_kind(load_plan(submission), "sine")) > 20
+    with pytest.raises(ValueError, match="not an extension"):
+        save_plan(old, submission)
+
+
+def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
+    """Whoever adds a recording meanwhile finds it in the plan, before what the data ask for."""
+    work = a_recorded_cart(tmp_path / "work")
+    submission = load_submission(work)
+    old = propose_plan(submission)
+    save_plan(old, submission)
+    mine = let_go(1, name="mine", seconds=10.0)
+
+    def meanwhile(stage: str) -> None:
+        add_recording(work, mine)
+
+    made = make_plan(submission, progress=meanwhile)
+    n = len(old.recordings)
+    assert made.plan == load_plan(submission)
+    assert made.plan.recordings[: n + 1] == (*old.recordings, mine)
+    assert f" {len(made.plan.recordings) - n - 1} recording" in made.said
+    assert of_kind(made.plan, "sine")
+
+
+RUN = """
+[[recordings]]
+id = "{id}"
+kind = "{kind}"
+carts = {carts}
+wave = "{wave}"
+amplitude = {amplitude}
+frequency = {frequency}
+{more}
+"""
+GOOD = {
+    "id": "run",
+    "kind": "step",
+    "carts": "[1, 2]",
+    "wave": "square",
+    "amplitude": 0.2,
+    "frequency": 0.1,
+    "more": "",
+}
+LOOP = {"kind": "closed_loop", "amplitude": 1.0}
+
+
+def with_run(**changes) -> str:
+    return "version = 1\n[limits]\ninput = 5\ntravel = 2.5\n" + RUN.format(**{**GOOD, **changes})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("version = 1\n[limit]\n", r"limit: unknown key; did you mean 'limits'\?"),
+        ("version = 1\n[limits]\ninput = 5\ntravl = 2", r"travl: unknown key; .*'travel'"),
+        ("version = 1\n[limits]\ninput = 0\ntravel = 2", r"limits.input: expected more than 0"),
+        ("version = 1\n[limits]\ninput = nan\ntravel = 2", r"limits.input: .*finite.*found NaN"),
+        ("version = 2\n[limits]\ninput = 1\ntravel = 2", r"version: expected 1, found 2"),
+        ("version = 1\nlimits = [", "not valid TOML"),
+        (with_run(kind="steps"), r"recordings\[1\]\.kind \(run\): expected .*'step'\?"),
+        (with_run(wave="sqare"), r"wave \(run\): .*did you mean 'square'"),
+        (with_run(more="cycle = 2"), r"cycle \(run\): unknown key; did you mean 'cycles'"),
+        (with_run(more="cycles = 2.5"), r"cycles \(run\): expected a whole number, found 2.5"),
+        (with_run(id="../up"), r"id .*: expected letters"),
+        (with_run(carts="[1, 3]"), r"carts .*: expected some of the carts 1 to 2"),
+        (with_run(amplitude=6), r"amplitude .*at most the limit of 5 V, found 6"),
+        (with_run(amplitude=0), r"amplitude .*0 moves nothing"),
+        (with_run(carts="[2]"), r"amplitude .*cart 1, which is held"),
+        (with_run(more="settle = 1e-4"), r"settle \(run\): expected 0, or 0.001 to 600 s, found 0"),
+        (with_run(more="settle = 1001"), r"settle \(run\): .* to 600 s, found 1001"),
+        (with_run(frequency=2000), r"frequency \(run\): expected 0.001 to 1000 Hz, found 2000"),
+        (
+            with_run(kind="sweep", wave="chirp", more="frequency_end = 5e-4"),
+            r"frequency_end \(run\): expected 0.001 to 1000 Hz, found 0.0005",
+        ),
+        (with_run(more="cycles = 61"), r"cycles .*takes 610 s"),
+        (with_run(more="release = 3"), r"release .*a cart that is free, found 3"),
+        (with_run(wave="sine"), r"wave .*go together"),
+        (with_run(wave="chirp"), r"frequency_end .*another frequency"),
+        (with_run(more="frequency_end = 9"), r"frequency_end .*belongs to a chirp"),
+        (with_run(more='controller = {type = "pid", kp = 1}'), "controller .*belongs to a closed"),
+        (with_run(**LOOP), "controller .*a closed loop needs one"),
+        (
+            with_run(**LOOP, more='controller = {type = "pid", kd = 1}'),
+            r"controller\.kp \(run\): is required",
+        ),
+        (
+            with_run(**LOOP, more='controller = {type = "pid", kp = 1, k = 1}'),
+            r"controller\.k \(run\): unknown key",
+        ),
+        (with_run(**LOOP, more='controller = {type = "pd"}'), r"expected type = 'pid'"),
+        (
+            with_run(**LOOP, more='controller = {type = "state_feedback", gains = [1.0]}'),
+            r"controller\.gains .*expected 4 gains or none, found 1",
+        ),
+        (
+            with_run(**LOOP, more='controller = {type = "state_feedback", prefilter = 1.0}'),
+            r"gains and prefilter come together",
+        ),
+        (
+            with_run(**LOOP, more='controller = {type = "state_feedback", cart = 3}'),
+            r"controller\.cart .*no cart 3",
+        ),
+        (with_run() + RUN.format(**{**GOOD, "id": "RUN"}), r"recordings\[2\]\.id .*used before"),
+    ],
+)
+def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
+    """File, key, what was expected, what was found, what is near."""
+    submission = bare().model_copy(update={"folder": tmp_path})
+    plan_path(submission).write_text(text, encoding="utf-8")
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_plan(submission)
+    assert all(
+        line.startswith(f"{tmp_path.name}/plan.toml") for line in str(caught.value).split("\n")
+    )
+
+
+def test_a_link_in_its_place_is_not_followed(tmp_path):
+    """A plan that is a link to somewhere else is refused, also for writing."""
+    submission = bare().model_copy(update={"folder": tmp_path})
+    (tmp_path / "other").write_text(with_run(), encoding="utf-8")
+    plan_path(submission).symlink_to(tmp_path / "other")
+    with pytest.raises(ConfigError, match="is a link"):
+        save_plan(propose_plan(submission), submission)
+
+
+# ------------------------------------------------------------------- the command
+
+
+def run(monkeypatch, *arguments) -> str | int:
+    monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code or 0
+
+
+def test_the_command_writes_shows_and_extends(monkeypatch, capsys, tmp_path):
+    """It tells what to hold and how long it takes; run again it changes nothing."""
+    new_submission(tmp_path / "bench", carts=2)
+    assert run(monkeypatch, "plan", tmp_path / "bench") == 0
+    out, err = capsys.readouterr()
+    assert "hold cart 2, cart 1 free:" in out
+    assert "all carts free:" in out
+    assert "7 recordings, 0 done; the others take 1 min 59 s" in out
+    assert "check its [limits]" in err
+    raw = (tmp_path / "bench" / "plan.toml").read_bytes()
+
+    assert run(monkeypatch, "plan", tmp_path / "bench", "--json") == 0
+    out, err = capsys.readouterr()
+    data = json.loads(out)
+    assert data["recordings"][0]["held"] == [2]
+    assert data["seconds_left"] == pytest.approx(119.0)
+    assert "0 recordings added" in err
+    assert (tmp_path / "bench" / "plan.toml").read_bytes() == raw

@@ -1,0 +1,90 @@
+"""A model that follows a record: its derivatives are those of what it computes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.gap.data.runs import make_run
+from pipeline.gap.follow import forces
+from pipeline.gap.follow.laws import DRY, FollowedBench, LawSet, TrialLaw
+from pipeline.gap.follow.track import Own, errors_of, make_track
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.simulator.terms import Kind
+from tests.truth.cases import make_case
+
+# Of the largest input, position and the parameters of cart 1 and spring 2.
+SIZES = {
+    Kind.COULOMB_FRICTION: lambda u, x, m, k: (0.02 * u,),
+    Kind.LOAD_FRICTION: lambda u, x, m, k: (0.02,),
+    Kind.QUADRATIC_DRAG: lambda u, x, m, k: (2e-5,),
+    Kind.FORCE_OFFSET: lambda u, x, m, k: (0.02 * u,),
+    Kind.CUBIC_SPRING: lambda u, x, m, k: (0.01 * k / x**2,),
+    Kind.SLACK_SPRING: lambda u, x, m, k: (0.3 * k, 0.4 * x),
+    Kind.COUPLING_DAMPER: lambda u, x, m, k: (1e-4,),
+    Kind.DRIVE_DAMPING: lambda u, x, m, k: (1e-4,),
+    Kind.END_STOP: lambda u, x, m, k: (5.0 * k, 0.6 * x, 1e-3),
+    Kind.STICTION: lambda u, x, m, k: (0.02 * u, 2.0 * x),
+    Kind.PRESLIDING_FRICTION: lambda u, x, m, k: (0.02 * u, 0.02 * x),
+    Kind.EXTRA_MODE: lambda u, x, m, k: (0.1 * m, 900.0, 2.0),
+    Kind.COGGING: lambda u, x, m, k: (0.02 * u, 0.01 * u, 0.3 * x),
+    Kind.SENSOR_GAIN: lambda u, x, m, k: (0.03,),
+    Kind.BACKLASH: lambda u, x, m, k: (0.1 * x, 0.3 * m, 0.6),
+}
+DRIVEN = (Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH)
+# Whether a cart turns, or bodies meet, before a reading or after it is a jump in its error.
+JUMPS = (*DRY, Kind.BACKLASH)
+
+
+@pytest.mark.parametrize("gain", [0.5, 0.1, 0.0])
+@pytest.mark.parametrize("kind", SIZES)
+def test_derivatives_are_those_of_what_is_computed(kind, gain):
+    """All parameters and a run's own, with a drive that has all its laws: central differences."""
+    case = make_case(seed=44, n=2, rate=113.1)
+    chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
+    track = make_track(make_run(case.records[0], n=2))
+    largest, top = float(np.abs(track.command).max()), float(np.abs(track.y).max())
+    bench = FollowedBench(chain=chain, springs=case.springs, largest=largest, free=((True, True),))
+    values = SIZES[kind](largest, top, float(chain.m[0]), float(chain.k[1]))
+    own = track.fresh()
+    start = np.concatenate([own.zero, own.shift + 0.01 * top, own.v0 + 0.1, own.factor])
+
+    for place in (0,) if kind in DRIVEN else (0, 1):
+        bare = LawSet(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+        law = TrialLaw(kind=kind, place=place, values=values)
+        laws, p = bare.with_laws(bare.start(chain), [law])
+        p[laws.drive_at : laws.base] = 0.05 * largest, 0.9 * largest, 0.006, 0.01
+
+        def errors(both, *, derive=False, laws=laws):
+            size = laws.size
+            mine = Own(**dict(zip(vars(own), both[size:].reshape(4, 2), strict=True)))
+            told = errors_of(laws, both[:size], track, mine, gain=gain, derive=derive)
+            assert told is not None
+            return told
+
+        at = np.concatenate([p, start])
+        _, J = errors(at, derive=True)
+        steps = np.diag(1e-5 * np.where(at == 0.0, 1e-3, np.abs(at)))
+        present = at != 0.0
+        present[p.size : p.size + 2] = True  # zeros, which are nothing here
+        for lane in np.flatnonzero(present):
+            above, below = (errors(at + sign * steps[lane])[0] for sign in (1.0, -1.0))
+            numeric = (below - above) / (2.0 * steps[lane, lane])
+            off = np.abs(numeric - J[lane]) / max(np.abs(J[lane]).max(), 1e-12)
+            if kind in JUMPS:
+                assert np.quantile(off, 0.9) < 0.02, lane
+            else:
+                assert off.max() < 1e-4, lane
+
+
+def test_a_model_that_runs_away_is_told():
+    """A spring that softens without end leaves no errors, and no derivatives."""
+    case = make_case(seed=44, n=2, rate=113.1)
+    chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
+    track = make_track(make_run(case.records[0], n=2))
+    bench = FollowedBench(chain=chain, springs=case.springs, largest=0.1, free=((True, True),))
+    bare = LawSet(bench=bench, keys=(), drive=(True,) * forces.DRIVE)
+    soft = TrialLaw(kind=Kind.CUBIC_SPRING, place=1, values=(-10.0,))
+    laws, p = bare.with_laws(bare.start(chain), [soft])
+    own = replace(track.fresh(), shift=np.ones(2))
+    assert errors_of(laws, p, track, own, gain=0.0, derive=True) is None

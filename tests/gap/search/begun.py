@@ -1,0 +1,30 @@
+"""One cart with hidden effects, ready to be searched: the linear fit and the study."""
+
+from dataclasses import replace
+
+from pipeline.gap.data.runs import make_run
+from pipeline.gap.data.sides import split
+from pipeline.gap.fit.baseline import fit_baseline
+from pipeline.gap.fit.levenberg_marquardt import GapFit
+from pipeline.gap.search.hypothesis import Study
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from tests.truth.bench import Hidden
+from tests.truth.cases import make_case
+
+COULOMB, DAHL = ("coulomb_friction", 1), ("presliding_friction", 1)
+CUBIC, DELAY = ("cubic_spring", 1), ("input_delay", 0)
+
+
+def begun(*hidden: Hidden, rate: float = 113.1) -> tuple[GapFit, Study]:
+    """Return the linear fit and the study of one cart with these effects."""
+    case = make_case(seed=46, n=1, effects=hidden, rate=rate)
+    runs = [make_run(record, n=1) for record in case.records]
+    teach, judge_by = split(runs)
+    fit, training = fit_baseline([runs[i] for i in teach], springs=case.springs, start=None)
+    study = Study(
+        training=tuple(training),
+        held_out=tuple(replace(runs[i], sigma=training[0].sigma) for i in judge_by),
+        springs=case.springs,
+        catalogue=CATALOGUE,
+    )
+    return fit, study

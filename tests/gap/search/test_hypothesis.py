@@ -1,0 +1,56 @@
+"""What an effect must bring to be worth it."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pipeline.gap.search.hypothesis import Hypothesis, Study, worth_it
+from pipeline.plant.nonlinear.effects import find_effect
+from tests.gap.search.begun import CUBIC, DELAY
+
+
+def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0) -> Hypothesis:
+    """Return a hypothesis with what it leaves of 1000 training and 1000 held-out points."""
+    effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
+    fit: Any = SimpleNamespace(chi=chi, structure=SimpleNamespace(effects=effects), n_points=1000.0)
+    left: Any = SimpleNamespace(chi=held)
+    return Hypothesis(
+        fit=fit,
+        held=left,
+        error=held**0.5,
+        bic=100.0 * float(np.log(chi)),
+        news=news,
+        held_news=news,
+        at_floor=max(chi, held) < 1.15,
+    )
+
+
+@pytest.mark.parametrize(
+    ("child", "worth"),
+    [
+        ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 on either side
+        ({"chi": 2.0, "held": 2.0, "news": 5.0}, False),  # what is left swings: little is news
+        ({"chi": 1.0, "held": 7.0}, False),  # of the runs fitted only
+        ({"chi": 5.6, "held": 5.7}, False),  # too little for the criterion
+    ],
+)
+def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
+    """Of the runs fitted and of those held out; of what the fuller model leaves."""
+    parent = judged(CUBIC, chi=6.0, held=6.0)
+    both = judged(CUBIC, DELAY, **child)
+    study: Any = SimpleNamespace(explains=lambda h: True)
+    assert worth_it(both, parent, study) == worth
+
+
+@pytest.mark.parametrize(
+    ("error", "contact", "repeatability", "said"),
+    [(0.014, False, 0.0, True), (0.012, False, 0.0, False), (0.014, True, 0.0, False),
+     (0.014, False, 0.01, False)],
+)  # fmt: skip
+def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
+    """Not beside a contact, whose own law is not the model's, nor within what repeats differ by."""
+    chosen: Any = SimpleNamespace(error=error, has_contact=contact)
+    study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
+    assert Study.may_be_half(study, chosen) == said

@@ -1,0 +1,53 @@
+"""What a search leaves out at its end."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.gap.search.hypothesis import judge
+from pipeline.gap.search.prune import SURE, prune, sureness
+from pipeline.gap.search.translate import make_candidate
+from pipeline.gap.search.whole import fit_whole
+from pipeline.plant.nonlinear.effects import find_effect
+from tests.gap.search.begun import COULOMB, DAHL, DELAY, begun
+from tests.truth.bench import Hidden
+
+
+def test_a_richer_law_that_explains_no_more_gives_way():
+    """Dry friction that yields over next to nothing is plain dry friction."""
+    fit, study = begun(
+        Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
+        Hidden(effect="input_delay", parameters={"delay": 0.015}),
+    )
+    chain = fit.structure.chain(fit.theta)
+    start = fit
+    for key, values in (("input_delay", (0.015,)), ("presliding_friction", (0.0006, 1e-4))):
+        effect = find_effect(key)
+        place = 0 if effect.place == "input" else 1
+        candidate = make_candidate(effect, place, values, runs=study.training, chain=chain)
+        start = start.with_effect(candidate, values)
+    rich = judge(fit_whole(start, study), study)
+
+    pruned = prune(rich, study, [judge(fit, study)])
+
+    assert rich.key == {DAHL, DELAY}
+    assert pruned.key == {COULOMB, DELAY}
+    assert pruned.error < 1.01 * rich.error
+
+
+@pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
+def test_what_is_nothing_within_its_error_is_told(value, nothing):
+    """A delay is named where it is three standard errors from none."""
+    fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
+    chain = fit.structure.chain(fit.theta)
+    delay = make_candidate(
+        find_effect("input_delay"), 0, (value,), runs=study.training, chain=chain
+    )
+    model = fit.with_effect(delay, (value,))
+    known = replace(fit, structure=model.structure, theta=model.theta)
+    sure = np.diag(np.full(model.theta.size, (1e-3 / delay.scales[0]) ** 2))
+
+    (found,) = sureness(replace(known, covariance=sure))
+    assert (found < SURE) == nothing
+    assert sureness(known) == [np.inf]  # without an error nothing is said

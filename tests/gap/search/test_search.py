@@ -1,0 +1,70 @@
+"""A search from its first step to its last, on one cart."""
+
+from dataclasses import replace
+
+import pytest
+
+from pipeline.gap.search.deadline import Deadline
+from pipeline.gap.search.search import Search
+from tests.gap.search.begun import COULOMB, DELAY, begun
+from tests.truth.bench import Hidden
+
+FRICTION = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006})
+LATE = Hidden(effect="input_delay", parameters={"delay": 0.015})
+
+
+def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
+    """Return a search after all its steps."""
+    fit, study = begun(*hidden)
+    search = Search(study, fit, Deadline(map, seconds=seconds))
+    search.find_effects()
+    search.measure_noise_anew()
+    search.change_sides()
+    search.add_constant_force()
+    search.reach_verdict()
+    return search
+
+
+@pytest.mark.parametrize(
+    ("hidden", "verdict", "found"),
+    [
+        ((), "none", set()),
+        ((FRICTION,), "named", {COULOMB}),
+        ((LATE, FRICTION), "named", {COULOMB, DELAY}),
+    ],
+)
+def test_what_is_hidden_is_named(hidden, verdict, found):
+    """Nothing, one effect, two: each step of the path adds one, and lowers the error."""
+    search = searched(*hidden)
+
+    assert search.verdict == verdict
+    assert search.chosen.key == found
+    assert [len(step.key) for step in search.path] == list(range(len(found) + 1))
+    errors = [step.error for step in search.path]
+    assert errors == sorted(errors, reverse=True)
+    assert search.final.covariance is not None
+    assert {run.id for run, _ in search.judged} == {
+        run.id for run in (*search.study.training, *search.study.held_out)
+    }
+
+
+def test_without_time_the_linear_model_is_the_answer():
+    """Past the time allowed nothing more is tried, and the deadline says so."""
+    search = searched(FRICTION, seconds=0.0)
+
+    assert search.deadline.cut
+    assert search.chosen.key == set()
+    assert search.verdict == "unexplained"
+
+
+def test_noise_that_was_taken_for_too_much_is_measured_anew():
+    """With three times the noise there is, the friction still comes out, and the noise too."""
+    fit, study = begun(FRICTION)
+    loud = study.with_noise([replace(run, sigma=3.0 * run.sigma) for run in study.training])
+    search = Search(loud, fit, Deadline(map, seconds=None))
+
+    search.find_effects()
+    search.measure_noise_anew()
+
+    assert search.study.floor == pytest.approx(study.floor, rel=0.1)
+    assert search.chosen.fit.chi > 0.7

@@ -1,0 +1,67 @@
+"""From laws to effects and back: places that show, columns, an effect put in and taken out."""
+
+import numpy as np
+import pytest
+
+from pipeline.gap.data.runs import make_run
+from pipeline.gap.fit.structure import Structure
+from pipeline.gap.follow.laws import COLUMNS, DRIVE_COLUMNS, FollowedBench, column_set, smooth_laws
+from pipeline.gap.search.translate import filled, make_candidate, values_of
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.simulator.terms import Kind
+from tests.truth.cases import make_case
+
+ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
+
+
+@pytest.mark.parametrize(
+    ("kind", "free", "places"),
+    [
+        (Kind.COULOMB_FRICTION, [(True, True)], [0, 1]),
+        (Kind.COULOMB_FRICTION, [(False, True), (False, True)], [1]),  # cart 1 is always held
+        (Kind.CUBIC_SPRING, [(True, True)], [0, 1, 2]),
+        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1 and 2 stretch alike, 3 never
+    ],
+)
+def test_a_law_is_looked_for_where_it_would_show(kind, free, places):
+    """Held carts show nothing; of springs that always stretch alike the first stands for all."""
+    bench = FollowedBench(
+        chain=PRESETS["throne-2dof"], springs=(True,) * 3, largest=1.0, free=tuple(free)
+    )
+    laws = smooth_laws(bench, columns=ALL)
+    assert [place for one, place in laws.keys if one == kind] == places
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
+def test_values_are_read_back_from_the_columns(effect):
+    """What an effect fills tells its values, also where a column is a difference of two."""
+    values = tuple(0.3 * (1.0 + i) for i in range(len(effect.names)))
+    columns = effect.columns(effect.named(values))
+    np.testing.assert_allclose(values_of(effect, columns), values, rtol=1e-12)
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
+def test_every_effect_has_its_law(effect):
+    """Whatever an effect fills, a law that can be followed fills too, or it cannot be found."""
+    laws = column_set([column for columns in COLUMNS for column in columns])
+    assert filled(effect) <= laws | column_set(DRIVE_COLUMNS)
+
+
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
+def test_an_effect_put_into_a_model_and_taken_out_leaves_it(effect):
+    """Its values come back from the vector, each side on its own; the rest is untouched."""
+    chain = PRESETS["throne-2dof"]
+    case = make_case(seed=44, n=2, rate=113.1)
+    runs = [make_run(record, n=2) for record in case.records[:2]]
+    plain = Structure(springs=tuple(bool(k) for k in chain.k)).start(chain)
+    place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
+    sides = (1.0, -1.0) if any(p.side for p in effect.parameters) else (1.0,)
+    for side in sides:
+        values = tuple(side * 0.5 if p.side else 0.5 for p in effect.parameters)
+        candidate = make_candidate(effect, place, values, runs=runs, chain=chain)
+
+        grown = plain.with_effect(candidate, values)
+
+        np.testing.assert_allclose(grown.terms[-1].values, values, rtol=1e-12)
+        assert np.array_equal(grown.without(0).theta, plain.theta)

@@ -1,0 +1,96 @@
+"""What is said of a search, as a table: hypotheses with their errors in, verdicts out."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from pipeline.gap.search.verdict import reach_verdict
+from pipeline.plant.nonlinear.effects import find_effect
+
+FLOOR = 0.01
+COULOMB, SECOND = ("coulomb_friction", 1), ("coulomb_friction", 2)
+DELAY, CUBIC, DRAG, DEAD = (
+    ("input_delay", 0),
+    ("cubic_spring", 1),
+    ("quadratic_drag", 1),
+    ("dead_zone", 0),
+)
+
+
+def hypothesis(*keys: tuple[str, int], error: float, bic: float, held: float = 1.0) -> Any:
+    """Return what a verdict looks at of a hypothesis: no fit is made here."""
+    effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
+    structure = SimpleNamespace(effects=effects)
+    return SimpleNamespace(
+        key=frozenset(keys),
+        error=error,
+        bic=bic,
+        at_floor=False,
+        fit=SimpleNamespace(chi=1.0, n_points=100_000, structure=structure),
+        held=SimpleNamespace(chi=held, n_points=10_000),
+        news=10_000.0,
+        held_news=1_000.0,
+    )
+
+
+STUDY: Any = SimpleNamespace(
+    floor=FLOOR, repeatability=0.0, training=(), explains=lambda h: h.error <= 2 * FLOOR
+)
+LINEAR = hypothesis(error=0.3, bic=0.0)
+
+
+OTHER_CART = hypothesis(SECOND, error=0.25, bic=-50)
+
+
+def verdict_on(*steps: Any, others: tuple[Any, ...] = ()) -> tuple[str, set[Any], list[Any]]:
+    """Return the verdict, the effects that stand, and the rivals."""
+    path = (LINEAR, *steps)
+    verdict, stand, close = reach_verdict(path, [*path, *others], study=STUDY, sample_time=0.01)
+    assert [len(h.key) for h in stand] == list(range(len(stand)))  # one effect a step
+    return verdict, set(stand[-1].key), close
+
+
+def test_an_effect_beside_which_another_does_as_well_alone_is_taken_back():
+    """The last step does not pay; then the first does not, for the second does it alone."""
+    delay = hypothesis(DELAY, error=0.25, bic=-10)
+    both = hypothesis(DELAY, COULOMB, error=0.2, bic=-500)
+    three = hypothesis(DELAY, COULOMB, CUBIC, error=0.195, bic=-600)
+    alone = hypothesis(COULOMB, error=0.2, bic=-505)
+    poor = hypothesis(COULOMB, error=0.28, bic=-5)
+    assert verdict_on(delay, both, three, others=(poor,))[:2] == ("partial", {DELAY, COULOMB})
+    assert verdict_on(delay, both, three, others=(alone,))[:2] == ("partial", {COULOMB})
+
+
+@pytest.mark.parametrize(
+    ("rival", "verdict"),
+    [
+        ((("stiction", 1), ("stiction", 2)), "named"),  # a richer form of the same laws
+        ((DRAG, DEAD), "ambiguous"),
+        ((DRAG, SECOND), "ambiguous"),
+    ],
+)
+def test_effects_that_only_together_explain_have_rivals_too(rival, verdict):
+    """Two others that fit alike, instead of one or of both."""
+    one = hypothesis(COULOMB, error=0.2, bic=-100)
+    both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
+    same = hypothesis(*rival, error=0.015, bic=-999.5)
+    said, stand, close = verdict_on(one, both, others=(same, OTHER_CART))
+    assert (said, stand) == (verdict, {COULOMB, SECOND})
+    assert close == ([same] if verdict == "ambiguous" else [])
+
+
+def test_a_rival_far_less_likely_is_none():
+    """A criterion forty higher tells them apart."""
+    one = hypothesis(COULOMB, error=0.2, bic=-100)
+    both = hypothesis(COULOMB, SECOND, error=0.015, bic=-1000)
+    other = hypothesis(DRAG, DEAD, error=0.0151, bic=-950)
+    assert verdict_on(one, both, others=(other, OTHER_CART))[0] == "named"
+
+
+@pytest.mark.parametrize(("held", "verdict"), [(1.0, "ambiguous"), (1.05, "named")])
+def test_runs_held_out_are_evidence_too(held: float, verdict: str):
+    """Of 30 by the runs fitted and 1000 ln 1.05 = 49 by the others, 40 make a rival none."""
+    drag = hypothesis(DRAG, error=0.01, bic=-1000)
+    cubic = hypothesis(CUBIC, error=0.01, bic=-970, held=held)
+    assert verdict_on(drag, others=(cubic,))[0] == verdict

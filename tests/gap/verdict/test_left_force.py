@@ -1,0 +1,158 @@
+"""The force that no effect explains: laws that are not in the catalogue are read off the data."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pipeline.gap.data.sides import prepare, take_sides
+from pipeline.gap.explain import explain_gap
+from pipeline.gap.fit.baseline import fit_baseline, fit_nuisance
+from pipeline.gap.types import Residual
+from pipeline.gap.verdict.left_force import left_forces
+from pipeline.gap.verdict.residual_map import map_residual
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.results import Kind, Record
+from pipeline.set_up import Bench
+
+Law = Callable[[float, float, float], float]  # of position, velocity and input
+
+COUNT = 0.00227  # cm, of an encoder
+RATE, SUBSTEPS, DURATION = 250.0, 4, 8.0
+CARTS = {
+    1: Chain(m=np.array([2e-4]), c=np.array([4e-4]), k=np.array([0.035, 0.0])),
+    2: Chain(m=np.array([2e-4, 3e-4]), c=np.array([4e-4, 3e-4]), k=np.array([0.035, 0.02, 0.03])),
+}
+
+
+def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
+    """Return one run of carts on springs with a law of force more on one of them.
+
+    Heun's method with steps of 1 ms; encoder steps and noise of a third of one.
+    """
+    n = chain.n
+    t = np.arange(int(DURATION * RATE)) / RATE
+    u = np.zeros(t.size)
+    if kind == "sweep":
+        u = size * np.sin(2 * np.pi * (0.8 * t + 0.2 * t**2))
+    elif kind == "step":
+        u = size * ((t > 0.3) & (t < 4.0))
+    x, v = np.zeros(n), np.zeros(n)
+    if kind == "decay":
+        x[cart - 1] = size
+
+    def acceleration(x, v, push):
+        force = -chain.stiffness @ x - chain.c * v
+        force[0] += push
+        force[cart - 1] += law(x[cart - 1], v[cart - 1], push)
+        return force / chain.m
+
+    y, h = np.zeros((n, t.size)), 1.0 / RATE / SUBSTEPS
+    for sample, push in enumerate(u):
+        y[:, sample] = x
+        for _ in range(SUBSTEPS):
+            a = acceleration(x, v, push)
+            b = acceleration(x + h * v, v + h * a, push)
+            x, v = x + h * v + 0.5 * h * h * a, v + 0.5 * h * (a + b)
+    rng = np.random.default_rng(seed)
+    y = np.round((y + 0.3 * COUNT * rng.standard_normal(y.shape)) / COUNT) * COUNT
+    return Record(
+        id=f"{kind}-{seed}",
+        kind=kind,
+        t=t,
+        u=None if kind == "decay" else u.astype(np.float64),
+        y=y,
+        carts=tuple(range(1, n + 1)),
+        free=tuple(range(1, n + 1)),
+        resolution=np.full(n, COUNT),
+    )
+
+
+def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
+    """Return a lab of sweeps, steps and decays."""
+    plan: tuple[tuple[Kind, float], ...] = (
+        ("sweep", 0.05), ("sweep", 0.03), ("step", 0.08), ("step", 0.05), ("decay", 2.0),
+        ("decay", 1.2),
+    )  # fmt: skip
+    return [
+        record(CARTS[carts], law, cart=cart, kind=kind, size=size, seed=seed)
+        for seed, (kind, size) in enumerate(plan)
+    ]
+
+
+def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tuple[Residual, ...]:
+    """Return what is left by the linear chain that fits best."""
+    runs = prepare(records, springs=springs, interventions=(), notes=[])
+    training, held_out = take_sides(runs, notes=[])
+    fit, training = fit_baseline(training, springs=springs, start=None)
+    nuisance = [*fit.nuisance, *fit_nuisance(fit, held_out).nuisance]
+    forces = left_forces(fit, [*training, *held_out], nuisance)
+    return map_residual(forces, Bench(springs=springs))
+
+
+@pytest.mark.parametrize(
+    ("law", "terms"),
+    [
+        (lambda x, v, u: -6e-5 * v * abs(v), {"v|v|": -6e-5}),
+        (lambda x, v, u: -8e-4 * np.sign(v) * abs(v) ** 0.5, {"sqrt|v| sign v": -8e-4}),
+        (lambda x, v, u: -3e-4 * x * x * v, {"x^2 v": -3e-4}),
+        (lambda x, v, u: -0.15 * u * x, {"u x": -0.15}),
+        (lambda x, v, u: -2e-3 * x**3 - 5e-5 * v * abs(v), {"x^3": -2e-3, "v|v|": -5e-5}),
+    ],
+    ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
+)
+def test_a_law_is_read_off_what_it_leaves(law, terms):
+    """The terms of a law are found, no other, its numbers within 6 %.
+
+    That is three of the standard errors stated of the least sure, the root's.
+    """
+    (residual,) = left_by_the_chain(recordings(law), springs=(True, False))
+
+    assert residual.formula is not None
+    found = {term.term: term.coefficient for term in residual.formula.terms}
+    assert found == pytest.approx(terms, rel=0.06)
+    assert residual.formula.explains > 0.9
+    assert [shown.quantity for shown in residual.against] == ["position", "velocity", "input"]
+
+
+def test_noise_has_no_formula():
+    """Nothing is read into what a right model leaves."""
+    (residual,) = left_by_the_chain(recordings(lambda x, v, u: 0.0), springs=(True, False))
+
+    assert residual.formula is None
+    assert all(shown.formula is None for shown in residual.against)
+
+
+def test_the_force_is_on_the_cart_that_it_acts_on():
+    """Of two carts only the second has a formula for it: its neighbour's motion is taken off."""
+    records = recordings(lambda x, v, u: -6e-5 * v * abs(v), carts=2, cart=2)
+
+    first, second = left_by_the_chain(records, springs=(True, True, True))
+
+    assert second.formula is not None
+    found = {term.term: term.coefficient for term in second.formula.terms}
+    assert found == pytest.approx({"v|v|": -6e-5}, rel=0.05)
+    sizes = [
+        max(abs(force) for shown in residual.against for force in shown.force)
+        for residual in (first, second)
+    ]
+    assert sizes[0] < 0.2 * sizes[1]
+
+
+def test_an_effect_that_the_catalogue_lacks_is_described():
+    """The workflow without quadratic drag: unexplained, and the formula is that of drag."""
+    catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]
+
+    gap = explain_gap(
+        recordings(lambda x, v, u: -6e-5 * v * abs(v)),
+        Bench(springs=(True, False)),
+        catalogue=catalogue,
+    )
+
+    assert gap.verdict in ("unexplained", "partial")
+    (residual,) = gap.residual
+    assert residual.formula is not None
+    assert residual.formula.terms[0].term == "v|v|"
+    assert residual.formula.terms[0].unit == "V s^2/cm^2"
+    assert {force.experiment for force in gap.left_forces} == {*gap.training, *gap.held_out}

@@ -1,0 +1,32 @@
+"""Places for gradebooks: a SQLite file, and a PostgreSQL server."""
+
+import os
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from tests.helpers import postgres
+
+
+@pytest.fixture(scope="session")
+def server():
+    """A PostgreSQL server of our own."""
+    if why := postgres.missing():
+        (pytest.fail if os.environ.get(postgres.NEEDED) else pytest.skip)(why)
+    with postgres.running() as url:
+        yield url
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def place(request, tmp_path):
+    """Where a gradebook can be made, empty."""
+    if request.param == "sqlite":
+        yield str(tmp_path)
+        return
+    url = request.getfixturevalue("server")
+    yield url
+    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.begin() as connection:
+        connection.execute(text("DROP SCHEMA public CASCADE"))
+        connection.execute(text("CREATE SCHEMA public"))
+    engine.dispose()

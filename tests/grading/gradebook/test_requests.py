@@ -1,0 +1,327 @@
+"""Requests for another look, on a real SQLite file and on a real PostgreSQL server."""
+
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from threading import Barrier
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.gradebook.history import history_text
+from pipeline.grading.gradebook.open_book import Conflict, OpenBook
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN, RequestRefused
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradings import Batch
+from pipeline.grading.publish.anonymous import history_of, pseudonyms_in
+from tests.helpers.grades import failed_grade, make_grade, make_outcome, two_cart_rubric
+from tests.helpers.places import ROOT
+
+RUBRIC = two_cart_rubric()
+CRITERIA = [criterion.id for criterion in RUBRIC.criteria]
+
+
+@pytest.fixture
+def book(place):
+    """A released class of two teams that lost half of every criterion."""
+    with RequestBook(place, assignment="lab", create=True) as book:
+        finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2")))
+        book.release(True, by="prof")
+        yield book
+
+
+def finish(book, *grades, moved=None, rubric=RUBRIC, key=""):
+    """Grade a class."""
+    outcomes = [make_outcome(grade, key=f"{key}{grade.submission}") for grade in grades]
+    for outcome in outcomes:
+        if book.known(outcome.key) is None:
+            book.put(outcome)
+    keys = tuple(outcome.key for outcome in outcomes)
+    book.finish(Batch(keys=keys, shared={}, moved=moved or {}), rubric=rubric)
+
+
+def answer(book, points, text="looked", by="Ada"):
+    """Answer the oldest request."""
+    (asked, *_) = book.queue().waiting
+    book.answer(
+        asked.entry.submission,
+        asked.request.criterion,
+        points,
+        text=text,
+        by=by,
+        seen=asked.version,
+    )
+
+
+def test_an_answer_and_its_points_count_at_once(book):
+    """The students read both; the history tells each step, and grading again keeps them."""
+    book.ask("team-1", "laws", why="  see\npage 3 ", by="s1")
+    assert book.n_waiting() == 1
+    (asked,) = book.queue().waiting
+    assert (asked.entry.submission, asked.request.events[0].text) == ("team-1", "see\npage 3")
+
+    answer(book, 1.0, text="you are right")
+
+    own = book.own_feedback("team-1")
+    assert own.requests["laws"].state == "answered"
+    (laws,) = [c for c in own.entry.grade.criteria if c.id == "laws"]
+    assert laws.points == 1.0
+    assert laws.message.endswith("you are right")
+    told = history_text(*book.history("team-1")).splitlines()[-3:]
+    assert [re.sub(r".*UTC  ", "", line) for line in told] == [
+        "asked     laws: by s1: see page 3",
+        "override  laws: 1 by hand, by Ada: you are right",
+        "answered  laws: 1 by hand, by Ada: you are right",
+    ]
+    finish(book, make_grade("team-1", share=0.25), make_grade("team-2", share=0.5), key="again ")
+    again = book.own_feedback("team-1")
+    assert again.requests == own.requests
+    assert {c.id: c.points for c in again.entry.grade.criteria}["laws"] == 1.0
+    assert book.n_waiting() == 0
+
+
+def test_points_stay_where_the_answer_gives_none(book):
+    """There is an answer, and no change by hand."""
+    book.ask("team-1", "laws", why="see page 3", by="s1")
+    answer(book, None, text="page 3 is about cart 2")
+    own = book.own_feedback("team-1")
+    assert own.requests["laws"].events[-1].text == "page 3 is about cart 2"
+    assert not own.entry.overrides
+
+
+def test_a_criterion_is_asked_for_once_unless_reopened(book):
+    """Whoever of the team asks; other criteria and other teams are free."""
+    book.ask("team-1", "laws", why="one", by="s1")
+    for state in ("asked", "answered"):
+        with pytest.raises(RequestRefused, match="asked for already"):
+            book.ask("team-1", "laws", why="two", by="s2")
+        assert book.own_feedback("team-1").requests["laws"].state == state
+        if state == "asked":
+            answer(book, None)
+    book.ask("team-1", "pieces", why="other criterion", by="s1")
+    book.ask("team-2", "laws", why="other team", by="s9")
+    (settled,) = book.queue("team-1").settled
+    book.reopen("team-1", "laws", by="Bob", seen=settled.version)
+    book.ask("team-1", "laws", why="two", by="s2")
+    order = [(one.entry.submission, one.request.criterion) for one in book.queue().waiting]
+    assert order == [("team-1", "pieces"), ("team-2", "laws"), ("team-1", "laws")]
+    steps = [event.what for event in book.own_feedback("team-1").requests["laws"].events]
+    assert steps == ["asked", "answered", "reopened", "asked"]
+
+
+@pytest.mark.parametrize(
+    ("criterion", "why", "message"),
+    [
+        ("laws", " \n", "say what should be looked at"),
+        ("laws", "", "say what should be looked at"),
+        ("laws", "x" * (MOST_LETTERS + 1), "at most 1,000 characters, found 1,001"),
+        ("nothing", "x", "for criteria that lost points"),
+        ("", "x", "for criteria that lost points"),
+    ],
+)
+def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message):
+    """Nothing is stored."""
+    with pytest.raises(RequestRefused, match=message):
+        book.ask("team-1", criterion, why=why, by="s1")
+    assert book.n_waiting() == 0
+
+
+def test_whole_points_are_not_asked_about(book):
+    """A criterion never judged can be: its points are lost too."""
+    finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new ")
+    with pytest.raises(RequestRefused, match="lost points"):
+        book.ask("team-1", "laws", why="more", by="s1")
+    book.ask("team-2", "laws", why="the file was in the zip", by="s2")
+    answer(book, 0.5, text="found it")
+    assert book.own_feedback("team-2").entry.grade.points == 0.5
+
+
+def test_few_requests_wait_at_once(book):
+    """After an answer there is room for one more."""
+    for criterion in CRITERIA[:MOST_OPEN]:
+        book.ask("team-1", criterion, why="x", by="s1")
+    with pytest.raises(RequestRefused, match=f"{MOST_OPEN} requests of yours wait"):
+        book.ask("team-1", CRITERIA[MOST_OPEN], why="x", by="s1")
+    book.ask("team-2", CRITERIA[MOST_OPEN], why="x", by="s2")
+    answer(book, None)
+    book.ask("team-1", CRITERIA[MOST_OPEN], why="x", by="s1")
+
+
+def test_students_read_and_ask_nothing_before_the_release(place):
+    """Nor after it was taken back, nor of another class in the same database."""
+    with RequestBook(place, assignment="lab", create=True) as book:
+        assert book.own_feedback("team-1") is None
+        finish(book, make_grade("team-1", share=0.5))
+        for released in (None, True, False):
+            if released is not None:
+                book.release(released, by="prof")
+            assert (book.own_feedback("team-1") is not None) == bool(released)
+            if not released:
+                with pytest.raises(RequestRefused, match="not released"):
+                    book.ask("team-1", "laws", why="x", by="s1")
+        book.release(True, by="prof")
+        assert book.own_feedback("team-1", assignment="lab") is not None
+        assert book.own_feedback("team-1", assignment="lab-2") is None
+        with pytest.raises(ConfigError, match="not the name of a submission"):
+            book.own_feedback("s-team-1")  # an author of it
+        with pytest.raises(ConfigError, match="no such submission"):
+            book.own_feedback("team-9")
+    with RequestBook(place, assignment="lab-2", create=True) as other:
+        finish(other, make_grade("team-1", share=0.5), key="2 ")
+        assert other.own_feedback("team-1") is None
+
+
+def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
+    """Answered by another, changed by hand, graded again: nothing of it is written."""
+    for criterion in ("laws", "pieces"):
+        book.ask("team-1", criterion, why="x", by="s1")
+    laws, pieces = book.queue().waiting
+    give = {"text": "mine", "by": "Bob"}
+    book.answer("team-1", "laws", 1.0, text="hers", by="Ada", seen=laws.version)
+    with pytest.raises(Conflict) as conflict:
+        book.answer("team-1", "laws", 0.0, seen=laws.version, **give)
+    now = conflict.value.now
+    assert now is not None
+    assert (now.points, now.by) == (1.0, "Ada")
+    book.override("team-1", "pieces", 0.75, why="seen", by="Ada")
+    with pytest.raises(Conflict):
+        book.answer("team-1", "pieces", 0.0, seen=pieces.version, **give)
+    (pieces,) = book.queue().waiting
+    finish(book, make_grade("team-1", share=0.25), key="again ")
+    with pytest.raises(Conflict):
+        book.answer("team-1", "pieces", 0.0, seen=pieces.version, **give)
+    (settled,) = book.queue().settled
+    with pytest.raises(RequestRefused, match="answered already"):
+        book.answer("team-1", "laws", 0.0, seen=settled.version, **give)
+    with pytest.raises(RequestRefused, match="only a request that was answered"):
+        book.reopen("team-1", "pieces", by="Bob", seen=book.queue().waiting[0].version)
+    with pytest.raises(ConfigError, match="expected 0 to 1 points"):
+        answer(book, 99.0)
+    with pytest.raises(RequestRefused, match="write an answer"):
+        answer(book, 1.0, text=" ")
+    events = book.history("team-1")[1]
+    assert [e.what for e in events].count("answered") == 1
+    assert [e.what for e in events].count("override") == 2
+
+
+def test_of_two_answers_at_one_moment_one_counts(book, place):
+    """Ten rounds of two that saw the same queue: one is taken, one gets a conflict."""
+    with RequestBook(place) as other:
+        for number in range(10):
+            book.ask("team-1", "laws", why=f"round {number}", by="s1")
+            seen = book.queue().waiting[0].version
+            ready = Barrier(2)
+
+            def give(who, by, *, seen=seen, ready=ready):
+                ready.wait()
+                try:
+                    who.answer("team-1", "laws", 0.75, text=f"from {by}", by=by, seen=seen)
+                except Conflict:
+                    return "conflict"
+                return "taken"
+
+            with ThreadPoolExecutor(2) as pool:
+                one, two = pool.submit(give, book, "Ada"), pool.submit(give, other, "Bob")
+                assert sorted([one.result(), two.result()]) == ["conflict", "taken"]
+            book.reopen("team-1", "laws", by="Ada", seen=book.queue().settled[0].version)
+    what = [event.what for event in book.history("team-1")[1]]
+    assert (what.count("answered"), what.count("override")) == (10, 10)
+
+
+def test_of_two_who_ask_at_one_moment_one_asks(book, place):
+    """The second of a team is told."""
+    with RequestBook(place) as other:
+        ready = Barrier(2)
+
+        def ask(who, by):
+            ready.wait()
+            try:
+                who.ask("team-1", "laws", why="x", by=by)
+            except RequestRefused:
+                return "refused"
+            return "asked"
+
+        with ThreadPoolExecutor(2) as pool:
+            one, two = pool.submit(ask, book, "s1"), pool.submit(ask, other, "s2")
+            assert sorted([one.result(), two.result()]) == ["asked", "refused"]
+
+
+def test_a_request_goes_with_the_people(book):
+    """Under another name it goes on; another team of the same name does not inherit it."""
+    book.ask("team-1", "laws", why="see page 3", by="s1")
+    moved = {"team-1": "group-1"}
+    finish(book, make_grade("group-1", share=0.5, authors=("s-team-1",)), moved=moved, key="b ")
+    (asked,) = book.queue().waiting
+    assert (asked.entry.submission, asked.request.events[0].text) == ("group-1", "see page 3")
+    answer(book, 1.0)
+    finish(book, make_grade("group-1", share=0.5, authors=("someone",)), key="c ")
+    assert (book.n_waiting(), book.own_feedback("group-1").requests) == (0, {})
+
+
+def test_a_criterion_that_is_gone_can_still_be_answered(book):
+    """In words; points for it would mean nothing."""
+    book.ask("team-1", "laws", why="x", by="s1")
+    less = tuple(c for c in RUBRIC.criteria if c.id != "laws")
+    finish(
+        book, make_grade("team-1", share=0.5), rubric=RUBRIC.model_copy(update={"criteria": less})
+    )
+    with pytest.raises(ConfigError, match="no such criterion"):
+        answer(book, 1.0)
+    answer(book, None, text="nobody loses points for it now")
+    assert book.n_waiting() == 0
+
+
+def test_an_anonymous_history_does_not_say_who_asked(book):
+    """Neither by name nor in the words, as far as the names are known."""
+    anonymous = RUBRIC.model_copy(update={"anonymous": True})
+    finish(book, make_grade("team-1", share=0.5), rubric=anonymous)
+    book.ask("team-1", "laws", why="I, u42 of team-1 (S-team-1), see page 3", by="u42")
+    shown = pseudonyms_in(book)["team-1"]
+    text = history_text(*history_of(book, shown))
+    assert not [name for name in ("u42", "team-1") if name in text.casefold()]
+    assert "asked     laws: by the team: I, …" in text
+    assert "u42" in history_text(*history_of(book, "team-1"))
+
+
+def test_a_gradebook_made_before_opens(tmp_path):
+    """It gets the tables that it lacks; what is in it stays."""
+    with OpenBook(tmp_path, assignment="lab", create=True) as book:
+        finish(book, make_grade("team-1", share=0.5))
+    with closing(sqlite3.connect(tmp_path / FILE)) as old:
+        for table in ("request_events", "releases"):
+            old.execute(f"DROP TABLE {table}")
+        old.commit()
+    with RequestBook(tmp_path) as book:
+        assert (book.n_waiting(), book.released) == (0, False)
+        book.release(True, by="prof")
+        book.ask("team-1", "laws", why="x", by="s1")
+        answer(book, 1.0)
+        assert book.entry("team-1").grade.points == 10.5
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
+def test_a_kill_leaves_an_answer_with_its_points_or_neither(place):
+    """Whenever the process that answers is killed."""
+    assert_whole(place, kills=8)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
+def test_a_hundred_kills_leave_no_half_of_an_answer(place):
+    """The same, a hundred times."""
+    assert_whole(place, kills=100)
+
+
+def assert_whole(place: str, *, kills: int) -> None:
+    command = [sys.executable, "-m", "tests.helpers.gradebook_kills", place, str(kills), "answers"]
+    said = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert said.returncode == 0, said.stderr
+    done, within, told, _ = map(int, re.findall(r"\d+", said.stdout))
+    assert done == kills
+    assert within > kills // 4  # most lived long enough to answer
+    assert told >= within

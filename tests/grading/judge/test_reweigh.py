@@ -1,0 +1,115 @@
+"""Points under another rubric from what was found before: the same as grading again."""
+
+from dataclasses import replace
+from decimal import Decimal
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from pipeline.grading.judge.reweigh import (
+    findings_text,
+    needs_recordings,
+    read_findings,
+    reweigh,
+)
+from pipeline.grading.rubric import Rubric
+from tests.helpers.grading_students import Student, student
+
+
+def _erring(carts: int) -> Student:
+    """Return a team that is right in some places, near in others, and wrong in the rest."""
+    honest = student(carts)
+    names = honest.rubric.names
+    off = {name: honest.value("final", name) * (1 + 0.03 * i) for i, name in enumerate(names)}
+    off["K" if carts == 1 else "K_1"] *= 2.0
+    space = honest.reported.state_space
+    assert space is not None
+    rows = [list(row) for row in space.A]
+    rows[1][0] *= Decimal("1.12")
+    loop = honest.reported.feedback
+    assert loop is not None
+    claimed = loop.model_copy(update={"overshoot_percent": Decimal("14"), "prefilter": None})
+    return honest.reporting(
+        final=off,
+        state_space=space.model_copy(update={"A": tuple(map(tuple, rows))}),
+        feedback=claimed,
+    )
+
+
+@st.composite
+def _changes(draw, rubric: Rubric) -> Rubric:
+    """Return the rubric with other points, tolerances, costs, lateness and step."""
+    step = draw(st.sampled_from([0.01, 0.25, 0.5, 1.0]))
+    plain = rubric.model_dump(mode="json") | {"step": step}
+    for criterion in plain["criteria"]:
+        criterion["points"] = step * draw(st.integers(1, 12))
+        for full in [key for key in criterion if "full" in key]:
+            none = full.replace("full", "none")
+            low, high = sorted(draw(st.tuples(st.integers(0, 60), st.integers(0, 200))))
+            criterion[full], criterion[none] = low, high
+        if draw(st.booleans()):
+            criterion["requires"] = []
+    for code in draw(st.sets(st.sampled_from(sorted(plain["flags"])), max_size=4)):
+        plain["flags"][code] = draw(st.sampled_from([0.0, 0.1, 0.5, 1.0]))
+    plain["late"] |= {
+        "percent_per_day": draw(st.integers(0, 60)),
+        "grace_days": draw(st.sampled_from([0, 0.5, 2])),
+        "most_percent": draw(st.integers(0, 100)),
+    }
+    return Rubric.model_validate(plain)
+
+
+@pytest.mark.parametrize("carts", [1, 2])
+@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(data=st.data())
+def test_points_are_those_of_grading_again(carts, data):
+    """Whatever points, tolerances, costs, lateness and step: every criterion, and the total."""
+    team = _erring(carts)
+    now = data.draw(_changes(team.rubric))
+    before = team.graded(days_late=1.3)
+    kept = read_findings(findings_text(before.verdicts))
+
+    weighed = reweigh(before.grade, kept, rubric=now)
+
+    again = replace(team, rubric=now).grade(days_late=1.3)
+    assert [(c.id, c.outcome, c.points, c.out_of) for c in weighed.criteria] == [
+        (c.id, c.outcome, c.points, c.out_of) for c in again.criteria
+    ]
+    assert (weighed.points, weighed.deducted, weighed.out_of) == (
+        again.points,
+        again.deducted,
+        again.out_of,
+    )
+    assert needs_recordings(team.rubric, now) == []
+
+
+def test_the_same_rubric_gives_the_same_points():
+    """The test's team loses points in several ways, so equal points mean something."""
+    team = _erring(2)
+    before = team.graded(days_late=1.3)
+    weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
+    assert weighed.points == before.grade.points
+    assert {c.outcome for c in weighed.criteria} == {"pass", "partial", "fail"}
+
+
+def test_what_needs_the_recordings_is_named():
+    """Keys that decide what is compared with what."""
+    rubric = student(2).rubric
+    plain = rubric.model_dump(mode="json")
+    plain["required"]["final"] = ["K_*"]
+    plain["late"]["due"] = "2026-11-20T23:59:00-08:00"
+    laws = next(c for c in plain["criteria"] if c["check"] == "laws")
+    laws["frequency_percent"] = 4.0
+    gains = next(c for c in plain["criteria"] if c["id"] == "final-gains")
+    gains["sigmas"] = 2.0
+    gains["points"] = 1.0
+    plain["criteria"][0]["id"] = "another"
+    plain["criteria"] = [c | {"requires": []} for c in plain["criteria"]]
+    assert needs_recordings(rubric, Rubric.model_validate(plain)) == [
+        "required",
+        "late.due",
+        "criteria.another",
+        "criteria.final-gains.sigmas",
+        "criteria.laws.frequency_percent",
+    ]

@@ -1,0 +1,116 @@
+"""A class under another rubric: the preview says what grading again then gives."""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.grading.batch.runner import grade_batch
+from pipeline.grading.batch.worker import Setup
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.grading.publish.rubric_preview import preview_rubric
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.simulated.submission import Students, write_submission
+from tests.helpers.grades import fill_book, in_this_process
+
+RUBRIC = load_rubric(Path("throne-1dof"))
+LATE = {"team-1": 1.3}
+
+
+@pytest.fixture(scope="module")
+def school(tmp_path_factory) -> Path:
+    """An honest team, one that is late and in hertz, one with a gain off, and one not readable."""
+    folder = tmp_path_factory.mktemp("class")
+    for number in range(3):
+        own = folder / f"team-{number}"
+        students = Students(authors=(f"s{number}",))
+        write_submission(
+            own, "throne-1dof", seed=number, compact=True, reported=True, students=students
+        )
+        file = own / "submission.toml"
+        text = file.read_text(encoding="utf-8")
+        if number == 1:
+            text = re.sub(r"omega_n = (\S+)", lambda m: f"omega_n = {float(m[1]) / 6.28:.3g}", text)
+        if number == 2:
+            text = re.sub(r"\bK = (\S+)", lambda m: f"K = {1.1 * float(m[1]):.3g}", text)
+        file.write_text(text, encoding="utf-8")
+    (folder / "team-3").mkdir()
+    (folder / "team-3" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
+    return folder
+
+
+def _grade(school: Path, out: Path, rubric: Rubric) -> Gradebook:
+    book = Gradebook(out, create=True, assignment="lab")
+    hand_ins = find_hand_ins([school], scratch=out)
+    batch = grade_batch(
+        [replace(one, days_late=LATE.get(one.id, 0.0)) for one in hand_ins],
+        setup=Setup(rubric=rubric, scratch=out),
+        book=book,
+        execute=in_this_process,
+    )
+    book.finish(batch, rubric=rubric)
+    return book
+
+
+def test_the_preview_is_what_grading_again_gives(school, tmp_path):
+    """Points, tolerances, costs and lateness; who has points given by hand keeps those."""
+    plain = RUBRIC.model_dump(mode="json")
+    plain["late"]["percent_per_day"] = 40.0
+    plain["flags"]["hz_for_rad_s"] = 0.75
+    own = {criterion["id"]: criterion for criterion in plain["criteria"]}
+    own["final-gains"] |= {"points": 4.5, "full_percent": 2.0, "none_percent": 12.0}
+    own["pieces"]["points"] = 0.5
+    now = Rubric.model_validate(plain)
+    with _grade(school, tmp_path, RUBRIC) as book:
+        book.override("team-2", "final-dampings", 1.25, why="a slip", by="Ada")
+        before = {entry.submission: entry.grade.points for entry in book.entries()}
+
+        shown = preview_rubric(book, now)
+
+    with _grade(school, tmp_path, now) as book:
+        again = {entry.submission: entry.grade for entry in book.entries()}
+    assert {team.submission: (team.before, team.after) for team in shown.teams} == {
+        name: (before[name], grade.points)
+        for name, grade in again.items()
+        if grade.status == "graded"
+    }
+    assert {team.submission: team.late_after for team in shown.teams} == {
+        name: grade.deducted for name, grade in again.items() if grade.status == "graded"
+    }
+    for team in shown.teams:
+        points = {criterion.id: criterion.points for criterion in again[team.submission].criteria}
+        assert {c.id: c.after for c in team.criteria}.items() <= points.items()
+    assert (shown.failed, shown.unknown, shown.needs) == (1, (), ())
+    assert (shown.out_of_before, shown.out_of_after) == (20.0, now.out_of)
+    by_hand = next(team for team in shown.teams if team.submission == "team-2")
+    assert by_hand.by_hand == ("final-dampings",)
+    assert "final-dampings" not in {criterion.id for criterion in by_hand.criteria}
+    gains = [abs(team.gain) for team in shown.teams]
+    assert gains == sorted(gains, reverse=True)
+    assert len({team.gain for team in shown.teams}) == 3
+    assert sum(shown.bars_before) == sum(shown.bars_after) == 3
+
+
+def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
+    """Their points under another rubric are not guessed."""
+    fill_book(tmp_path)
+    with Gradebook(tmp_path) as book:
+        graded = [e.submission for e in book.entries() if e.grade.status == "graded"]
+        shown = preview_rubric(book, book.rubric)
+    assert sorted(shown.unknown) == sorted(graded)
+
+
+def test_who_was_graded_by_another_rubric_is_named(school, tmp_path):
+    """Left out of a later run with another rubric: their numbers are off by other limits."""
+    plain = RUBRIC.model_dump(mode="json")
+    plain["required"]["final"] = []
+    other = Rubric.model_validate(plain)
+    _grade(school, tmp_path, RUBRIC).close()
+    with _grade(school / "team-0", tmp_path, other) as book:
+        shown = preview_rubric(book, RUBRIC)
+    assert shown.unknown == ("team-1", "team-2")
+    assert [team.submission for team in shown.teams] == ["team-0"]
+    assert shown.needs == ("required",)

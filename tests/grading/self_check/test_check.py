@@ -1,0 +1,117 @@
+"""The check: which numbers disagree and where to look, and no answer from which a value follows."""
+
+import json
+import re
+from functools import cache
+
+import pytest
+
+from pipeline.grading.self_check.check import JudgedNumbers, judge_numbers, next_answer
+from pipeline.grading.self_check.log import CheckAnswer, answer_line
+from pipeline.grading.self_check.words import answer_lines
+from tests.helpers.grading_class import Team, make_team
+from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS, reporting, scaled
+
+SEEDS = range(3)  # a bench each of one, two and three carts
+NOT_PLACED = {  # no number disagrees with the recordings
+    "initial_final_disagree",
+    "missing",
+    "no_fit_done",
+}
+team = cache(make_team)
+
+
+def slipped(slip: str, seed: int) -> Team:
+    """Return the team of a seed with a slip, or as it is where one cart cannot have it."""
+    one = team(seed)
+    alone = one.bench.chain.n == 1 and slip in OF_SEVERAL_CARTS
+    return one if alone else SLIPS[slip](one)
+
+
+def judge(one: Team) -> JudgedNumbers:
+    return judge_numbers(one.submission, one.analysis, rubric=one.rubric)
+
+
+def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
+    first = next_answer(found, (), basis="0")
+    return first, next_answer(found, (first,), basis="0")
+
+
+def stripped(text: str, one: Team) -> str:
+    """Return a text without what is no number: names of numbers, recordings, carts; the counts."""
+    for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
+        text = text.replace(run, "")
+    text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
+    text = re.sub(r"^(\d+ of|All) \d+ numbers?|Asked \d+ times?", "", text, flags=re.MULTILINE)
+    said = ("2π", "cart 1", "n − 1", "log10", "cartlab-check/1")  # whatever the recordings are
+    return re.sub("|".join(said), "", text)
+
+
+@pytest.mark.parametrize("slip", sorted(SLIPS))
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
+    """Neither stage has a digit left once names and counts are taken away, in words or in JSON."""
+    one = slipped(slip, seed)
+    for answer in asked_twice(judge(one)):
+        said = stripped("\n".join(answer_lines(answer)), one)
+        assert re.findall(r".*\d.*", said) == []
+        plain = json.loads(answer_line(answer))
+        assert (plain.pop("ask"), plain.pop("basis")) == (answer.ask, "0")
+        assert re.findall(r".{0,30}\d.{0,30}", stripped(json.dumps(plain), one)) == []
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_answer_tells_neither_side_nor_size(seed):
+    """A gain a third too large, half too large and a third too small: one answer, word for word."""
+    one = team(seed)
+    name = next(iter(one.reported.final))
+    answers = set()
+    for factor in (1.33, 1.55, 1 / 1.33):
+        moved = scaled(one, [name], factor, ["final"])
+        alone = moved.reported.model_copy(update={"feedback": None, "state_space": None})
+        _, where = asked_twice(judge(reporting(moved, alone)))
+        assert where.disagree == (f"final.{name}",)
+        answers.add(answer_line(where))
+    assert len(answers) == 1
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_honest_numbers_agree(seed):
+    """Readings and fits of careful students: nothing disagrees beyond what also loses points."""
+    one = team(seed)
+    found = judge(one)
+    assert found.agree
+    assert len(found.disagree) <= 1
+    assert next_answer(found, (), basis="0").stage == "which"
+
+
+@pytest.mark.parametrize("slip", sorted(SLIPS.keys() - NOT_PLACED))
+def test_each_common_mistake_is_placed(slip):
+    """Asked again, the kind of mistake is named for a number that it made wrong, most times."""
+    placed = []
+    for seed in SEEDS:
+        one = slipped(slip, seed)
+        found = judge(one)
+        if one is team(seed) or not found.disagree:
+            continue
+        _, where = asked_twice(found)
+        assert {hint.number for hint in where.hints} == set(found.disagree)
+        placed.append(slip in {code for h in where.hints for code in (h.slip, *h.or_else)})
+    assert placed
+    assert sum(placed) >= 0.6 * len(placed)
+
+
+def test_where_is_told_only_of_what_disagreed_and_was_not_changed():
+    """First which; then where, of what was asked for; after any change which again."""
+    one = SLIPS["peak_to_peak"](team(1))
+    found = judge(one)
+    first, second = asked_twice(found)
+    assert (first.stage, first.hints) == ("which", ())
+    assert (second.stage, second.ask) == ("where", 2)
+    changed = next_answer(found, (first, second), basis="1")
+    assert (changed.stage, changed.ask, changed.hints) == ("which", 3, ())
+    number = found.disagree[-1]
+    of_one = next_answer(found, (first,), basis="0", where=[number])
+    assert [hint.number for hint in of_one.hints] == [number]
+    honest = next_answer(judge(team(1)), (first,), basis="0", where=["final.K_1"])
+    assert honest.stage == "which"

@@ -1,0 +1,171 @@
+"""`cartlab check` as it is typed: its exit status, its file, and folders that were changed."""
+
+import json
+import re
+import sys
+
+import jsonschema
+import pytest
+
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.grade import read_grade
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.self_check.log import FILE, read_answers
+from pipeline.resources import RUBRICS
+from tests.helpers.commandline import Done, cartlab_here
+from tests.helpers.desks import a_submission
+from tests.helpers.places import ROOT
+
+RUBRIC = RUBRICS / "throne-1dof.toml"
+
+
+def change(folder, old, new):
+    """Type something else into `submission.toml`, once."""
+    path = folder / "submission.toml"
+    text = path.read_text(encoding="utf-8")
+    assert old in text
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def check(folder, *more) -> Done:
+    return cartlab_here("check", folder, *more)
+
+
+@pytest.fixture
+def honest(tmp_path):
+    """A submission whose numbers are right."""
+    return a_submission(tmp_path / "team")
+
+
+@pytest.fixture
+def in_hertz(honest):
+    """One whose first frequency is in Hz."""
+    change(honest, "omega_n = 13.1", "omega_n = 2.085")
+    return honest
+
+
+def test_right_numbers_are_status_0(honest):
+    """And the one ask is in the folder."""
+    done = check(honest, "--rubric", RUBRIC)
+    assert done.returncode == 0
+    assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
+    assert len(read_answers(honest)) == 1
+
+
+def test_first_which_then_where(in_hertz):
+    """Status 1 both times; the value, 13.1, is in neither, nor in the file."""
+    first, second = check(in_hertz), check(in_hertz)
+    assert (first.returncode, second.returncode) == (1, 1)
+    assert "initial.omega_n" in first.stdout
+    assert "Hz" not in first.stdout
+    assert "initial.omega_n: Hz where rad/s is asked" in second.stdout
+    assert re.search(r"Look at (decay-|every decay)", second.stdout)
+    assert "Asked 2 times." in second.stdout
+    for said in (first.stdout, second.stdout, (in_hertz / FILE).read_text(encoding="utf-8")):
+        assert not re.search(r"13[.\d]|6\.28", said)
+
+
+def test_a_change_begins_again_with_which(in_hertz):
+    """Also one that is wrong again; every ask is counted."""
+    check(in_hertz)
+    change(in_hertz, "omega_n = 2.085", "omega_n = 9.0")
+    again = check(in_hertz)
+    assert "Where to look" not in again.stdout
+    assert [one.stage for one in read_answers(in_hertz)] == ["which", "which"]
+
+
+def test_json_is_the_line_that_is_added(in_hertz):
+    """It fits the shipped schema, and holds no time."""
+    schema = json.loads((ROOT / "docs" / "check.schema.json").read_text(encoding="utf-8"))
+    lines = [check(in_hertz, "--json").stdout for _ in range(3)]
+    assert (in_hertz / FILE).read_text(encoding="utf-8") == "".join(lines)
+    for number, line in enumerate(lines, start=1):
+        jsonschema.Draft202012Validator(schema).validate(json.loads(line))
+        assert json.loads(line)["ask"] == number
+
+
+def test_a_rubric_of_other_carts_cannot_be_used(honest):
+    """One line says so; nothing is counted."""
+    done = check(honest, "--rubric", "throne-2dof")
+    assert done.returncode == 2
+    assert "the submission is for 1 cart, the rubric for 2" in done.stderr
+    assert not (honest / FILE).exists()
+
+
+def test_nothing_reported_cannot_be_checked(honest):
+    """It says what to write where."""
+    path = honest / "submission.toml"
+    text = path.read_text(encoding="utf-8").partition("[reported")[0]
+    path.write_text(text, encoding="utf-8")
+    done = check(honest)
+    assert done.returncode == 2
+    assert "no number is reported yet: write what you found under" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "text", ["", "\n", "{}\n", "no json\n", '{"ask": 1}\n', "[" * 100_000, "\x00", "\u2028\n"]
+)
+def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
+    """One line names it; the file stays. An empty one holds nothing, and is gone on from."""
+    (honest / FILE).write_text(text, encoding="utf-8")
+    done = check(honest)
+    if text:
+        assert done.returncode == 2
+        assert f"{FILE}, line 1: expected what `cartlab check` wrote" in done.stderr
+        assert (honest / FILE).read_text(encoding="utf-8") == text
+    else:
+        assert done.returncode == 0
+
+
+def test_a_line_taken_out_is_refused(in_hertz):
+    """The asks are numbered, so fewer of them show."""
+    for _ in range(3):
+        check(in_hertz)
+    _, *rest = (in_hertz / FILE).read_text(encoding="utf-8").splitlines(keepends=True)
+    (in_hertz / FILE).write_text("".join(rest), encoding="utf-8")
+    assert check(in_hertz).returncode == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links of POSIX")
+def test_a_link_is_not_followed(honest, tmp_path):
+    """The file behind it is neither read nor written."""
+    other = tmp_path / "other.txt"
+    other.write_text("mine", encoding="utf-8")
+    (honest / FILE).symlink_to(other)
+    done = check(honest)
+    assert done.returncode == 2
+    assert f"{FILE}: is a link" in done.stderr
+    assert other.read_text(encoding="utf-8") == "mine"
+
+
+def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
+    """In a note, without points lost for it; also that the file was changed."""
+    check(in_hertz)
+    check(in_hertz)
+
+    def notes() -> tuple[str, ...]:
+        task = Task(id="team", key="k", sources=(str(in_hertz),))
+        return read_grade(
+            grade_task(task, rubric=load_rubric(RUBRIC), scratch=tmp_path).grade
+        ).notes
+
+    assert "cartlab check was asked 2 times." in notes()
+    (in_hertz / FILE).write_text("{}\n", encoding="utf-8")
+    assert "is not as it was written" in notes()[-1]
+
+
+def test_what_students_see_is_report_or_check(honest, tmp_path):
+    """Anything else is one line that says what was expected, in a rubric and in a submission."""
+    rubric = tmp_path / "lab.toml"
+    text = RUBRIC.read_text(encoding="utf-8")
+    rubric.write_text(text + '\n[students]\nsee = "chekc"\n', encoding="utf-8")
+    done = check(honest, "--rubric", rubric)
+    assert done.returncode == 2
+    expected = "students.see: expected 'report' or 'check', found"
+    assert re.search(rf"lab\.toml line \d+: {expected} 'chekc'", done.stderr)
+    rubric.write_text(text + '\n[students]\nsee = "check"\n', encoding="utf-8")
+    assert load_rubric(rubric).students.see == "check"
+    change(honest, "[system]", '[students]\nsee = "all"\n\n[system]')
+    done = check(honest)
+    assert done.returncode == 2
+    assert expected in done.stderr

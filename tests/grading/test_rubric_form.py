@@ -1,0 +1,135 @@
+"""A rubric's numbers as a form: what is written back changes nothing else."""
+
+import re
+import tomllib
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.errors import ConfigError
+from pipeline.grading.rubric_file import load_rubric, parse_rubric
+from pipeline.grading.rubric_form import (
+    WrongFields,
+    changed_fields,
+    rubric_form,
+    with_values,
+)
+from pipeline.resources import RUBRICS
+
+SHIPPED = {path.stem: path.read_text(encoding="utf-8") for path in sorted(RUBRICS.glob("*.toml"))}
+
+
+def typed_into(text: str, **typed: str) -> str:
+    """Return the text of a rubric after a form was filled in."""
+    form = rubric_form(parse_rubric(text, where=""))
+    return with_values(
+        text, changed_fields(form, {k.replace("__", "."): v for k, v in typed.items()})
+    )
+
+
+def _comments(text: str) -> list[str]:
+    return [line.partition("#")[2] for line in text.splitlines() if "#" in line]
+
+
+@settings(max_examples=60, deadline=None)
+@given(data=st.data())
+def test_a_form_keeps_comments_and_order(data):
+    """Any fields changed: the file says the new values, and every other line is as it was."""
+    text = SHIPPED[data.draw(st.sampled_from(sorted(SHIPPED)))]
+    form = rubric_form(parse_rubric(text, where=""))
+    fields = data.draw(st.lists(st.sampled_from(list(form.fields())), min_size=1, max_size=6))
+    typed = {
+        field.name: str(data.draw(st.decimals(0, 100, places=2, allow_nan=False)))
+        for field in fields
+    }
+
+    changed = changed_fields(form, typed)
+    new = with_values(text, changed)
+
+    document, before = tomllib.loads(new), tomllib.loads(text)
+    for key, number in changed.items():
+        here: Any = document
+        for part in key[:-1]:
+            here = here[part]
+        assert Decimal(str(here.pop(key[-1]))) == number
+        was: Any = before
+        for part in key[:-1]:
+            was = was.get(part, {}) if isinstance(was, dict) else was[part]
+        was.pop(key[-1], None)
+    assert document == before
+    assert _comments(new) == _comments(text)
+    left = iter(_without_numbers(new))
+    assert all(line in left for line in _without_numbers(text))  # all of them, in their order
+
+
+def _without_numbers(text: str) -> list[str]:
+    return [re.sub(r"(?<== )[0-9.]+", "a number", line) for line in text.splitlines()]
+
+
+def test_nothing_changed_is_the_same_text():
+    """Values sent back as they were shown, or with zeros that say nothing, change no byte."""
+    for text in SHIPPED.values():
+        form = rubric_form(parse_rubric(text, where=""))
+        shown = {field.name: field.value for field in form.fields()}
+        assert with_values(text, changed_fields(form, shown)) == text
+        zeros = {
+            name: f"{value}0" if "." in value else f"{value}.0" for name, value in shown.items()
+        }
+        assert with_values(text, changed_fields(form, zeros)) == text
+
+
+def test_late_work_at_half_and_a_point_for_hertz():
+    """One digit in a line with its comment; one line more in a table that is there."""
+    text = SHIPPED["throne-1dof"]
+    late = typed_into(text, late__percent_per_day="50")
+    assert late == text.replace("percent_per_day = 10", "percent_per_day = 50")
+    hertz = typed_into(text, flags__hz_for_rad_s="50")
+    added = [line for line in hertz.splitlines() if line not in text.splitlines()]
+    assert added == ["hz_for_rad_s = 0.5"]
+    assert hertz.index("data_problem = 0.25") < hertz.index(added[0]) < hertz.index("[late]")
+    assert parse_rubric(hertz, where="").flags.of("hz_for_rad_s") == 0.5
+
+
+def test_a_table_that_is_not_there_is_made_before_the_criteria():
+    """And not within a criterion, nor between one and the comment above it."""
+    text = SHIPPED["throne-1dof"]
+    start, end = text.index("[late]"), text.index("[[criteria]]")
+    bare = f"{text[:start]}# what is judged\n{text[end:]}"
+    new = typed_into(bare, late__percent_per_day="12,5")
+    head = new[: new.index("# what is judged")]
+    assert head.endswith("[late]\npercent_per_day = 12.5\n\n")
+    assert parse_rubric(new, where="").late.percent_per_day == 12.5
+
+
+def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
+    """An inline table is not taken apart."""
+    text = SHIPPED["throne-1dof"]
+    start, end = text.index("[late]"), text.index("[[criteria]]")
+    inline = "late = { percent_per_day = 10 }\n" + text[:start] + text[end:]
+    with pytest.raises(ConfigError, match=r"late\.percent_per_day: is not on a line"):
+        typed_into(inline, late__percent_per_day="50")
+
+
+def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
+    """A message may show a line of TOML."""
+    text = SHIPPED["throne-1dof"].replace(
+        'title = "the pieces asked for"\npoints = 1',
+        'title = """the pieces\npoints = 7\n"""\npoints = 1',
+    )
+    new = typed_into(text, criteria__pieces__points="2")
+    assert new == text.replace('"""\npoints = 1', '"""\npoints = 2')
+
+
+def test_no_number_is_named_with_its_field():
+    """All of them at once."""
+    form = rubric_form(load_rubric(Path("throne-1dof")))
+    with pytest.raises(WrongFields) as wrong:
+        changed_fields(
+            form, {"step": "much", "criteria.pieces.points": "", "late.grace_days": "nan"}
+        )
+    assert sorted(wrong.value.problems) == ["criteria.pieces.points", "late.grace_days", "step"]
+    assert wrong.value.problems["step"] == "needs a number, found 'much'"

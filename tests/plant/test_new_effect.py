@@ -1,0 +1,109 @@
+"""A new effect takes its file and its line in the catalogue; the rest is made from its law."""
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+import pipeline
+from docs.codegen.__main__ import MADE
+from pipeline.plant.nonlinear.effects import CATALOGUE
+from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
+from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw, HysteresisLaw
+
+ROOM = Path(pipeline.__file__).parent
+CUBIC_DRAG = Effect(
+    key="cubic_drag",
+    title="Cubic drag",
+    sentence="The resistance grows with the third power of the speed.",
+    place="cart",
+    law=ForceLaw("-q * v**3"),
+    parameters=(EffectParameter("coefficient", "q", "input s^3/position^3", scale="damping"),),
+    fingerprint="Large swings die faster than small ones.",
+    deciding_run="Free decay from two release heights.",
+    reference="none: it stands here for any new law",
+    axis="velocity",
+)
+
+
+def function_of(name: str, source: str, **known: object) -> Any:
+    """Return one function of a made file, as it would run without the compiler."""
+    tree = ast.parse(source)
+    (found,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == name)
+    found.decorator_list = []
+    space: dict[str, Any] = dict(known)
+    exec(compile(ast.Module(body=[found], type_ignores=[]), name, "exec"), space)
+    return space[name]
+
+
+def kinds_of(source: str, name: str) -> dict[str, int]:
+    """Return the members of an enumeration in a made file."""
+    (found,) = (n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name)
+    return {
+        one.targets[0].id: ast.literal_eval(one.value)
+        for one in found.body
+        if isinstance(one, ast.Assign) and isinstance(one.targets[0], ast.Name)
+    }
+
+
+@pytest.fixture(scope="module")
+def made() -> dict[str, str]:
+    """Return what is made from a catalogue with one effect more."""
+    return {name: source((*CATALOGUE, CUBIC_DRAG)) for name, source in MADE.items()}
+
+
+def test_its_columns_force_and_slopes_are_made(made):
+    """The simulator reads its parameter from a column of its own, and knows its derivative."""
+    columns = kinds_of(made["columns.py"], "Cart")
+    Cart = type("Cart", (), columns)
+    row = np.zeros((1, len(columns)))
+    row[0, columns["CUBIC_DRAG_COEFFICIENT"]] = 2.0
+
+    force = function_of("cart_force", made["simulator/laws.py"], Cart=Cart)
+    slopes = function_of("cart_slopes", made["simulator/laws.py"], Cart=Cart)
+
+    assert_allclose(force(row, 0, 0.3, 0.5, 0.0), -2.0 * 0.5**3)
+    assert_allclose(slopes(row, 0, 0.3, 0.5, 0.0), (0.0, -6.0 * 0.5**2))
+
+
+def test_a_model_that_follows_knows_it(made):
+    """By its kind: the law, its slopes, and its derivative by the coefficient."""
+    source = made["simulator/terms.py"]
+    kinds = kinds_of(source, "Kind")
+    terms = function_of("terms", source, Kind=type("Kind", (), kinds))
+    out = np.zeros(11)
+
+    terms(kinds["CUBIC_DRAG"], np.array([2.0]), 0, 0.3, 0.5, 0.0, 0.1, 1.0, out)
+
+    assert_allclose(out[:5], (-2.0 * 0.5**3, 0.0, -6.0 * 0.5**2, 0.0, -(0.5**3)))
+
+
+PLAIN = [
+    effect
+    for effect in CATALOGUE
+    if isinstance(effect.law, ForceLaw | FrictionLaw | HysteresisLaw)
+    and effect.place != "input"
+    and not effect.only_rest
+]
+
+
+@pytest.mark.parametrize("effect", PLAIN, ids=lambda effect: effect.key)
+def test_no_other_file_of_the_plant_names_it(effect):
+    """A law without a state that the simulators have built in stands in one file alone.
+
+    Trial shapes of laws that need one are in `gap.follow.score`.
+    """
+    files = {
+        path.relative_to(ROOM).as_posix()
+        for room in ("plant", "gap")
+        for path in (ROOM / room).rglob("*.py")
+        if re.search(rf"\b({effect.key}|{effect.key.upper()}\w*)\b", path.read_text("utf-8"))
+    }
+    allowed = {f"plant/nonlinear/{name}" for name in MADE} | {"gap/follow/score.py"}
+    allowed |= {"gap/follow/choose.py"}  # of two laws of dry friction on a cart one goes
+    named = {name for name in files if not name.startswith("plant/nonlinear/effects/")}
+    assert named <= allowed

@@ -1,0 +1,31 @@
+"""A cart looks alike wherever it is drawn: in figures, live, and in the thumbnails of the desk."""
+
+import re
+
+from pipeline.report.figures.style import CARTS, MEASURED, MODEL, SECOND, THIRD
+from pipeline.resources import TEMPLATES
+
+ROLES = {MODEL: "model", SECOND: "second", THIRD: "third", MEASURED: "ink"}
+
+
+def sheet(name: str) -> str:
+    """Return a style sheet or a script as text."""
+    return (TEMPLATES / name).read_text(encoding="utf-8")
+
+
+def test_pages_have_the_colours_of_the_figures():
+    """The style sheet has one row a cart, of the colour that figures draw it in."""
+    rows = re.findall(r"--cart-(\d): var\(--f-(\w+)\);", sheet("report.css"))
+    assert rows == [(str(n), ROLES[colour]) for n, (colour, *_) in enumerate(CARTS, start=1)]
+    dashes = re.findall(r"--cart-(\d)-dash: ([\d ]+);", sheet("report.css"))
+    assert [cart for cart, _ in dashes] == [str(n) for n in range(1, len(CARTS) + 1)]
+    assert len({dash for _, dash in dashes}) == len(CARTS)
+
+
+def test_other_pages_take_the_colours_from_there():
+    """No page has colours of its own for carts."""
+    desk = re.findall(r"\.thumb [^{]*\{[^}]*stroke: var\((--[\w-]+)\)", sheet("desk/desk.css"))
+    assert desk == [f"--cart-{n}" for n in range(1, len(CARTS) + 1)]
+    live = sheet("live.js")
+    assert "colour: `--cart-${i + 1}`, dash: `--cart-${i + 1}-dash`" in live
+    assert re.findall(r"#[0-9a-f]{3,6}\b", live) == []

@@ -1,0 +1,69 @@
+"""How pages come to be full: what is tried, and what is kept of it."""
+
+from collections.abc import Callable
+
+from pipeline.report.render.room import Choices, End, Pages, fill_pages
+
+TOP, BOTTOM = 50.0, 750.0
+
+
+def figures(*heights: float) -> Callable[[Choices], Pages]:
+    """Return how figures of such heights are laid out, one after the other."""
+
+    def lay_out(choices: Choices) -> Pages:
+        ends, page, y = [], 1, TOP
+        for number, height in enumerate(heights, start=1):
+            share = choices.shares.get(number, 1.0)
+            if y + share * height > BOTTOM:
+                page, y = page + 1, TOP
+            y += share * height
+            end = End(page=page, y=y, picture=number, share=share, height=share * height)
+            ends.append(end)
+        return Pages(ends=ends, top=TOP, bottom=BOTTOM)
+
+    return lay_out
+
+
+def test_a_figure_that_nearly_fits_comes_up():
+    """It and the one above it are drawn smaller, alike."""
+    shares = fill_pages(figures(400.0, 350.0, 100.0)).shares
+    assert shares == {1: shares[1], 2: shares[1]}
+    assert (BOTTOM - TOP) * 0.9 < shares[1] * 750.0 <= BOTTOM - TOP
+
+
+def test_no_figure_becomes_too_small_to_read():
+    """Of one that does not fit by far, the page stays white."""
+    assert fill_pages(figures(400.0, 600.0, 100.0)) == Choices()
+
+
+def test_full_pages_are_left_as_they_are():
+    """The document is laid out once."""
+    told = []
+
+    def lay_out(choices: Choices) -> Pages:
+        told.append(choices)
+        return figures(600.0, 600.0)(choices)
+
+    assert fill_pages(lay_out) == Choices()
+    assert told == [Choices()]
+
+
+def test_a_table_stays_whole_where_less_is_white_then():
+    """It stood in two parts, and the page of the second one was half empty."""
+
+    def lay_out(choices: Choices) -> Pages:
+        begun = 2 if choices.whole == (7,) else 1
+        ends = [
+            End(page=1, y=BOTTOM - 150.0),
+            End(page=begun, y=TOP + 20.0, table=7),
+            End(page=2, y=TOP + 250.0 * begun, table=7),
+            End(page=3, y=BOTTOM, picture=1, height=700.0),
+        ]
+        return Pages(ends=ends, top=TOP, bottom=BOTTOM)
+
+    assert fill_pages(lay_out) == Choices(whole=(7,))
+
+
+def test_a_document_without_blocks_has_no_pages_to_fill():
+    """Nothing is chosen."""
+    assert fill_pages(lambda choices: Pages(ends=[], top=TOP, bottom=BOTTOM)) == Choices()

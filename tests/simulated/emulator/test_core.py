@@ -1,0 +1,193 @@
+"""The controller's state machine, tick by tick."""
+
+import numpy as np
+import pytest
+
+from pipeline.bench.protocol.messages import (
+    EXTENSIONS,
+    FULL_SCALE,
+    Description,
+    PidGains,
+    Reading,
+    Start,
+    StateGains,
+    Wave,
+    encode,
+    parse_reading,
+)
+from pipeline.bench.protocol.waves import target_at
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.loop.sampled_loop import LoopSetup, Pid, StateFeedback, simulate_loop
+from pipeline.simulated.emulator.core import ReferenceCore
+
+PERIOD = 1e-3
+# Two carts in counts and duty counts: some 10 counts a duty count, 2 and 5 Hz.
+CHAIN = Chain(m=np.array([2e-4, 1.5e-4]), c=np.array([2e-4, 1e-4]), k=np.array([0.0, 0.1, 0.06]))
+
+
+def make_core(**changes) -> ReferenceCore:
+    fields = {"name": "x", "encoders": 2, "carts": 2, "commands": EXTENSIONS} | changes
+    return ReferenceCore(Description(**fields))
+
+
+def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
+    """Tell the core something, then tick; returns its lines. `y` gives the counts at each tick."""
+    core.receive(commands)
+    for k in range(first, first + ticks):
+        core.tick(y(k), stamp=k, now=k)
+    lines = [parse_reading(line) for line in core.take().splitlines()]
+    assert None not in lines
+    return [line for line in lines if line is not None]
+
+
+def still(k: int) -> tuple[int, int]:
+    return 7, -3
+
+
+@pytest.mark.parametrize("wave", Wave)
+def test_a_run_streams_its_wave_and_ends(wave):
+    """A run of REPS/FREQ seconds sends that many lines of the wave, clipped, and goes silent."""
+    start = Start(wave=wave, frequency=8.0, amplitude=5000, cycles=3)
+    lines = run(make_core(), encode(start), still, ticks=500)
+    assert [line.ms for line in lines] == list(range(375))
+    assert [line.target for line in lines] == [target_at(start, 1e-3 * ms) for ms in range(375)]
+    assert all(line.duty == np.clip(line.target, -FULL_SCALE, FULL_SCALE) for line in lines)
+    assert all(line.counts == (0, 0) for line in lines)  # zeroed where it had its power
+
+
+def test_the_waves_are_what_they_are_called():
+    """Each wave at the eighths of its period of 0.8 s, and a chirp's instantaneous frequency."""
+
+    def eighths(wave: Wave) -> list[int]:
+        start = Start(wave=wave, frequency=1.25, amplitude=1000)
+        return [target_at(start, 0.1 * k) for k in range(8)]
+
+    assert eighths(Wave.DELTA) == [1000, 0, 0, 0, 0, 0, 0, 0]
+    assert eighths(Wave.SQUARE) == [0, 0, 0, 0, 1000, 1000, 1000, 1000]
+    assert eighths(Wave.SINE) == [0, 707, 1000, 707, 0, -707, -1000, -707]
+    assert eighths(Wave.TRIANGLE) == [0, 500, 1000, 500, 0, -500, -1000, -500]
+    assert eighths(Wave.SAWTOOTH) == [0, 250, 500, 750, -1000, -750, -500, -250]
+    pulse = Start(wave=Wave.DELTA, frequency=1.0, amplitude=9, cycles=2)
+    assert [target_at(pulse, t) for t in (0.0, 0.049, 0.051, 1.0, 1.049, 1.051)] == [9, 9, 0] * 2
+
+    chirp = Start(wave=Wave.CHIRP, frequency=1.0, amplitude=1_000_000, cycles=20)
+    t = np.arange(0, 20, 1e-4)
+    x = np.array([target_at(chirp, s, chirp_end=10.0) for s in t])
+    rising = t[:-1][(x[:-1] < 0) & (x[1:] >= 0)]
+    # Between two upward zeros the mean frequency is that in their middle, but for its curvature:
+    # (ln 10 / 20 / f)² / 24 of it, under 1e-3.
+    np.testing.assert_allclose(
+        1 / np.diff(rising), 10 ** ((rising[1:] + rising[:-1]) / 40), rtol=1e-3
+    )
+    assert (
+        target_at(Start(wave=Wave.CHIRP, frequency=2.0, amplitude=10), 0.125, chirp_end=2.0) == 10
+    )
+
+
+def simulated(controller, reference, *, delay):
+    t = PERIOD * np.arange(reference.size)
+    return simulate_loop(
+        CHAIN,
+        controller,
+        t=t,
+        reference=reference,
+        setup=LoopSetup(sample_time=PERIOD, delay=delay, input_limit=FULL_SCALE, encoder_step=1.0),
+    )
+
+
+@pytest.mark.parametrize("amplitude", [400, 40_000])
+def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
+    """The duty is what the loop's simulation asks for at the same readings, clipping included."""
+    gains = StateGains(gains=(0.02, 0.002, 0.05, -0.001), prefilter=0.3)
+    start = Start(wave=Wave.SQUARE, encoder=1, frequency=2.0, amplitude=amplitude)
+    r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
+    loop = simulated(
+        StateFeedback(gains=np.array(gains.gains), prefilter=gains.prefilter), r, delay=1
+    )
+    y = np.rint(loop.x).astype(int)
+    lines = run(make_core(), encode(gains) + encode(start), lambda k: tuple(y[:, k]), ticks=500)
+    assert np.abs(loop.u).max() > 100
+    # Half a count is the rounding of the duty; arithmetic in another order may tip it over.
+    np.testing.assert_allclose([line.duty for line in lines], loop.u, atol=0.5 + 1e-6)
+
+
+@pytest.mark.parametrize("encoder", [1, 2])
+def test_pid_is_the_law_of_the_simulated_loop(encoder):
+    """The duty is what the loop's simulation asks for at the same readings, acting at once."""
+    gains = PidGains(kp=0.05, ki=0.2, kd=0.001)
+    start = Start(wave=Wave.SAWTOOTH, encoder=encoder, frequency=2.0, amplitude=3000)
+    r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
+    loop = simulated(Pid(kp=gains.kp, ki=gains.ki, kd=gains.kd, cart=encoder), r, delay=0)
+    y = np.rint(loop.x).astype(int)
+    lines = run(make_core(), encode(gains) + encode(start), lambda k: tuple(y[:, k]), ticks=500)
+    assert np.abs(loop.u).max() > 100
+    np.testing.assert_allclose([line.duty for line in lines], loop.u, atol=0.5 + 1e-6)
+
+
+def test_the_last_gains_count_from_the_next_start():
+    """`g` after `f` makes it a PID; gains that come in a run change the next one only."""
+    core = make_core()
+    lines = run(core, b"g;1;0;0;d;q;c;o;10;50;5;", still, ticks=100)
+    assert lines[-1].duty == 50
+    lines = run(core, b"f;0;0;0;0;2;", still, ticks=100, first=100)
+    assert lines[-1].duty == 50
+    lines = run(core, b"d;q;c;o;10;50;1;", still, ticks=100, first=200)
+    assert lines[-1].duty == 100
+    lines = run(core, b"g;3;0;0;d;q;c;o;10;50;1;", still, ticks=100, first=300)
+    assert lines[-1].duty == 150
+
+
+def test_a_reset_forgets_and_a_stop_does_not():
+    """After `z` counts are zero and gains are gone; after `s` both are as before."""
+    core = make_core()
+    run(core, b"g;1;0;0;d;q;c;o;10;50;5;", lambda k: (k, 0), ticks=10)
+    assert run(core, b"s;", lambda k: (k, 0), ticks=10, first=10) == []
+    lines = run(core, b"d;q;c;o;10;50;1;", lambda k: (k, 0), ticks=10, first=20)
+    assert (lines[0].counts, lines[-1].duty) == ((20, 0), -29)
+    lines = run(core, b"z;d;q;c;o;10;50;1;", lambda k: (k, 0), ticks=100, first=30)
+    assert lines[0].counts == (0, 0)
+    assert {line.duty for line in lines} == {0}
+
+
+def test_a_start_in_mid_run_begins_anew():
+    """Stamps begin again at zero, and so do the sums of the PID."""
+    core = make_core()
+    first = run(core, b"g;0;1;0;d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80)
+    again = run(core, b"d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80, first=80)
+    assert [line.ms for line in again] == list(range(80))
+    assert first == again
+
+
+def test_silence_after_a_heartbeat_cuts_the_motor():
+    """100 ms of wall time after the last heartbeat the run ends, and no other begins without one.
+
+    A bench that never had one runs on; a reset disarms.
+    """
+    core = make_core()
+    core.receive(b"k;d;q;o;o;1;50;9;")
+    for k in range(600):  # a bench six times as fast as time
+        core.tick((0, 0), stamp=k, now=k // 6)
+    assert len(core.take().splitlines()) == 600  # 99 ms of wall time
+    core.tick((0, 0), stamp=600, now=100)
+    assert core.take() == b""
+    assert run(core, b"d;q;o;o;1;50;9;", still, ticks=50, first=700) == []
+    assert len(run(core, b"k;d;q;o;o;1;50;9;", still, ticks=500, first=800)) == 100
+    assert len(run(core, b"z;d;q;o;o;1;50;9;", still, ticks=500, first=1400)) == 500
+
+
+def test_a_query_is_answered_and_hands_are_not_the_controllers():
+    """A query in mid-run gets its line between the others; `h` changes nothing; stock is silent."""
+    core = make_core()
+    core.receive(b"d;q;o;o;1;50;1;h;1;2;?;")
+    core.tick((0, 0), stamp=0, now=0)
+    answer, reading = core.take().splitlines()
+    assert answer.startswith(b"?cartlab/1 name=x ")
+    assert parse_reading(reading) == Reading(counts=(0, 0), target=0, duty=0, ms=0)
+    assert run(make_core(commands=frozenset()), b"?;s;k;", still, ticks=3) == []
+
+
+def test_a_bench_of_three_encoders_sends_three_counts():
+    """The line then has one field more, and state feedback six gains."""
+    core = make_core(encoders=3, carts=3)
+    lines = run(core, b"f;0;0;0;0;1;0;0;d;q;c;o;100;9;1;", lambda k: (0, 0, k), ticks=5)
+    assert lines[-1] == Reading(counts=(0, 0, 4), target=0, duty=-4, ms=4)

@@ -1,0 +1,337 @@
+"""The virtual bench over a real line: pyserial talks to `cartlab emulate` in another process."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+import serial
+
+from pipeline.bench.protocol.messages import (
+    STOCK_STOP,
+    WATCHDOG,
+    Hands,
+    Reading,
+    Signal,
+    Start,
+    Wave,
+    encode,
+    parse_description,
+    parse_reading,
+)
+from pipeline.errors import ConfigError
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.results import Record
+from pipeline.simulated.emulator.carts import TRUE_PERIOD, VirtualCarts
+from pipeline.simulated.emulator.faults import Faults, read_fault
+from pipeline.simulated.emulator.links import open_link
+from pipeline.simulated.hidden import prepare_bench
+from pipeline.stages.log_decrement import fit_log_decrement
+from tests.helpers.benches import Emulator, emulator
+from tests.helpers.waiting import started
+
+QUIET = 0.3  # s a read waits
+MOTOR_OFF = 1000  # ms after the last heartbeat: the watchdog's 100 and a machine as busy as can be
+pty_only = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
+
+
+@contextmanager
+def host(bench: Emulator) -> Iterator[serial.SerialBase]:
+    """Open the line as a host does, at a bench that has been reset."""
+    line = serial.serial_for_url(bench.address, timeout=QUIET)
+    try:
+        line.write(encode(Signal.RESET))
+        yield line
+    finally:
+        line.close()
+
+
+def play(
+    bench: Emulator, line: serial.SerialBase, *commands: bytes, heard: bytearray | None = None
+) -> bytes:
+    """Return all that comes until a run has ended; into `heard` as well, as it comes."""
+    heard, runs = bytearray() if heard is None else heard, bench.runs
+    line.write(b"".join(commands))
+    # pyserial forgets what it has read of a piece when the cable is pulled: small pieces.
+    while (got := line.read(64)) or bench.runs == runs:
+        heard += got
+    return bytes(heard)
+
+
+def stream(bench: Emulator, line: serial.SerialBase, start: Start) -> list[Reading]:
+    """Run it; every line must be a reading."""
+    readings = [parse_reading(text) for text in play(bench, line, encode(start)).splitlines()]
+    assert None not in readings
+    return [reading for reading in readings if reading is not None]
+
+
+@pytest.fixture(scope="module")
+def fast_bench() -> Iterator[Emulator]:
+    """Yield the two-cart preset, ten times as fast as time."""
+    with emulator("--speed", "10", "--seed", "3", watchdog=WATCHDOG) as bench:
+        yield bench
+
+
+@pytest.mark.slow
+@pytest.mark.sample
+@pty_only
+def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
+    """In real time: a description, a run with the stamps of a period that is no whole ms.
+
+    The next host finds the bench as the last one left it; a signal ends it with exit status 0.
+    """
+    with emulator("--port", "pty", "--hide", "coulomb_friction:force=0.004") as bench:
+        for _ in range(2):
+            with host(bench) as line:
+                line.write(encode(Signal.QUERY))
+                described = parse_description(line.readline())
+                assert (described.carts, described.commands) == (2, frozenset("cfhkms"))
+                began = time.monotonic()
+                readings = stream(
+                    bench, line, Start(wave=Wave.SQUARE, frequency=1.0, amplitude=300, cycles=2)
+                )
+                took = time.monotonic() - began - QUIET
+            # One more or less, by where in a ms the run began.
+            assert len(readings) == pytest.approx(2.0 / TRUE_PERIOD, abs=1)
+            steps = np.diff([reading.ms for reading in readings])
+            assert set(steps) == {1, 2}
+            assert np.sum(steps == 2) in (4, 5)  # of 1.0024 ms every 417th stamp is left out
+            assert readings[-1].counts[0] > readings[-1].counts[1] > 100
+            assert took > 1.9
+            assert [bench.event("client")["connected"] for _ in "io"] == [True, False]
+        assert "hidden: coulomb_friction on cart 1: force 0.004 V" in bench.said
+    assert bench.event("exit")["status"] == 0
+
+
+def test_the_static_gain_comes_out(fast_bench):
+    """What a step moves the carts, in cm/V by the description, is the preset's static gain."""
+    with host(fast_bench) as line:
+        line.write(encode(Signal.QUERY))
+        scales = parse_description(line.readline())
+        start = Start(wave=Wave.SQUARE, frequency=0.05, amplitude=1000)
+        readings = stream(fast_bench, line, start)
+    x = np.array([reading.counts for reading in readings]).T
+    duty = np.array([reading.duty for reading in readings])
+    level = x[:, -3000:].mean(axis=1) - x[:, : x.shape[1] // 3].mean(axis=1)
+    gain = level * scales.position_per_count / (duty[-1] * scales.input_per_count)
+    expected = PRESETS["throne-2dof"].static_gains()
+    # A mean of rounded counts is 0.15 of one off, twice, in at least 1400; and after 7 s of the
+    # slower mode (0.9/s) 2e-3 are left, averaged over half of its swings and so far less.
+    np.testing.assert_allclose(gain, expected, rtol=1e-3)
+
+
+def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
+    """Cart 2 with cart 1 held swings at ω_2 and ζ_2 of the chain; the held cart stands."""
+    chain = PRESETS["throne-2dof"]
+    with host(fast_bench) as line:
+        line.write(encode(Hands(held=(1,), released=2)))
+        time.sleep(1.0)  # the hand needs 1.5 s of the bench's clock
+        readings = stream(fast_bench, line, Start(wave=Wave.DELTA, frequency=0.2, amplitude=0))
+        line.write(encode(Hands()))
+    counts = np.array([reading.counts for reading in readings], dtype=float).T
+    assert np.ptp(counts[0]) <= 1
+    record = Record(
+        id="decay",
+        kind="decay",
+        t=np.arange(len(readings), dtype=np.float64) * TRUE_PERIOD,
+        u=None,
+        y=counts,
+        carts=(1, 2),
+        free=(2,),
+        resolution=np.ones(2),
+    )
+    fit = fit_log_decrement(record, cart=2)
+    assert 0.3 <= fit.release <= 0.65
+    omega_n = np.sqrt((chain.k[1] + chain.k[2]) / chain.m[1])
+    # The fit's own standard errors are some 1e-5 and 1e-4; its start in the fade adds its share.
+    assert fit.omega_n == pytest.approx(omega_n, rel=5e-4)
+    assert fit.zeta == pytest.approx(chain.c[1] / (2 * chain.m[1] * omega_n), rel=5e-3)
+
+
+def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
+    """It pulls for 1.5 s, then takes its time; the motor is idle meanwhile, and alive after."""
+    carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
+    carts.take_in_hand(Hands(released=1))
+    carts.start()
+    x = []
+    for _ in range(6000):
+        carts.move(-2000)
+        x.append(carts.counts()[0])
+    out = np.flatnonzero(np.abs(x) > 500)
+    assert 0 < out[0] < 1.5 / TRUE_PERIOD
+    gain = PRESETS["throne-1dof"].static_gains()[0]
+    rest = -2000 * carts.input_per_count * gain / 0.00227
+    # The swing of the start has e^(-1.32 · 4) left of it, 5e-3 of at most 1.8 cm and the rest.
+    assert np.mean(x[-400:]) == pytest.approx(rest, abs=5e-3 * (800 + abs(rest)))
+    held = np.array(x[1600:1780])  # until 0.3 s after the pull: only a tremor
+    assert np.ptp(held) < 0.03 * np.abs(held).max()
+
+
+def damaged(readings: bytes) -> tuple[list[Reading], int]:
+    """Return what a host can read, and how many lines it cannot."""
+    parsed = [parse_reading(line) for line in readings.split(b"\n") if line]
+    return [reading for reading in parsed if reading is not None], parsed.count(None)
+
+
+def test_what_is_injected_is_what_a_host_finds():
+    """Lost, garbled and merged lines and new clocks add up; nothing else is missing."""
+    faults = [f"--fault={kind}=0.01" for kind in ("drop", "garble", "merge", "delay", "reset")]
+    with emulator("--speed", "10", *faults) as bench, host(bench) as line:
+        start = encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=20))
+        readings, spoiled = damaged(play(bench, line, start))
+        run = bench.event("run")
+    injected = run["injected"]
+    assert run["ended"] == "done"
+    assert all(120 < injected[kind] < 280 for kind in ("drop", "garble", "merge", "reset"))
+    assert spoiled == injected["garble"] + injected["merge"]
+    lost = injected["drop"] + injected["garble"] + 2 * injected["merge"]
+    assert len(readings) == run["lines"] - lost
+    ms = np.array([reading.ms for reading in readings])
+    # Of a new clock that begins right behind another the host may see one.
+    assert np.sum(np.diff(ms) < 0) == pytest.approx(injected["reset"], abs=5)
+    # A lump holds the lines of 50 ms.
+    assert injected["late"] == pytest.approx(50 * injected["delay"], rel=0.05)
+
+
+def test_faults_come_when_they_are_told_to():
+    """An encoder sticks 1 s into the streaming, for good; the cable is pulled 1 s later, once."""
+    options = ("--speed", "5", "--fault", "stuck=2@1", "--fault", "disconnect@2")
+    with emulator(*options) as bench:
+        with host(bench) as line:
+            start = encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=3))
+            heard = bytearray()
+            with pytest.raises(serial.SerialException, match="disconnected"):
+                play(bench, line, start, heard=heard)
+        counts = np.array([reading.counts for reading in damaged(bytes(heard))[0]])
+        assert 1990 <= len(counts) <= 1999
+        assert np.ptp(counts[1000:], axis=0)[1] == 0 < np.ptp(counts[:1000], axis=0)[1]
+        assert np.ptp(counts[1000:], axis=0)[0] > 50
+        assert bench.event("run")["ended"] == "done"  # it does not miss its host
+        with host(bench) as line:
+            start = Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=1)
+            again = stream(bench, line, start)
+        assert len({reading.counts[1] for reading in again}) == 1
+
+
+def test_what_is_held_up_still_comes():
+    """A lost line end comes once the run is over; a late lump keeps its order, and comes."""
+    faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
+    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
+    assert sent == [b"1:2:3:4:0\n", b"1:2:3:4:1\n", b"1:2:3:4:2"]
+    assert faults.idle(clock=0.004) == b"\n"
+    sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=0.005 + 1e-3 * ms)[0] for ms in range(3)]
+    assert sent == [b"", b"", b""]
+    assert faults.idle(clock=0.054) == b""
+    assert faults.idle(clock=0.056) == b"1:2:3:4:0\n1:2:3:4:1\n1:2:3:4:2\n"
+    assert faults.injected == {"merge": 1, "delay": 1, "late": 3}
+
+
+@pytest.mark.parametrize("way", ["falls silent", "goes away", "is killed"])
+def test_the_motor_is_cut_when_the_host(fast_bench, way):
+    """100 ms after the last heartbeat the run is over, however fast the bench's clock runs."""
+    start = encode(Signal.HEARTBEAT) + encode(
+        Start(wave=Wave.SINE, frequency=0.01, amplitude=300, cycles=1)
+    )
+    if way == "is killed":
+        script = (
+            "import serial, sys, time\n"
+            f"line = serial.serial_for_url({fast_bench.address!r})\n"
+            f"line.write({start!r})\n"
+            "while True: time.sleep(0.03); line.write(b'k;'); print('beat', flush=True)\n"
+        )
+        with started([sys.executable, "-c", script], stdout=subprocess.PIPE) as child:
+            for _ in range(10):
+                assert child.stdout is not None
+                child.stdout.readline()
+    else:
+        with host(fast_bench) as line:
+            if way == "falls silent":
+                play(fast_bench, line, start)
+            else:
+                line.write(start)
+    # Both clocks are read in whole ms.
+    assert 99 <= fast_bench.event("motor off")["ms_after_heartbeat"] <= MOTOR_OFF
+    assert fast_bench.event("run")["ended"] == "watchdog"
+
+
+def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
+    """Without a heartbeat the run goes on to its end, as on the stock bench; a stop ends it."""
+    with host(fast_bench) as line:
+        line.write(encode(Start(wave=Wave.SINE, frequency=0.5, amplitude=30, cycles=1)))
+    assert fast_bench.event("run")["ended"] == "done"
+    with host(fast_bench) as line:
+        line.write(encode(Start(wave=Wave.SINE, frequency=0.01, amplitude=30, cycles=1)))
+        line.read(100)
+        # A start that noise cut short before it.
+        play(fast_bench, line, b"d;q;o;\xff", encode(Signal.STOP))
+    ended = fast_bench.event("run")
+    assert ended["ended"] == "stopped"
+    assert ended["lines"] < 20_000
+
+
+def test_a_stock_bench_knows_no_query_and_no_stop():
+    """It answers nothing and runs on, until the stock way of stopping it; cart two is no cart."""
+    with (
+        emulator("--stock", "--period", "2.005", preset="throne-1dof") as bench,
+        host(bench) as line,
+    ):
+        line.write(b"?;s;")
+        assert line.read(1) == b""
+        line.write(encode(Start(wave=Wave.SQUARE, frequency=1.0, amplitude=300, cycles=99)))
+        line.write(b"s;")
+        heard = b""
+        while len(heard) < 8_000:
+            heard += line.read(4096)
+        line.write(b"".join(map(encode, STOCK_STOP)))
+        readings, spoiled = damaged(heard[: heard.rindex(b"\n")])
+        assert spoiled == 0
+        assert bench.event("run")["ended"] == "restarted"
+    assert {reading.counts[1] for reading in readings} == {0}
+    assert np.diff([reading.ms for reading in readings[:400]]).mean() == pytest.approx(2.005, 2e-3)
+
+
+@pytest.mark.parametrize(
+    ("fault", "message"),
+    [
+        ("drop", "give a rate, drop=0.01, or a time, drop@5"),
+        ("drop=0.1@3", "give a rate"),
+        ("drop=2", "between 0 and 1"),
+        ("dorp=0.1", "did you mean 'drop'"),
+        ("stuck=0.5", "which encoder"),
+        ("drop=1.2.3", "could not convert"),
+        ("drop:0.1", "write KIND=RATE"),
+    ],
+)
+def test_a_fault_that_is_none_is_said(fault, message):
+    """A fault without sense is one clear message."""
+    with pytest.raises(ConfigError, match=message):
+        read_fault(fault)
+
+
+@pytest.mark.parametrize(
+    ("port", "message"),
+    [
+        ("COM3", "write socket://127.0.0.1:5555"),
+        ("socket://localhost", "write socket"),
+        ("socket://localhost:99999", "write socket"),
+        ("socket://0.0.0.0:0", "whoever reaches this port"),
+    ],
+)
+def test_a_port_that_will_not_do_is_said(port, message):
+    """A port without sense, or one that others could reach, is one clear message."""
+    with pytest.raises(ConfigError, match=message):
+        open_link(port)
+
+
+def test_a_port_that_is_taken_is_said():
+    """Two benches on one port are one too many; a remote one has to be meant."""
+    first = open_link("socket://127.0.0.1:0")
+    with pytest.raises(ConfigError, match=r"in use|normally permitted"):
+        open_link(first.address)
+    first.close()
+    anywhere = open_link("socket://0.0.0.0:0", remote=True)
+    assert anywhere.address.startswith("socket://0.0.0.0:")
+    anywhere.close()

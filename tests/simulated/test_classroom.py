@@ -1,0 +1,29 @@
+"""The class of the demo: what is planted in it is what grading says of it."""
+
+from pathlib import Path
+
+from pipeline.grading.batch.grade_class import Options, grade_class
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.simulated.classroom import PRESET, write_class
+
+
+def test_the_slip_and_the_copy_are_found_and_the_honest_team_is_not_touched(tmp_path):
+    """Team 1 has all points and no flag, team 2 its Hz, teams 2 and 3 the one recording."""
+    write_class(tmp_path / "class")
+    assert [p.name for p in tmp_path.iterdir()] == ["class"]
+    grade_class(
+        [tmp_path / "class"],
+        rubric_file=Path(PRESET),
+        out=tmp_path / "grades",
+        options=Options(figures=False),
+    )
+    with Gradebook(tmp_path / "grades") as book:
+        grades = {line.submission: line.grade for line in book.entries()}
+    flags = {name: {flag.code for flag in grade.flags} for name, grade in grades.items()}
+    assert flags == {
+        "team-1": set(),
+        "team-2": {"hz_for_rad_s", "shared_data"},
+        "team-3": {"shared_data"},
+    }
+    assert grades["team-1"].points == grades["team-1"].out_of
+    assert grades["team-2"].points < grades["team-2"].out_of

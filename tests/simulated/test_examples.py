@@ -1,0 +1,374 @@
+"""Synthetic submissions: complete, physically sensible, and the same bytes every time."""
+
+import re
+import tomllib
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.errors import ConfigError, DataError
+from pipeline.plant.linear.chain import Chain, parameter_names, quadratic_factors
+from pipeline.plant.linear.dwells import dwell_frequencies
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.linear.recovery import recover_from_parameters
+from pipeline.plant.linear.simulate import simulate_linear
+from pipeline.resources import EXAMPLES
+from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
+from pipeline.simulated.examples import CATALOGUE, write_examples
+from pipeline.simulated.submission import Students, write_submission
+from pipeline.submission import load_submission
+
+PRESET_NAMES = list(PRESETS)
+NOISE = 0.2 * COUNT
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """One submission of every preset, with what students report."""
+    root = tmp_path_factory.mktemp("sessions")
+    for preset in PRESET_NAMES:
+        write_submission(root / preset, preset, seed=1, reported=True)
+    return root
+
+
+def toml(folder):
+    return tomllib.loads((folder / "submission.toml").read_text(encoding="utf-8"))
+
+
+def experiments(folder, kind):
+    return [entry for entry in toml(folder)["experiments"] if entry["kind"] == kind]
+
+
+def table(folder, entry):
+    """Read one data file as columns by name."""
+    return np.genfromtxt(folder / entry["file"], delimiter=",", names=True)
+
+
+def positions(data):
+    return np.array([data[name] for name in data.dtype.names if re.fullmatch(r"x\d", name)])
+
+
+def content(folder):
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+# ------------------------------------------------------------------- the bytes
+
+
+def test_same_seed_same_bytes(tmp_path, sessions):
+    """A second run writes the same files; another seed writes other data."""
+    preset = "throne-2dof"
+    write_submission(tmp_path / "again", preset, seed=1, reported=True)
+    write_submission(tmp_path / "other", preset, seed=2, reported=True)
+
+    again, other, first = (
+        content(folder) for folder in (tmp_path / "again", tmp_path / "other", sessions / preset)
+    )
+    assert again == first
+    assert other["data/decay-1a.csv"] != first["data/decay-1a.csv"]
+
+
+def test_the_shipped_examples_are_what_the_program_writes(tmp_path):
+    """Every file in `submissions/` comes from `python -m pipeline.simulated.examples`."""
+    write_examples(tmp_path)
+
+    for example in CATALOGUE:
+        assert content(tmp_path / example.folder) == content(EXAMPLES / example.folder)
+
+
+def test_the_examples_are_small():
+    """Together they weigh less than a photograph."""
+    sizes = [
+        len(data) for example in CATALOGUE for data in content(EXAMPLES / example.folder).values()
+    ]
+
+    assert sum(sizes) < 2e6
+
+
+# --------------------------------------------------------------- what is there
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_loads_as_a_submission(sessions, preset):
+    """The folder passes the same validation as a student's."""
+    submission = load_submission(sessions / preset)
+
+    assert submission.system.carts == PRESETS[preset].n
+    assert submission.design is not None
+    assert submission.reported is not None
+    assert set(submission.reported.final) == set(parameter_names(PRESETS[preset].n))
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_a_whole_session(sessions, preset):
+    """Three decays of each cart, steps of two sizes and signs, 20 to 30 dwells, and the rest."""
+    folder, n = sessions / preset, PRESETS[preset].n
+
+    assert [e["carts"] for e in experiments(folder, "decay")] == [
+        [cart] for cart in range(1, n + 1) for _ in range(3)
+    ]
+    levels = [table(folder, e)["input"] for e in experiments(folder, "step")]
+    assert len({float(level[np.argmax(np.abs(level))]) for level in levels}) == 2
+    assert {np.sign(level.sum()) for level in levels} == {1.0, -1.0}
+    assert 20 <= len(experiments(folder, "sine")) <= 30
+    assert len(experiments(folder, "sweep")) == 1
+    assert len(experiments(folder, "closed_loop")) == 1
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_the_carts_move_well_and_not_too_far(sessions, preset):
+    """Every run moves some cart by 0.4 to 2 cm, in whole counts, with an input a motor gives."""
+    for entry in toml(sessions / preset)["experiments"]:
+        data = table(sessions / preset, entry)
+        x = positions(data)
+
+        assert 0.4 <= np.abs(x).max() <= 2.0, entry["id"]
+        assert np.abs(data["input"]).max() <= 5.0
+        # Four decimals: half of the last one.
+        assert_allclose(x / COUNT, np.round(x / COUNT), atol=0.51e-4 / COUNT)
+        assert_allclose(np.diff(data["time"]), SAMPLE_TIME, atol=1.01e-5)
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+@pytest.mark.parametrize("kind", ["step", "sine", "sweep", "closed_loop"])
+def test_the_log_is_the_motion_of_the_plant(sessions, preset, kind):
+    """The logged input, applied to the true plant from rest, gives the logged positions."""
+    for entry in experiments(sessions / preset, kind)[:5]:
+        data = table(sessions / preset, entry)
+
+        model = simulate_linear(PRESETS[preset], data["time"], data["input"])
+
+        residual = positions(data) - model
+        residual -= np.median(residual, axis=1, keepdims=True)  # the encoder's zero
+        # A cart at rest may lie anywhere between two counts, so rounding is at worst half a count.
+        assert np.sqrt(np.mean(residual**2)) < np.hypot(NOISE, COUNT / 2), entry["id"]
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_dwells_settle_before_they_end(sessions, preset):
+    """The last two cycles of every dwell lie on the cycles before them."""
+    for entry in experiments(sessions / preset, "sine"):
+        data = table(sessions / preset, entry)
+        t, x = data["time"], positions(data)
+        period = 1 / entry["frequency"]
+        late = t > t[-1] - 2 * period
+        for cart in x:
+            earlier = np.interp(t[late] - 4 * period, t, cart)
+            # Two readings with noise and rounding each, and straight lines between them.
+            noise = np.sqrt(2 * (NOISE**2 + COUNT**2 / 12))
+            bend = np.abs(cart).max() * (2 * np.pi * SAMPLE_TIME / period) ** 2 / 8
+            assert np.sqrt(np.mean((cart[late] - earlier) ** 2)) < 1.2 * noise + bend, entry["id"]
+
+
+def test_the_three_cart_session_has_the_dwell_of_figures_12_to_14():
+    """The shipped example dwells at exactly 4 Hz, recorded from rest."""
+    folder = EXAMPLES / "three-cart"
+    (entry,) = [e for e in experiments(folder, "sine") if e["frequency"] == 4.0]
+
+    data = table(folder, entry)
+
+    assert np.abs(positions(data)[:, 0]).max() < 4 * COUNT
+    assert data["time"][-1] > 7.0  # some 8 time constants
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_dwells_surround_every_resonance_and_null(preset):
+    """Some dwell lies within 1 % of each, or within its bandwidth, and some on both sides."""
+    chain = PRESETS[preset]
+    dwells = 2 * np.pi * np.array(dwell_frequencies(chain, n=28))
+    for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
+        for omega, zeta in zip(*quadratic_factors(roots), strict=True):
+            assert np.abs(dwells / omega - 1).min() < max(0.01, zeta)
+            assert dwells.min() < omega < dwells.max()
+
+
+# ------------------------------------------------------------------ by hand
+
+
+def release_by_hand(**changes):
+    chain = PRESETS["throne-2dof"]
+    t = SAMPLE_TIME * np.arange(500, dtype=np.float64)
+    hand = ReleasingHand(cart=2, position=-1.5, release=0.4, fade=0.02)
+    run = BenchRun(id="d", kind="decay", t=t, u=np.zeros(500), free=(2,), hand=hand)
+    bench = SimulatedBench(chain=chain, zero_error_counts=0.0)
+    return chain, hand, run, bench
+
+
+def test_a_hand_holds_then_lets_go_softly():
+    """Held within 1 % until the release; then the force fades, so nothing starts with a jerk."""
+    _, hand, run, bench = release_by_hand()
+
+    x = bench.move(run).x
+
+    held = run.t < hand.release
+    assert_allclose(x[1, held], -1.5, rtol=0.01)
+    assert_array_equal(x[0], 0.0)
+    first = np.argmax(~held)
+    step = np.diff(x[1])
+    # A cut string starts with omega² x T²/2 = 0.06 cm in a sample; the fading hand with less.
+    assert abs(step[first]) < 0.04
+    assert x[1].max() > 1.2  # and then it swings through
+
+
+def test_after_the_hand_the_decay_is_free():
+    """Past the fade each sample follows from the two before it, as in any damped oscillation."""
+    chain, hand, run, bench = release_by_hand()
+
+    x = bench.move(run).x[1, run.t > hand.release + hand.fade + SAMPLE_TIME]
+
+    sigma = chain.zeta_carts[1] * chain.omega_carts[1]
+    omega_d = np.sqrt(chain.omega_carts[1] ** 2 - sigma**2)
+    decay = np.exp(-sigma * SAMPLE_TIME)
+    expected = 2 * decay * np.cos(omega_d * SAMPLE_TIME) * x[1:-1] - decay**2 * x[:-2]
+    assert_allclose(x[2:], expected, atol=1e-12)
+    assert x.size > 400
+
+
+def test_a_held_cart_reads_one_number():
+    """Noise shakes only what is free to move."""
+    _, _, run, bench = release_by_hand()
+
+    y = bench.read(bench.move(run), run=run, rng=np.random.default_rng(1))
+
+    assert np.ptp(y[0]) == 0
+    assert np.ptp(y[1]) > 2
+
+
+# -------------------------------------------------------------- what they claim
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES)
+def test_honest_claims_are_near_the_truth(sessions, preset):
+    """Final gains and frequencies within 2 %, dampings within 20 %; guesses stand as guessed."""
+    truth, reported = PRESETS[preset].parameters(), toml(sessions / preset)["reported"]
+
+    assert list(reported["initial"]) == list(reported["final"]) == list(truth)
+    for name, value in truth.items():
+        # Two standard deviations, combined over two or three springs and masses.
+        limit = 0.2 if name.startswith("zeta") else 0.02
+        assert reported["final"][name] == pytest.approx(value, rel=limit), name
+        if re.fullmatch("zeta_[a-cxy]", name):
+            assert reported["initial"][name] == 0.10
+
+
+def test_claims_have_three_digits(sessions):
+    """Numbers are typed with three significant digits, guesses with two."""
+    text = (sessions / "throne-3dof" / "submission.toml").read_text(encoding="utf-8")
+    final = text.split("[reported.final]")[1].split("[")[0]
+
+    for value in re.findall(r"= (\S+)", final):
+        assert len(value.replace(".", "").lstrip("0")) == 3, value
+    assert "zeta_x = 0.10\n" in text.split("[reported.initial]")[1].split("[")[0]
+
+
+@pytest.mark.parametrize("preset", PRESET_NAMES[1:])
+def test_honest_claims_agree_with_each_other(sessions, preset):
+    """The reported final values are one chain's: redundancies are left at their rounding."""
+    final = toml(sessions / preset)["reported"]["final"]
+
+    residuals = recover_from_parameters(final).residuals
+
+    # Half of the third digit, 0.5 % at most, amplified some ten times on the worst route.
+    assert max(residuals.values()) < 0.05
+
+
+def test_reported_state_space_and_feedback(sessions):
+    """A and B have their shapes, and the gains are those that ran."""
+    document = toml(sessions / "throne-3dof")
+    reported = document["reported"]
+    (control,) = [e for e in document["experiments"] if e["kind"] == "closed_loop"]
+
+    assert np.shape(reported["state_space"]["A"]) == (6, 6)
+    assert np.shape(reported["state_space"]["B"]) == (6,)
+    assert reported["feedback"]["gains"] == control["controller"]["gains"]
+    assert reported["feedback"]["prefilter"] == control["controller"]["prefilter"]
+
+
+def test_the_controlled_cart_follows(sessions):
+    """The chosen cart ends within 5 % of its reference: the students' model is a little off."""
+    for preset in PRESET_NAMES:
+        (entry,) = experiments(sessions / preset, "closed_loop")
+        data = table(sessions / preset, entry)
+        final = data[f"x{entry['controlled_cart']}"][-50:].mean()
+        assert final == pytest.approx(data["reference"][-1], rel=0.05)
+
+
+# ------------------------------------------------------------- other benches
+
+
+def test_four_carts(tmp_path):
+    """The plant is written for n carts."""
+    chain = Chain(
+        m=np.full(4, 2.5e-4), c=np.full(4, 4e-4), k=np.array([0.0, 0.12, 0.1, 0.08, 0.06])
+    )
+
+    write_submission(
+        tmp_path,
+        SimulatedBench(chain=chain),
+        seed=4,
+        reported=True,
+        students=Students(title="Four"),
+    )
+
+    assert load_submission(tmp_path).system.springs == (False, True, True, True, True)
+    assert set(toml(tmp_path)["reported"]["final"]) == set(parameter_names(4))
+
+
+def test_counts_as_units(tmp_path):
+    """A bench that reads counts writes whole numbers."""
+    chain = Chain(m=np.array([5.5e-6]), c=np.array([2.6e-5]), k=np.array([2.8e-3, 0.0]))
+
+    write_submission(
+        tmp_path,
+        SimulatedBench(chain=chain, position_unit="count", count=1.0, travel=440.0),
+        seed=5,
+    )
+
+    x = positions(table(tmp_path, experiments(tmp_path, "step")[0]))
+    assert_array_equal(x, np.round(x))
+    assert 100 < np.abs(x).max() < 900
+
+
+def test_rounded_time_stamps(tmp_path):
+    """Three decimals give the stamps of an ECP export."""
+    write_submission(
+        tmp_path,
+        "throne-1dof",
+        seed=6,
+        compact=True,
+        students=Students(time_decimals=3, notes="# Ours\n"),
+    )
+
+    t = table(tmp_path, experiments(tmp_path, "sweep")[0])["time"]
+    assert_allclose(t, np.round(SAMPLE_TIME * np.arange(t.size), 3), atol=1e-12)
+    assert (tmp_path / "notes.md").read_bytes() == b"# Ours\n"
+
+
+def test_an_unknown_preset_names_the_known_ones(tmp_path):
+    """A misspelt preset is the caller's to mend."""
+    with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
+        write_submission(tmp_path, "throne-4dof", seed=0)
+
+
+def test_a_cart_without_damping_of_its_own(tmp_path):
+    """Its decay is cut when a student would stop it; the chain as a whole still settles."""
+    chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([8e-4, 0.0]), k=np.array([0.05, 0.1, 0.05]))
+
+    write_submission(tmp_path, SimulatedBench(chain=chain), seed=7, compact=True)
+
+    last = experiments(tmp_path, "decay")[-1]
+    assert last["carts"] == [2]
+    assert 8.0 < table(tmp_path, last)["time"][-1] < 9.0
+
+
+def test_carts_that_never_settle_are_refused(tmp_path):
+    """Without damping there is no steady state to record."""
+    undamped = Chain(m=np.array([2e-4]), c=np.zeros(1), k=np.array([0.03, 0.0]))
+
+    with pytest.raises(DataError, match="never settle"):
+        write_submission(tmp_path, SimulatedBench(chain=undamped), seed=0)

@@ -1,0 +1,521 @@
+"""Effects hidden in a synthetic bench: in every kind of run, against limits and the truth."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.errors import ConfigError, DataError
+from pipeline.gap.types import Gap
+from pipeline.ingest.read import read_data
+from pipeline.json_files import plain
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.loop.sampled_loop import StateFeedback
+from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions, simulate_augmented
+from pipeline.plant.nonlinear.effects import (
+    CATALOGUE,
+    AugmentedChain,
+    EffectTerm,
+    find_effect,
+)
+from pipeline.set_up import Bench
+from pipeline.simulated.bench import COUNT, SAMPLE_TIME, BenchRun, ReleasingHand, SimulatedBench
+from pipeline.simulated.hidden import prepare_bench, preset_bench, usual_term
+from pipeline.simulated.submission import write_submission
+from pipeline.submission import load_submission
+from tests.helpers.commandline import cartlab_here
+from tests.truth.bench import Hidden, simulate_truth
+
+TWO = PRESETS["throne-2dof"]
+KEYS = [effect.key for effect in CATALOGUE]
+# The truth knows these contacts by another law of its own.
+OWN_CONTACT = {"backlash", "end_stop"}
+
+
+def bench(*terms, chain=TWO):
+    return SimulatedBench(chain=chain, effects=terms, noise_counts=0.0, zero_error_counts=0.0)
+
+
+def usual(key, chain=TWO, **changes):
+    """Return the effect at its usual place and size, some parameters changed."""
+    term = usual_term(find_effect(key), chain)
+    values = dict(zip(term.effect.names, term.values, strict=True)) | changes
+    return replace(term, values=tuple(values[name] for name in term.effect.names))
+
+
+def named(term):
+    return dict(zip(term.effect.names, term.values, strict=True))
+
+
+def clock(seconds):
+    return SAMPLE_TIME * np.arange(round(seconds / SAMPLE_TIME), dtype=np.float64)
+
+
+def step(n=2, seconds=3.0):
+    t = clock(seconds)
+    u = np.where((t > 0.3) & (t < 0.5 * seconds), -0.05, 0.0)
+    return BenchRun(id="step", kind="step", t=t, u=u, free=tuple(range(1, n + 1)))
+
+
+def decay(cart=1):
+    t = clock(2.5)
+    # Its tremor turns at the release, so the cart is let go without velocity.
+    tremor = tuple(np.pi / 2 - 2 * np.pi * np.array([1.3, 4.1, 8.7]) * t[45])
+    hand = ReleasingHand(cart=cart, position=-1.5, release=float(t[45]), fade=0.021, tremor=tremor)
+    return BenchRun(id="decay", kind="decay", t=t, u=np.zeros(t.size), free=(cart,), hand=hand)
+
+
+def control():
+    t = clock(2.0)
+    controller = StateFeedback(
+        gains=np.array([0.02, 0.002, 0.01, 0.001]), prefilter=0.06, model=TWO
+    )
+    return BenchRun(
+        id="control",
+        kind="closed_loop",
+        t=t,
+        u=np.zeros(t.size),
+        free=(1, 2),
+        cart=2,
+        reference=np.where(t > 0.2, 1.0, 0.0),
+        controller=controller,
+        input_limit=0.2,
+    )
+
+
+# -------------------------------------------------------------- whole submissions
+
+
+def _cases():
+    """Every effect on every preset; in the quick suite, one of each preset."""
+    for i, key in enumerate(KEYS):
+        for j, preset in enumerate(PRESETS):
+            quick = i == 6 * j
+            marks = () if quick else (pytest.mark.slow,)
+            yield pytest.param(key, preset, marks=marks)
+
+
+@pytest.fixture(scope="module")
+def linear(tmp_path_factory):
+    """A session on each preset without effects."""
+    root = tmp_path_factory.mktemp("linear")
+    for preset in PRESETS:
+        write_submission(root / preset, preset, seed=3, compact=True)
+    return root
+
+
+@pytest.mark.parametrize(("key", "preset"), list(_cases()))
+def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
+    """The session loads and reads as any other, shows the effect, and nowhere names it."""
+    chain = PRESETS[preset]
+
+    write_submission(
+        tmp_path, replace(preset_bench(preset), effects=(usual(key, chain),)), seed=3, compact=True
+    )
+
+    records = read_data(load_submission(tmp_path)).records
+    others = read_data(load_submission(linear / preset)).records
+    apart = [float(np.abs(a.y - b.y).max()) for a, b in zip(records, others, strict=True)]
+    # Two readings of the same position differ by at most a count and the encoder noise.
+    assert max(apart) > 4 * COUNT
+    assert key not in (tmp_path / "submission.toml").read_text(encoding="utf-8")
+    assert {path.name for path in tmp_path.iterdir()} == {"submission.toml", "data"}
+
+
+def test_several_effects_at_once():
+    """Each with its place, said or usual."""
+    hide = ["coulomb_friction:cart=2", "cubic_spring:spring=3,coefficient=0.02", "dead_zone"]
+    prepared = prepare_bench(preset="throne-2dof", hide=hide)
+    assert [(t.effect.key, t.place) for t in prepared.effects] == [
+        ("coulomb_friction", 2),
+        ("cubic_spring", 3),
+        ("dead_zone", 0),
+    ]
+
+
+def test_the_linear_path_compiles_nothing():
+    """Importing the synthesis and preparing a bench with effects loads no numba."""
+    code = (
+        "import sys; from pipeline.simulated.hidden import prepare_bench as p; "
+        "p(preset='throne-2dof', hide=['stiction']); print('numba' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+# --------------------------------------------------------------------- the limit
+
+
+@pytest.mark.parametrize("key", KEYS)
+@pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
+def test_next_to_nothing_is_the_linear_bench(key, make_run):
+    """With its size a hundred-thousandth, each effect leaves every kind of run within a count."""
+    term = usual(key)
+    # These have further sizes, without a neutral value of their own.
+    further = {
+        "stiction": ("static_force",),
+        "end_stop": ("damping",),
+        "extra_mode": ("stiffness", "damping"),
+    }.get(key, ())
+    values = [
+        (p.neutral or 0.0) + 1e-5 * (value - (p.neutral or 0.0))
+        if p.neutral is not None or p.name in further
+        else value
+        for p, value in zip(term.effect.parameters, term.values, strict=True)
+    ]
+    if key == "saturation":
+        values = [1e3]  # a limit nobody reaches
+    if key == "backlash":
+        values[0] = 0.0  # the contact's own stiffness stays, however small the gap
+    small = replace(term, values=tuple(values))
+
+    moved, plain = bench(small).move(make_run()), bench().move(make_run())
+
+    # No effect would reach a hundred thousand counts if it grew in proportion; what else differs
+    # is now and then a rounding of an encoder in the loop.
+    assert_allclose(moved.x, plain.x, atol=COUNT)
+
+
+# ------------------------------------------------------------ against the truth
+
+
+@pytest.mark.parametrize("key", [key for key in KEYS if key not in OWN_CONTACT])
+def test_steps_agree_with_the_independent_bench(key):
+    """A step with an effect is that of the fine-step simulator, to a fifth of a count."""
+    term, run = usual(key), step()
+    hidden = Hidden(effect=key, place=term.place, parameters=named(term))
+
+    moved = bench(term).move(run)
+
+    model = AugmentedChain(chain=TWO, terms=(term,))
+    truth = simulate_truth(
+        m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=run.u, free=(1, 2),
+        x0=rest_positions(model),
+    )  # fmt: skip
+    # The truth reads out along straight lines within 50 µs and errs by omega h / 2 of the phase:
+    # 0.07 count where the motion is linear.
+    assert_allclose(moved.x, truth, atol=0.2 * COUNT)
+    assert np.abs(moved.x - bench().move(run).x).max() > 2 * COUNT
+
+
+@pytest.mark.parametrize(
+    "key",
+    ["coulomb_friction", "presliding_friction", "load_friction", "cubic_spring", "dead_zone",
+     "input_delay", "actuator_lag", "extra_mode", "sensor_gain"],
+)  # fmt: skip
+def test_closed_loops_agree_with_the_independent_bench(key):
+    """The logged input of a loop, applied to the fine-step simulator, gives the logged motion."""
+    term, run = usual(key), control()
+
+    moved = bench(term).move(run)
+
+    hidden = Hidden(effect=key, place=term.place, parameters=named(term))
+    truth = simulate_truth(
+        m=TWO.m, c=TWO.c, k=TWO.k, hidden=[hidden], t=run.t, u=moved.u, free=(1, 2)
+    )
+    # As for the steps; an input that changes every sample adds an edge a sample to the truth.
+    assert_allclose(moved.x, truth, atol=0.5 * COUNT)
+    # The loop feels it: the controller asks for other inputs than on the linear bench.
+    assert np.abs(moved.u - bench().move(run).u).max() > 1e-4
+
+
+@pytest.mark.parametrize("key", ["coulomb_friction", "quadratic_drag", "cubic_spring"])
+def test_releases_agree_with_the_independent_bench(key):
+    """After the hand begins to let go, the fine-step simulator under its force does the same."""
+    run, term = decay(), usual(key)
+    hand = run.hand
+    assert hand is not None
+
+    x = bench(term).move(run).x
+
+    start = int(np.searchsorted(run.t, hand.release))
+    held = float(hand.hold(run.t[start])[0])
+    spring = TWO.k[0] + TWO.k[1]
+    extra = named(term)["coefficient"] * held**3 if key == "cubic_spring" else 0.0
+    fine = np.arange(run.t[start], run.t[-1] + 1e-9, SAMPLE_TIME / 40)
+    # The force falls in straight lines between the samples; the middle of each fine step.
+    samples = run.t[start:]
+    ramp = (spring * held + extra) * np.clip(1 - (samples - samples[0]) / hand.fade, 0, 1)
+    push = np.interp(fine + SAMPLE_TIME / 80, samples, ramp)
+    truth = simulate_truth(
+        m=TWO.m, c=TWO.c, k=TWO.k, t=fine, u=push, free=(1,), x0=np.array([held, 0.0]),
+        hidden=[Hidden(effect=key, place=term.place, parameters=named(term))],
+    )  # fmt: skip
+    # The truth's phase errs by omega h / 2, 1e-3 of 1.5 cm where the spring is at its stiffest.
+    assert_allclose(x[0, start:], np.interp(samples, fine, truth[0]), atol=0.6 * COUNT)
+
+
+@pytest.mark.parametrize("key", KEYS)
+def test_sample_by_sample_is_the_whole_run(key):
+    """Stepping a bench through the samples gives the run simulated at once."""
+    term = usual(key)
+    model, run = AugmentedChain(chain=TWO, terms=(term,)), step()
+    stepped = SteppedBench(model)
+    x = [stepped.readings]
+    for now, following in zip(run.u[:-1], run.u[1:], strict=True):
+        stepped.step(float(now), following=float(following), interval=SAMPLE_TIME)
+        x.append(stepped.readings)
+
+    # Their substeps differ, by which forces are held: some hundredths of a count.
+    assert_allclose(np.transpose(x), simulate_augmented(model, run.t, run.u), atol=0.1 * COUNT)
+
+
+# ------------------------------------------------------------------ what is special
+
+
+def test_a_constant_force_shows_where_the_carts_rest():
+    """Carts rest where springs carry the force: elsewhere with other carts held, not in a loop."""
+    term = usual("force_offset")
+    (force,) = term.values
+    model = AugmentedChain(chain=TWO, terms=(term,))
+
+    both, alone = rest_positions(model), rest_positions(model, free=(1,))
+
+    assert_allclose(both, np.linalg.solve(TWO.stiffness, [force, 0.0]), rtol=1e-6)
+    assert_allclose(alone, [force / TWO.stiffness[0, 0], 0.0], rtol=1e-6)
+    assert_allclose(bench(term).move(step()).x[:, 0], both)
+    # Before a closed loop the encoders are zeroed at rest.
+    assert_allclose(bench(term).move(control()).x[:, 0], 0.0, atol=1e-12)
+
+
+def test_a_sensor_deceives_the_controller():
+    """A loop brings the reading to its place, so the cart itself stands off by the gain."""
+    run = control()
+    gain = 1.1
+
+    moved = bench(replace(usual("sensor_gain"), place=2, values=(gain,))).move(run)
+
+    true = simulate_truth(m=TWO.m, c=TWO.c, k=TWO.k, t=run.t, u=moved.u, free=(1, 2))
+    assert_allclose(moved.x[1], gain * true[1], atol=0.2 * COUNT)
+
+
+def test_a_hand_stops_before_the_end_stop():
+    """No hand pulls a cart into a stop; away from it the cart is held where it was meant to be."""
+    stop = usual("end_stop", position=-1.0)
+
+    assert bench(stop).move(decay()).x[0, 0] == pytest.approx(-0.9, rel=0.01)
+    assert bench(usual("end_stop", position=1.0)).move(decay()).x[0, 0] == pytest.approx(
+        -1.5, rel=0.01
+    )
+
+
+def test_a_held_cart_stays_held():
+    """With effects on both carts, the cart that is held reads zero."""
+    terms = (usual("coulomb_friction"), replace(usual("force_offset"), place=2))
+
+    x = bench(*terms).move(decay()).x
+
+    assert_array_equal(x[1], 0.0)
+
+
+def test_carts_that_run_away_are_refused():
+    """A spring that softens without end is one clear error, in a run and in a loop."""
+    soft = usual("cubic_spring", coefficient=-20.0)
+    for run in (step(), control(), decay()):
+        with pytest.raises(DataError, match="the carts run away"):
+            bench(soft).move(run)
+
+
+def test_a_loop_cannot_look_ahead():
+    """A drive may lead its log by a sample at most: the next input is not known earlier."""
+    assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
+    with pytest.raises(DataError, match="lead its log by over one sample"):
+        bench(usual("input_delay", delay=-0.02)).move(control())
+
+
+# --------------------------------------------------------------- a stored model
+
+
+def stored(prepared):
+    """Return the `gap.json` of a bench, as the gap workflow writes it."""
+    model = AugmentedChain(chain=prepared.chain, terms=prepared.effects)
+    gap = Gap(
+        bench=Bench(springs=tuple(bool(k) for k in prepared.chain.k)),
+        verdict="named", effects=(), baseline=0.1, final=0.01, noise_floor=0.01,
+        repeatability=None, by_record=(), where=(), next_experiment="", linear=model, model=model,
+        training=(), held_out=(), traces=(),
+    )  # fmt: skip
+    return plain(gap)
+
+
+def test_a_stored_model_gives_the_same_records(tmp_path):
+    """Simulating from `gap.json` writes the very records of the bench it describes."""
+    prepared = prepare_bench(preset="throne-1dof", hide=["stiction", "backlash:gap=0.02"])
+    file = tmp_path / "gap.json"
+    file.write_text(json.dumps(stored(prepared)), encoding="utf-8")
+
+    again = prepare_bench(model=file)
+    write_submission(tmp_path / "a", prepared, seed=5)
+    write_submission(tmp_path / "b", again, seed=5)
+
+    assert again.told == tuple(text.replace(" (default)", "") for text in prepared.told)
+    for path in sorted((tmp_path / "a" / "data").iterdir()):
+        assert path.read_bytes() == (tmp_path / "b" / "data" / path.name).read_bytes()
+
+
+def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
+    """The fixed part of `gap.json` is enough: values with errors, and no contact details."""
+    document = {
+        "chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]},
+        "effects": [
+            {
+                "effect": "end_stop",
+                "where": {"cart": 1},
+                "parameters": {
+                    "position": {"value": 1.1, "std": 0.01, "unit": "cm"},
+                    "stiffness": {"value": 0.7, "std": 0.1, "unit": "V/cm"},
+                },
+            }
+        ],
+    }
+    file = tmp_path / "gap.json"
+    file.write_text(json.dumps(document), encoding="utf-8")
+
+    (term,) = prepare_bench(model=file).effects
+
+    assert term.values[:2] == (1.1, 0.7)
+    assert term.values[2] > 0
+
+
+def test_a_model_in_counts_moves_as_far(tmp_path):
+    """Units stand in the file: a model in counts is moved by a centimetre's worth of counts."""
+    chain = PRESETS["throne-1dof"]
+    document = {
+        "chain": {name: (getattr(chain, name) * COUNT).tolist() for name in "mck"},
+        "units": {"position": "count", "input": "V"},
+    }
+    file = tmp_path / "gap.json"
+    file.write_text(json.dumps(document), encoding="utf-8")
+
+    prepared = prepare_bench(model=file)
+    write_submission(tmp_path / "out", prepared, seed=1)
+
+    records = read_data(load_submission(tmp_path / "out")).records
+    (sweep,) = [record for record in records if record.kind == "sweep"]
+    assert_array_equal(sweep.y, np.round(sweep.y))
+    assert 300 < np.abs(sweep.y).max() < 700
+
+
+def with_backlash(**sizes):
+    """Return a model with backlash of these sizes."""
+    entry = {"effect": "backlash", "parameters": {"gap": 0.05, **sizes}}
+    return {"chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]}, "effects": [entry]}
+
+
+@pytest.mark.parametrize("command", ["simulate", "emulate"])
+@pytest.mark.parametrize("sizes", [{"contact_stiffness": 1e30}, {"motor_mass": 1e-30}])
+def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
+    """What no simulation would get through is refused at once; nothing is written or served."""
+    file = tmp_path / "gap.json"
+    file.write_text(json.dumps(with_backlash(**sizes)), encoding="utf-8")
+    out = ["--out", str(tmp_path / "out")] if command == "simulate" else []
+    done = cartlab_here(command, "--model", str(file), *out)
+    assert done.returncode == 2
+    assert "a stiffness is too large, or a mass too small" in done.stderr.splitlines()[-1]
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ("{", r"no JSON from line 1, character 2 on: give a file as `cartlab gap` writes it"),
+        ("[" * 100_000, "no JSON"),
+        ("[]", "no JSON object"),
+        ({"effects": []}, "chain: missing"),
+        ({"chain": {"m": [1.0], "c": [0.1]}}, "chain: needs 'k'"),
+        ({"chain": {"m": [1.0], "c": [0.1], "k": [1.0]}}, "k: expected shape"),
+        ({"chain": {"m": [-1.0], "c": [0.1], "k": [1.0, 0.0]}}, "m must be positive"),
+        ({"chain": {"m": [1e-320], "c": [0.1], "k": [1.0, 0.0]}}, "expected sizes of 1e-30 to"),
+        ({"chain": {"m": [1e-29], "c": [0.1], "k": [1.0, 0.0]}}, "can be run on a bench"),
+        ({"chain": {"m": [1.0, 1.0], "c": [0.1, 0.1], "k": [1.7e308, 1.7e308, 1.0]}}, "1.7e[+]308"),
+        (with_backlash(gap=1e-320), "gap: expected 0 or a size of 1e-30 to .*, found 9.*e-321"),
+        (with_backlash(motor_mass=0.0), "motor_mass must be positive, found 0"),
+        (with_backlash(gap=-1.0), "gap must be positive, found -1"),
+        ({"chain": {"m": [1.0], "c": [0.1], "k": [1.0, 0.0]}, "effects": [{"effect": "glue"}]},
+         r"effects\[1\]: no effect 'glue'"),
+    ],
+)  # fmt: skip
+def test_a_broken_model_is_one_line(tmp_path, document, message):
+    """Whatever is wrong with the file, the message names it and the place."""
+    file = tmp_path / "gap.json"
+    text = document if isinstance(document, str) else json.dumps(document)
+    file.write_text(text, encoding="utf-8")
+
+    with pytest.raises(ConfigError, match=message) as error:
+        prepare_bench(model=file)
+
+    assert "gap.json" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+# ---------------------------------------------------------------- the option --hide
+
+
+@pytest.mark.parametrize(
+    ("hide", "message"),
+    [
+        ("coulomb", "no effect 'coulomb'; did you mean 'coulomb_friction'"),
+        ("coulomb_friction:forse=1", "has no 'forse'; did you mean 'force'"),
+        ("coulomb_friction:force", "write force=VALUE"),
+        ("coulomb_friction:force=big", "force needs a number, found 'big'"),
+        ("coulomb_friction:force=nan", "force needs a number, found 'nan'"),
+        ("coulomb_friction:force=-1", "force must be at least 0"),
+        ("coulomb_friction:force=1,force=2", "force is given twice"),
+        ("coulomb_friction:cart=3", "no cart 3 on this bench; there is cart 1, 2"),
+        ("coulomb_friction:cart=1.5", "no cart 1.5"),
+        ("cubic_spring:spring=1", "no spring 1 on this bench; there is spring 2, 3"),
+        ("dead_zone:cart=1", "dead_zone has no 'cart'"),
+        ("saturation:limit=0", "limit must be positive"),
+        ("stiction:force=0.02,static_force=0.01", "below the sliding force"),
+    ],
+)
+def test_a_wrong_effect_is_one_line(hide, message):
+    """A wrong name, place or size is told with the nearest that would do."""
+    with pytest.raises(ConfigError, match=message):
+        prepare_bench(preset="throne-2dof", hide=[hide])
+
+
+def test_one_place_has_one_dry_friction():
+    """Two effects of a family exclude each other at a place, not at two."""
+    with pytest.raises(ConfigError, match="cart 1 already has coulomb_friction"):
+        prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
+    hide = ["coulomb_friction", "stiction:cart=2"]
+    assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2
+
+
+def test_defaults_are_told():
+    """What was left out gets a size that shows, and is said to be a default."""
+    prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
+
+    assert prepared.told == (
+        "presliding_friction on cart 1: force 0.002 V, distance 0.0258 cm (default)",
+    )
+    (spring,) = prepare_bench(preset="throne-3dof", hide=["cubic_spring"]).effects
+    assert spring.place == 2
+
+
+def test_a_bench_needs_one_source(tmp_path):
+    """Neither a preset nor a model, or both, is the caller's to mend."""
+    with pytest.raises(ConfigError, match="either --preset or --model"):
+        prepare_bench()
+    with pytest.raises(ConfigError, match="either --preset or --model"):
+        prepare_bench(preset="throne-1dof", model=tmp_path)
+
+
+def test_what_the_linear_chain_can_do_is_said():
+    """An effect that no data of this bench can tell from the chain is hidden, and said so."""
+    prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
+
+    assert prepared.told[0].endswith("here the linear chain can do the same")
+    (term,) = prepared.effects
+    assert isinstance(term, EffectTerm)
+    # It is the cart's own damping, once more.
+    chain = PRESETS["throne-1dof"]
+    damped = replace(chain, c=chain.c + term.values[0])
+    assert_allclose(
+        bench(term, chain=chain).move(step(1)).x, bench(chain=damped).move(step(1)).x, atol=1e-6
+    )

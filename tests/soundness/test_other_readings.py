@@ -1,0 +1,77 @@
+"""A factor is a unit where all records of a kind share it, and else no mistake of anybody's."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pipeline.estimation.chain.follow import Followed, Misread
+from pipeline.results import Record
+from pipeline.soundness.other_readings import without_lone_factors
+
+TENTH = Misread(words="a tenth as far", scale=0.1)
+TENFOLD = Misread(words="ten times as far", scale=10.0)
+SLOW = Misread(words="half its speed", clock=2.0)
+TURNED = Misread(words="x1 turned")
+
+
+def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
+    t = np.linspace(0.0, 99 * step, 100)
+    return Record(
+        id=name,
+        kind="step" if name.startswith("step") else "sine",
+        t=t,
+        u=size * np.sin(t),
+        y=np.sin(t)[None],
+        carts=(1,),
+        free=(1,),
+        resolution=np.array([0.001]),
+    )
+
+
+def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, float]) -> set[str]:
+    """Return what stays a mistake; the others follow as they are."""
+    records = [*(record(name, size=size) for name, size in sizes.items()), *others]
+    follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
+    fits = {
+        name: Followed(lost={1: lost}, missed={}, reach={1: 1.0}, friction={})
+        for name, lost in follows.items()
+    }
+    return set(without_lone_factors(found, records, fits=fits))
+
+
+@pytest.mark.parametrize(
+    ("misread", "sizes", "others", "unit"),
+    [
+        (TENTH, {"step-1": 1.0, "step-2": 2.0}, (), True),
+        (TENTH, {"step-1": 1.0, "step-2": 1.0}, (), False),  # a limit does so
+        (TENTH, {"step-1": 1.0, "step-2": 1.0}, (record("sine-1", size=1.0),), True),
+        (TENTH, {"step-1": 1.0, "step-2": 1.0}, (record("sine-1", size=0.1),), False),
+        (TENFOLD, {"step-1": 1.0, "step-2": 1.0}, (), True),  # no limit makes carts move further
+        (TENFOLD, {"step-1": 1.0}, (record("sine-1"),), False),
+        (TENTH, {"step-1": 1.0, "step-2": 2.0}, (record("step-3"),), False),
+        (TENFOLD, {"step-1": 1.0, "step-2": 1.0}, (record("step-3"),), False),
+    ],
+)
+def test_a_unit_is_that_of_all_records_of_a_kind(misread, sizes, others, unit):
+    """And where they move less, no limit of the amplifier explains them."""
+    found = {name: misread for name in sizes}
+    assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
+
+
+def test_one_record_with_another_clock_is_sampled_otherwise():
+    """A dwell at the sampling of the others has their clock, whatever it follows."""
+    others = [record("sine-2"), record("sine-3")]
+    assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
+    slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
+    fits = {
+        name: Followed(lost={1: lost}, missed={}, reach={1: 1.0}, friction={})
+        for name, lost in (("sine-1", 1.0), ("sine-2", 0.0), ("sine-3", 0.0))
+    }
+    assert without_lone_factors({"sine-1": SLOW}, [slow, *others], fits=fits) == {"sine-1": SLOW}
+
+
+def test_a_turned_channel_is_one_record_s_own():
+    """No limit, and no friction, turns a channel round."""
+    assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

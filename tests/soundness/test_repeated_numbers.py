@@ -1,0 +1,129 @@
+"""Runs that give one number twice: whether they agree, which is odd, and why."""
+
+from dataclasses import replace
+
+from pipeline.results import Estimate, LogDecrement, StepEdge, StepGain
+from pipeline.soundness.repeated_numbers import Repeats, compare_repeats
+from tests.helpers.analysis_factory import make_analysis
+
+SWING = make_analysis(1).log_decrements[0]
+
+
+def decay(run: str, omega: float, *, std: float = 1e-3) -> LogDecrement:
+    return replace(SWING, experiment=run, cart=1, omega_n=omega, omega_n_std=std)
+
+
+def step(run: str, gain: float, *, cart: int = 1, std: float = 0.01, size: float = 1.0) -> StepGain:
+    edge = StepEdge(
+        t=1.0,
+        u_before=0.0,
+        u_after=size,
+        level_before=0.0,
+        level_after=gain * size,
+        window_before=(0.0, 1.0),
+        window_after=(3.0, 4.0),
+        gain=gain,
+        gain_std=std,
+    )
+    return StepGain(
+        experiment=run,
+        cart=cart,
+        edges=(edge,),
+        gain=gain,
+        gain_std=std,
+        rest_shift=None,
+        interval=None,
+    )
+
+
+def compared(decays=(), steps=(), *, carts: int = 2, **fitted: float) -> Repeats:
+    estimates = {k: Estimate(value=v, std=0.01, source="bode_fit") for k, v in fitted.items()}
+    return compare_repeats(decays, steps, carts=carts, fitted=estimates, dwells={})
+
+
+def test_repeats_that_agree_pass():
+    """Three gains within 2 %: one check, passed; a number measured once has none."""
+    found = compared([decay("a", 20.0)], [step(f"{i}", g) for i, g in enumerate((2.0, 2.04, 2.02))])
+    (check,) = found.checks
+    assert (check.id, check.outcome) == ("repeats.K_1", "pass")
+    assert found.odd == {}
+    assert found.undecided == ()
+
+
+def test_of_two_nobody_knows_which_is_wrong():
+    """Two repeats a factor 1000 apart: a failed check, nobody named, and neither is used."""
+    found = compared([decay("a", 20.0), decay("b", 0.02)])
+    assert [c.outcome for c in found.checks if c.id == "repeats.omega_1"] == ["fail"]
+    assert found.odd == {}
+    assert found.undecided == ("omega_1",)
+
+
+def test_the_fit_tells_which_of_two_is_wrong():
+    """Where the other records say 20.3 rad/s, the run at 0.02 is the odd one: milliseconds."""
+    found = compared([decay("a", 20.0), decay("b", 0.02)], omega_1=20.3)
+    assert list(found.odd) == ["b"]
+    assert found.odd["b"].is_wrong
+    assert "milliseconds" in found.odd["b"].reason
+    assert found.undecided == ()
+
+
+def test_most_repeats_tell_where_no_fit_does():
+    """One of three gains stands off by a quarter, for no reason that is known."""
+    found = compared(steps=[step("a", 2.0), step("b", 2.5), step("c", 2.01)])
+    assert list(found.odd) == ["b"]
+    assert not found.odd["b"].is_wrong
+    assert [check.outcome for check in found.checks] == ["fail"]
+
+
+def test_a_run_is_odd_by_the_number_that_it_gives_otherwise():
+    """Of four runs one gives another K_1: K_2, in which it agrees, passes."""
+    steps = [step(run, gain, cart=cart) for run in "abc" for cart, gain in ((1, 2.0), (2, 1.5))]
+    steps += [step("d", 2.3, cart=1), step("d", 1.5, cart=2)]
+    found = compared(steps=steps)
+    assert list(found.odd) == ["d"]
+    assert not found.odd["d"].is_wrong
+    assert {check.id: check.outcome for check in found.checks} == {
+        "repeats.K_1": "fail",
+        "repeats.K_2": "pass",
+    }
+
+
+def test_a_reading_within_the_errors_of_those_like_the_fit_stays():
+    """Two steps give what the fit gives, a vague one lies a third off: nobody is left out."""
+    steps = [step("a", 2.0), step("b", 2.6), step("c", 2.05), step("vague", 2.5, std=0.2)]
+    assert list(compared(steps=steps, K_1=2.0).odd) == ["b"]
+
+
+def damped(run: str, zeta: float, *, std: float = 1e-4) -> LogDecrement:
+    return replace(decay(run, 20.0), zeta=zeta, zeta_std=std, friction=None)
+
+
+def test_dampings_of_repeats_are_compared():
+    """Of three decays one has a finger on the cart; half as much again is no contradiction."""
+    found = compared([damped("a", 0.03), damped("b", 0.031), damped("c", 0.09)])
+    assert list(found.odd) == ["c"]
+    assert not found.odd["c"].is_wrong
+    assert compared([damped("a", 0.03), damped("b", 0.04)]).undecided == ()
+    assert compared([damped("a", 0.03), damped("b", 0.09)]).undecided == ("zeta_1",)
+    assert compared([damped("a", 0.03), damped("b", 0.09, std=0.02)]).undecided == ()
+
+
+def test_wide_errors_are_no_contradiction_and_no_agreement():
+    """A third apart, each known to a tenth: neither is accused, and nothing agrees."""
+    found = compared(steps=[step("a", 2.0, std=0.2), step("b", 2.7, std=0.2)])
+    assert [check.outcome for check in found.checks] == ["skip"]
+    assert found.odd == {}
+    assert found.undecided == ()
+
+
+def test_gains_that_depend_on_the_size_of_the_step_are_no_odd_runs():
+    """Small steps give less where a cart sticks: the check fails, and every run stays."""
+    found = compared(
+        steps=[
+            *(step(f"small-{i}", 1.5, size=0.5) for i in range(2)),
+            *(step(f"large-{i}", 2.0, size=1.0) for i in range(3)),
+        ]
+    )
+    assert [check.outcome for check in found.checks] == ["fail"]
+    assert found.odd == {}
+    assert found.undecided == ()

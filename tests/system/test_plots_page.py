@@ -1,0 +1,103 @@
+"""The page of plots in a browser: from the student's page, by keyboard, on a phone, by night."""
+
+import re
+
+from playwright.sync_api import expect
+
+from pipeline.desk.app import DeskServer
+from pipeline.report.plots.page import render_page
+from pipeline.report.plots.runs import compare_runs
+from pipeline.words.progress import silent
+from tests.helpers.analysis_factory import make_analysis
+from tests.helpers.desks import a_submission
+from tests.helpers.waiting import PATIENCE, until
+from tests.system.test_desk import fits, show  # noqa: F401  (a fixture)
+from tests.system.test_report_pages import PHONE
+
+INK = "canvas => canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data"
+DRAWN = f"canvases => canvases.map(c => ({INK})(c).some(v => v > 0))"
+
+
+def shown(window) -> str:
+    """Return what the address keeps of a view."""
+    return window.evaluate("location.hash")
+
+
+def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
+    """Two runs, one cart, the residual, the spectrum, by keys alone; kept until a file changes."""
+    folder = a_submission(tmp_path / "team", "two-cart")
+    with DeskServer(folder=folder) as server:
+        window = show(server.url)
+        window.get_by_role("button", name="Lay records and models over each other").click()
+        window.wait_for_url("**/report/compare.html")
+        expect(window.locator(".result")).to_contain_text("The linear model is furthest off in")
+        assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # a plot a cart
+
+        # By keys: a second run, one cart of the two, what the model leaves, how often it swings.
+        window.get_by_role("checkbox", name="step-2").focus()
+        window.keyboard.press("Space")
+        window.get_by_role("checkbox", name="x₂").focus()
+        window.keyboard.press("Space")
+        assert window.locator("canvas").count() == 1
+        window.get_by_role("radio", name="Overlay").focus()
+        window.keyboard.press("ArrowRight")
+        expect(window.locator("#told")).to_have_text("step-1, step-2: residual")
+        assert shown(window) == "#run=step-1&run=step-2&cart=1&show=residual"
+        plot = window.get_by_role("group", name="x₁, residual")
+        plot.focus()
+        for _ in range(3):
+            window.keyboard.press("ArrowRight")
+        read = window.locator("output")
+        expect(read).to_contain_text(re.compile(r"^[\d.]+ s step-1: linear model"))
+        before = read.text_content()
+        window.keyboard.press("+")
+        window.keyboard.press("ArrowRight")
+        assert read.text_content() != before
+        window.keyboard.press("0")
+        window.get_by_role("radio", name="Residual", exact=True).focus()
+        window.keyboard.press("ArrowRight")
+        expect(window.get_by_role("group", name="x₁, amplitude")).to_be_visible()
+        assert window.locator("canvas").evaluate_all(DRAWN) == [True]
+        expect(window.locator(".key li")).to_have_count(4)
+
+        # A number of the table opens its residual; an address opens its view again.
+        window.get_by_role("link", name=re.compile("residual of sweep, x₂, linear model")).click()
+        expect(window.locator("#told")).to_have_text("sweep: residual")
+        address = window.url
+        window.goto("about:blank")
+        window.goto(address)
+        expect(window.get_by_role("checkbox", name="sweep")).to_be_checked()
+        expect(window.get_by_role("group", name="x₂, residual")).to_be_visible()
+        expect(window.get_by_role("group", name="x₁, residual")).to_have_count(0)
+
+        assert fits(window)
+        window.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+        width = "document.querySelector('canvas').getBoundingClientRect().width"
+        until(lambda: 300 < window.evaluate(width) < PHONE[0])
+
+        kept = (folder / "report" / "compare.html").stat()
+        window.goto(re.sub(r"report/.*", "compare", address))
+        assert window.url.endswith("/report/compare.html")
+        assert (folder / "report" / "compare.html").stat().st_mtime_ns == kept.st_mtime_ns
+        (folder / "data" / "step-1.csv").touch()
+        window.goto(re.sub(r"report/.*", "compare", address))
+        window.get_by_role("button", name="Make the plots").click()
+        window.wait_for_url("**/report/compare.html")
+        assert (folder / "report" / "compare.html").stat().st_mtime_ns != kept.st_mtime_ns
+
+
+def test_without_scripts_there_is_a_picture_and_the_table(browser, tmp_path):
+    """The run that the model is furthest off in, and the error of every run."""
+    analysis = make_analysis(1)
+    runs = compare_runs(analysis, gap=None, progress=silent)
+    page = tmp_path / "compare.html"
+    page.write_text(render_page(analysis, runs, gap=None, report=False), encoding="utf-8")
+    context = browser.new_context(java_script_enabled=False)
+    window = context.new_page()
+    window.set_default_timeout(1e3 * PATIENCE)
+    window.goto(page.as_uri())
+
+    expect(window.get_by_role("img", name="Measured motion")).to_be_visible()
+    expect(window.get_by_role("table")).to_contain_text("linear model")
+    assert not window.get_by_role("checkbox").first.is_visible()
+    context.close()

@@ -1,0 +1,48 @@
+"""Ctrl-C ends a command, whatever a library makes of it."""
+
+import contextlib
+import signal
+
+import pytest
+import typer
+
+from pipeline.cli.stopping import ctrl_c_says
+
+
+def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
+    """Press Ctrl-C at work that drops it, then look, or end in an error."""
+    with ctrl_c_says(lambda: said.append("stopped")) as looked:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        if error:
+            raise error
+        if look:
+            looked()
+            said.append("went on")
+
+
+@pytest.mark.parametrize("how", [{"look": True}, {"look": False}, {"error": ValueError("broken")}])
+def test_an_interrupt_that_a_library_drops_ends_the_work(how):
+    """As Python drops one that falls into the callback of a weak reference: at the next look.
+
+    Or at the end, or with the error that a library that is interrupted makes of it.
+    """
+    said = []
+    with pytest.raises(typer.Exit) as ended:
+        _work(said, **how)
+    assert ended.value.exit_code == 130
+    assert said == ["stopped"]
+
+
+def test_an_error_without_ctrl_c_stays_an_error():
+    """Only what follows on Ctrl-C is one."""
+    with pytest.raises(ValueError, match="broken"), ctrl_c_says(lambda: None):
+        raise ValueError("broken")
+
+
+def test_afterwards_ctrl_c_is_what_it_was():
+    """The handler of before is there again."""
+    before = signal.getsignal(signal.SIGINT)
+    with ctrl_c_says(lambda: None):
+        assert signal.getsignal(signal.SIGINT) is not before
+    assert signal.getsignal(signal.SIGINT) is before

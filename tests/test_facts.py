@@ -1,0 +1,96 @@
+"""Facts are asked for: nobody reads them back out of our own sentences, ids and names."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.places import ROOT
+
+PIPELINE = ROOT / "pipeline"
+READERS = {
+    "split",
+    "rsplit",
+    "partition",
+    "rpartition",
+    "startswith",
+    "endswith",
+    "removeprefix",
+    "removesuffix",
+}
+# What is said or named: as an attribute of anything, or as a variable.
+SAID = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
+        "partial"}  # fmt: skip
+# In these rooms such a variable holds the name of a parameter, never that of a file.
+ROOMS = ("checks", "identify", "soundness", "report/equations", "grading/mistakes", "grading/judge",
+         "grading/references")  # fmt: skip
+PARAMETERS = {"name", "omega", "zeta", "worst"}
+# A reason is shown line by line: one line for each thing that is wrong.
+ALLOWED = {'grade.reason.split("\\n")', 'reason.split("\\n")'}
+
+
+def read_back(source: str, *, of_parameters: bool = False) -> list[str]:
+    """Return the expressions of a module that read a fact out of a sentence, an id or a name."""
+    names = SAID - {"id"} | (PARAMETERS if of_parameters else set())
+    found = (ast.unparse(node) for node in _readings(ast.parse(source), names))
+    return [text for text in found if text.replace("'", '"') not in ALLOWED]
+
+
+def _readings(tree: ast.Module, names: set[str]) -> Iterator[ast.expr]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            if node.func.attr in READERS and _is_said(node.func.value, names):
+                yield node
+        elif isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load):
+            if _is_part(node.slice) and _is_said(node.value, names):
+                yield node
+        elif isinstance(node, ast.Compare) and isinstance(node.ops[0], (ast.In, ast.NotIn)):
+            text = isinstance(node.left, (ast.Constant, ast.JoinedStr))
+            where = node.comparators[0]
+            if text and isinstance(where, ast.Attribute) and where.attr in SAID - {"id"}:
+                yield node
+
+
+def _is_said(node: ast.expr, names: set[str]) -> bool:
+    if isinstance(node, ast.Attribute):
+        return node.attr in SAID
+    return isinstance(node, ast.Name) and node.id in names
+
+
+def _is_part(index: ast.expr) -> bool:
+    """Whether letters are taken: a slice, or a letter by its number."""
+    return isinstance(index, ast.Slice) or (
+        isinstance(index, ast.Constant) and isinstance(index.value, int)
+    )
+
+
+MODULES = [path for path in sorted(PIPELINE.rglob("*.py")) if path != PIPELINE / "names.py"]
+
+
+@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PIPELINE)))
+def test_no_fact_is_read_back_from_words(path: Path):
+    """Messages, ids, stages and names of parameters are not taken apart: `names.py` reads names."""
+    place = path.relative_to(PIPELINE).as_posix()
+    of_parameters = place.startswith(tuple(f"{room}/" for room in ROOMS))
+    assert read_back(path.read_text(encoding="utf-8"), of_parameters=of_parameters) == []
+
+
+@pytest.mark.parametrize(
+    "slip",
+    [
+        'check.message.split(": ", 1)[-1]',
+        'check.id.rpartition("-")[2]',
+        'check.id.partition(".")[0] in kinds',
+        '"estimates" in one.stage',
+        's.stage.startswith("hardware")',
+        'outcome.partial.endswith("by hand")',
+        'omega.removesuffix("_n")',
+        "kinds = {name[0] for name in names}",
+        'looks.get(worst[0], "look")',
+        'symbol = name.partition("_")[0]',
+    ],
+)
+def test_what_stood_there_before_is_found(slip: str):
+    """Each of these once read a fact out of a sentence, an id or a name."""
+    assert read_back(slip, of_parameters=True)

@@ -1,0 +1,122 @@
+"""Numbers as a report writes them."""
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.plant.loop.margins import Margins
+from pipeline.report.sections.loops import margin_rows
+from pipeline.words.numbers import listing, percent, significant, with_error, with_errors
+
+_SUPERSCRIPTS = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻−", "0123456789--")
+
+
+def read(text: str) -> tuple[float, float]:
+    """Return value and standard error as a reader takes them from the text."""
+    plain = text.translate(_SUPERSCRIPTS)
+    match = re.fullmatch(r"\(?(-?[\d.]+) ± ([\d.]+)\)?(?: × 10(-?\d+))?", plain)
+    assert match, text
+    scale = 10.0 ** int(match[3] or 0)
+    return float(match[1]) * scale, float(match[2]) * scale
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "expected"),
+    [
+        (24.3041, 0.1234, "24.30 ± 0.12"),
+        (24.3041, 0.0996, "24.30 ± 0.10"),  # the error rounds up into the next decade
+        (12345.6, 456.0, "12350 ± 460"),
+        (3.12812e-4, 1.2e-6, "(3.128 ± 0.012) × 10⁻⁴"),
+        (-0.5, 0.25, "−0.50 ± 0.25"),
+        (0.0, 1.3e-6, "(0.0 ± 1.3) × 10⁻⁶"),
+        (0.001, 2.0, "0.0 ± 2.0"),
+        (-0.001, 2.0, "0.0 ± 2.0"),  # no minus zero
+        (31.27, None, "31.27"),
+        (31.27, 0.0, "31.27"),
+        (31.27, math.inf, "31.27"),
+        (1 / 3, None, "0.3333"),
+        (12.5, 1e-12, "12.500000"),  # exact data: an error that says nothing
+        (5e6, 1e3, "(5.0000 ± 0.0010) × 10⁶"),
+    ],
+)
+def test_rounds_value_and_error_together(value, std, expected):
+    """Both end at the decimal place of the error's second digit."""
+    assert with_error(value, std) == expected
+
+
+@given(
+    st.floats(-1e9, 1e9, allow_nan=False).filter(lambda v: v == 0 or abs(v) > 1e-9),
+    st.floats(1e-7, 1e7),
+)
+def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
+    """What is read back lies within a twentieth of the error of what was written."""
+    std = ratio * abs(value) or ratio
+
+    got, got_std = read(with_error(value, std))
+
+    # Two digits of the error: its own rounding is at most 5 % (0.5 in 10), and the value is
+    # rounded at the same place; the 1e-4 is for the rounding of doubles.
+    assert abs(got - value) <= 0.0501 * std
+    assert abs(got_std - std) <= 0.0501 * std
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        (None, "–"),
+        (math.nan, "–"),
+        (0.0, "0"),
+        (9999.6, "10000"),
+        (123456.0, "1.235 × 10⁵"),
+        (-1.5e-7, "−1.500 × 10⁻⁷"),
+        (1.0, "1.000"),
+    ],
+)
+def test_significant_digits(value, expected):
+    """Four digits; a power of ten where plain digits would be long; a dash for nothing."""
+    assert significant(value) == expected
+
+
+def test_percentages_carry_their_sign_where_they_are_changes():
+    """A change shows its sign, a share does not; a missing one is a dash."""
+    assert percent(5.14, signed=True) == "+5.1 %"
+    assert percent(-148.2, signed=True) == "−148 %"
+    assert percent(5.14) == "5.1 %"
+    assert percent(None) == "–"
+
+
+def test_listing_reads_as_english():
+    """Commas, and an "and" before the last."""
+    assert [listing(list("abc")[:n]) for n in range(4)] == ["", "a", "a and b", "a, b and c"]
+    assert [listing("abcd"[:n], most=2) for n in (2, 3, 4)] == [
+        "a and b",
+        "a, b and 1 more",
+        "a, b and 2 more",
+    ]
+
+
+def test_margins_say_lag_lead_and_no_limit():
+    """A negative phase margin is a lead; where no gain or phase is the edge, there is no limit."""
+    lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
+    assert margin_rows(lag) == [
+        ("gain margin", "4.00", "", "at 0 rad/s"),
+        ("phase margin", "60.0", "°", "of lag at 20.0 rad/s"),
+        ("modulus margin", "0.700", "", ""),
+    ]
+    lead = replace(lag, phase_deg=-60.0, gain=None, omega_gain=None)
+    assert margin_rows(lead)[0][1:] == ("–", "", "no limit")
+    assert margin_rows(lead)[1][1:] == ("60.0", "°", "of lead at 20.0 rad/s")
+    none = replace(lag, phase_deg=None, omega_phase=None)
+    assert margin_rows(none)[1][1:] == ("–", "°", "no limit")
+    assert margin_rows(None) == []
+
+
+def test_a_column_has_one_form():
+    """Where one number needs a power of ten all of the column have one."""
+    small, large = (3.12812e-4, 1.2e-6), (0.1274769, 3.9e-6)
+    assert with_errors([large]) == ["0.1274769 ± 0.0000039"]
+    assert with_errors([small, large]) == ["(3.128 ± 0.012) × 10⁻⁴", "(1.274769 ± 0.000039) × 10⁻¹"]

@@ -1,0 +1,103 @@
+"""The sentences that an instructor may edit: found by key, values put in, marks set."""
+
+import ast
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.report.effects import gallery
+from pipeline.resources import TEMPLATES
+from pipeline.words.phrases import Phrases, phrases
+from pipeline.words.spans import Span
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.places import ROOT
+
+PIPELINE = ROOT / "pipeline"
+SUBJECTS = sorted(path.stem for path in (TEMPLATES / "words").glob("*.toml"))
+
+
+def written(folder: Path, text: str) -> Phrases:
+    """Return the sentences of a file of one's own."""
+    path = folder / "gap.toml"
+    path.write_text(text + "\n", encoding="utf-8")
+    return Phrases(path)
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_every_sentence_is_said_somewhere(subject):
+    """A catalogue holds no sentence that nothing asks for."""
+    asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
+    strings: set[str] = set()
+    parts: set[str] = set()  # of keys that are built, as in f"title_{verdict}"
+    for path in PIPELINE.rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        constants = [n.value for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant)]
+        found = {value for value in constants if isinstance(value, str)}
+        strings |= found
+        parts |= found if any(word in text for word in asking) else set()
+    built = tuple(s for s in parts if s.endswith("_"))
+    built_ends = tuple(s for s in parts if s.startswith("_"))
+    for key in phrases(subject).by_key:
+        said = key in strings or key.startswith(built) or key.endswith(built_ends)
+        assert said or key in ("bode_fit", "time_fit"), key  # the fit's own name
+
+
+def test_marks_are_set_and_values_are_never_markup(tmp_path):
+    """Strong, code and links come from the sentence alone."""
+    words = written(tmp_path, 'a = "**Yes: **{name}, see `f` under [here](#x)."')
+    assert words.spans("a", name="**no** [b](#y)") == (
+        Span("Yes: ", "strong"),
+        Span("**no** [b](#y), see "),
+        Span("f", "code"),
+        Span(" under "),
+        Span("here", url="#x"),
+        Span("."),
+    )
+    assert words.text("a", name=3).startswith("**Yes: **3,")
+    name = (Span("K", "em"),)
+    assert words.spans("a", name=name)[1:3] == (Span("K", "em"), Span(", see "))
+
+
+@pytest.mark.parametrize("subject", SUBJECTS)
+def test_a_catalogue_is_plain_toml(subject):
+    """One table of strings, whose braces are values or stand apart."""
+    found = tomllib.loads((TEMPLATES / "words" / f"{subject}.toml").read_text(encoding="utf-8"))
+    for key, text in found.items():
+        assert isinstance(text, str), key
+        shown = re.sub(r"\{ [^{}]* \}", "", re.sub(r"\{\w+\}", "", text))
+        assert shown.count("{") == 0, key
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ('a = "off by {shaer}"', "gap.toml: a names {shaer}; it may name {cart}, {share}"),
+        (
+            'b = "off by {share}"',
+            "gap.toml: the sentence a is missing; it may name {cart}, {share}",
+        ),
+        ("a = 3", "gap.toml: a needs a sentence in quotes, found 3"),
+        ('b = "x"\na = "off by {share}', "gap.toml line 2"),
+    ],
+)
+def test_a_slip_in_a_sentence_is_told_in_one_line(tmp_path, text, named):
+    """The file, the key and the values that it may name; with marks and without."""
+    words = written(tmp_path, text)
+    for say in (words.text, words.spans):
+        with pytest.raises(ConfigError) as error:
+            say("a", share="3 %", cart="1")
+        assert named in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("text", ['effects = "{shaer}"', 'effects = "All', 'made = "By hand"'])
+def test_a_slip_ends_a_command_in_one_line(tmp_path, monkeypatch, text):
+    """Exit status 2 and no traceback."""
+    monkeypatch.setattr(gallery, "_WORDS", written(tmp_path, text))
+    done = cartlab_here("effects", "coulomb_friction", "--out", tmp_path / "out")
+    assert done.returncode == 2
+    (line,) = done.stderr.strip().splitlines()
+    assert "templates/words/gap.toml" in line
