@@ -9,6 +9,7 @@ from urllib.parse import urlsplit
 import pytest
 
 from pipeline.desk.app import ROUTES, DeskServer
+from pipeline.desk.student.handin import list_held, list_missing
 from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
 from pipeline.grading.self_check.log import FILE, read_answers
