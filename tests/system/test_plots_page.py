@@ -28,7 +28,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
-        window.get_by_role("button", name="Lay records and models over each other").click()
+        window.get_by_role("button", name="Compare recordings and models").click()
         window.wait_for_url("**/report/compare.html")
         expect(window.locator(".result")).to_contain_text("The linear model is furthest off in")
         assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # a plot a cart

@@ -1,0 +1,180 @@
+"""Find crooked English, and keep each folder within its budget.
+
+`python .ci/prose.py` checks every text in the project that a person reads: Markdown, pages and
+words of templates, docstrings, comments and messages. A folder that has more finds than
+`.ci/prose.toml` allows fails. One that has fewer fails too, until `--lower` writes the new number,
+so a budget can only fall. `python .ci/prose.py PATH...` lists the finds of these files.
+
+A find is a place to read aloud. Rewrite the thought; do not swap the word.
+"""
+
+import ast
+import io
+import re
+import sys
+import tokenize
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+BUDGET = ROOT / ".ci" / "prose.toml"
+ROOTS = "README.md CONTRIBUTING.md CHANGELOG.md docs rubrics templates pipeline benchmarks tests"
+KINDS = {".py", ".md", ".j2", ".html", ".toml"}
+LONGEST = 38  # words in a sentence; above it a reader has to go back
+MESSAGE = 5  # words that make a string of a program a text
+
+# Constructions that read as translated, and what native readers write.
+RULES = {
+    r"\b(?:What|Who|Whoever) (?!is\b|are\b|do\b|does\b|did\b|was\b|were\b|can\b|to\b)[a-z][^?.!]*"
+    r" (?:is|are|has|have|was|were|may|must|comes?)\b[^?]*[.!]": "name the thing: 'the runs that'",
+    r"\b(?:is|are|was|were|has|have|of|where) none\b|\bnone is\b": "'there is no', 'is not a'",
+    r"\b(?:no|nothing|nobody)(?: \w+){0,2} but (?!it|they|the|a|not|this|also)": "'only'",
+    r"\bstands? (?:in|under|there|beside|below|above|at|once|twice)\b": "'is in', 'is below'",
+    r"\b(?:is|are|was|were|be) (?:told|said)\b(?! (?:to|that))|\btells? (?:of|nothing)\b": "'says'",
+    r"\b(?:brings?|leaves?) (?:most|more|nothing|little|less|noise)\b": "'improves', 'explains'",
+    r"\b(?:mend(?:ed|s|ing)?|anew|alike|wherein|thereof|thrice|nought|lest)\b": "a common word",
+    r"\b(?:one|those|any|all|nobody|everybody) who (?:is|are|has|does)\b": "'the run that'",
+    r"\b(?:is|are|was|were) (?:not )?to be (?!able)\w+|\bthere to (?:see|read)\b": "'must be'",
+}
+FOUND = [(re.compile(pattern), advice) for pattern, advice in RULES.items()]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Find:
+    """A sentence to read aloud: where it is, and what is odd."""
+
+    file: Path
+    line: int
+    advice: str
+    sentence: str
+
+
+def texts(file: Path) -> Iterator[tuple[int, str]]:
+    """Yield line and text of whatever a person reads in a file."""
+    raw = file.read_text(encoding="utf-8")
+    if file.suffix == ".py":
+        yield from _strings(raw)
+        yield from _comments(raw)
+    elif file.suffix == ".toml":
+        for number, line in enumerate(raw.splitlines(), 1):
+            quoted = re.findall(r'"((?:[^"\\]|\\.)*)"', line)
+            yield from ((number, text) for text in quoted)
+            if line.lstrip().startswith("#"):
+                yield number, line.lstrip("# ")
+    else:
+        yield from _paragraphs(raw, marked_up=file.suffix != ".md")
+
+
+def _strings(source: str) -> Iterator[tuple[int, str]]:
+    nodes = list(ast.walk(ast.parse(source)))
+    formatted = [node for node in nodes if isinstance(node, ast.JoinedStr)]
+    pieces = {id(part) for node in formatted for part in node.values}
+    for node in nodes:
+        text = ""
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            text = node.value if id(node) not in pieces else ""
+        elif isinstance(node, ast.JoinedStr):
+            text = "".join(p.value if isinstance(p, ast.Constant) else "X" for p in node.values)
+        if len(text.split()) >= MESSAGE:
+            yield node.lineno, text
+
+
+def _comments(source: str) -> Iterator[tuple[int, str]]:
+    """Yield the comments; those on lines that follow one another are one text."""
+    first, last, block = 0, -1, ""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type != tokenize.COMMENT:
+            continue
+        line, text = token.start[0], token.string.lstrip("# ")
+        if line == last + 1:
+            block += " " + text
+        else:
+            yield first, block
+            first, block = line, text
+        last = line
+    yield first, block
+
+
+def _paragraphs(raw: str, *, marked_up: bool) -> Iterator[tuple[int, str]]:
+    def blank(found: re.Match[str]) -> str:
+        return " X " + "\n" * found[0].count("\n")
+
+    raw = re.sub(r"(?s)```.*?```", blank, raw)
+    if marked_up:
+        raw = re.sub(r"(?s)<(style|script)\b.*?</\1>|\{[%#{].*?[%#}]\}|<[^>]+>", blank, raw)
+    line = 1
+    for part in re.split(r"(\n\s*\n|\n(?=\s*(?:[-*|#]|\d+\.)))", raw):
+        yield line, part
+        line += part.count("\n")
+
+
+def sentences(text: str) -> list[str]:
+    """Return the sentences of a text; code in it counts as one word."""
+    plain = re.sub(r"\s+", " ", re.sub(r"`[^`]*`", "X", text)).strip()
+    return [part for part in re.split(r"(?<=[.!?]) (?=[A-Z“\"(])", plain) if part]
+
+
+def finds(file: Path) -> Iterator[Find]:
+    """Yield each sentence of a file that has an odd construction, or too many words."""
+    for line, text in texts(file):
+        for sentence in sentences(text):
+            odd = [advice for pattern, advice in FOUND if pattern.search(sentence)]
+            if len(sentence.split()) > LONGEST and sentence.count("|") < 3:
+                odd.append("two sentences")
+            for advice in odd:
+                yield Find(file=file, line=line, advice=advice, sentence=sentence)
+
+
+def files_of(paths: list[Path]) -> list[Path]:
+    """Return the files with texts below some paths, in order."""
+    every = [f for path in paths for f in ([path] if path.is_file() else sorted(path.rglob("*")))]
+    return [f for f in every if f.suffix in KINDS and "__pycache__" not in f.parts]
+
+
+def folder_of(file: Path) -> str:
+    """Return the name under which the budget counts a file: its folder, at most two levels."""
+    return "/".join(file.relative_to(ROOT).parts[:-1][:2]) or file.name
+
+
+def counts() -> dict[str, int]:
+    """Return the number of finds of every folder that has some."""
+    every: dict[str, int] = {}
+    for file in files_of([ROOT / name for name in ROOTS.split()]):
+        n = len(list(finds(file)))
+        if n:
+            every[folder_of(file)] = every.get(folder_of(file), 0) + n
+    return dict(sorted(every.items()))
+
+
+def check(*, lower: bool) -> int:
+    """Compare the counts with the budget; return the exit code."""
+    budget: dict[str, int] = tomllib.loads(BUDGET.read_text(encoding="utf-8"))
+    now = counts()
+    over = {name: n for name, n in now.items() if n > budget.get(name, 0)}
+    for name, n in over.items():
+        print(f"{name}: {n} odd sentences, {budget.get(name, 0)} allowed.", file=sys.stderr)
+        print(f"  To see them: python .ci/prose.py {name}", file=sys.stderr)
+    if over:
+        return 1
+    if now != budget and not lower:
+        print("Fewer odd sentences than allowed. Keep it so: python .ci/prose.py --lower")
+        return 1
+    lines = [f'"{name}" = {n}' for name, n in now.items()]
+    head = "# Odd sentences that each folder may have, counted by prose.py. A number may only fall."
+    BUDGET.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    return 0
+
+
+def main(arguments: list[str]) -> int:
+    """List the finds of some paths, or check the project."""
+    paths = [Path(name).resolve() for name in arguments if name != "--lower"]
+    for find in (f for file in files_of(paths) for f in finds(file)):
+        where = find.file.relative_to(ROOT)
+        print(f"{where}:{find.line}: {find.advice}\n    {find.sentence[:220]}")
+    return 0 if paths else check(lower="--lower" in arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
