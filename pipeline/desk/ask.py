@@ -26,8 +26,8 @@ from pipeline.processes import Failed
 from pipeline.resources import TEMPLATES
 
 NOTHING_KNOWN: dict[str, Any] = {
-    "kind": None, "format": "", "duration": None, "remarks": [], "unsure": [], "lines": [],
-    "fractions": False, "frequency": None, "needs": [], "hardly": [], "still": {},
+    "kind": None, "format": "", "duration": None, "remarks": [], "unusable": [], "unsure": [],
+    "lines": [], "fractions": False, "frequency": None, "needs": [], "hardly": [], "still": {},
 }  # fmt: skip
 Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
 

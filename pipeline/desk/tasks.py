@@ -319,6 +319,7 @@ def _describe(found: Found) -> dict[str, Any]:
         "state": found.state,
         "kind": found.kind,
         "remarks": list(found.remarks),
+        "unusable": inspection.unusable if inspection else (),
         "unsure": list(found.unsure),
         "hardly": hardly_moving(inspection) if inspection else (),
         "still": {

@@ -48,6 +48,7 @@ class Inspection:
     rate : Hz. None, as the other times, where the file has no time column.
     kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
     problems : what to look at before using the file.
+    unusable : those of the problems for which a report does not take the file.
     needs : keys that its table in `submission.toml` has to state ("columns", "sample_rate").
     variables : of a binary file, read or not.
     guessed : column numbers by role, where the file has no headings and the signals tell.
@@ -64,6 +65,7 @@ class Inspection:
     kind: Kind | None
     frequency: float | None
     problems: tuple[str, ...]
+    unusable: tuple[str, ...]
     needs: tuple[str, ...]
     variables: tuple[Variable, ...]
     guessed: Mapping[str, int]
@@ -100,13 +102,15 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
     """
     real = Path(path).resolve()  # a link is the caller's own business here
     table, _ = read_table(real.parent, real.name, shown=str(path))
-    problems = [f"{table.cut}: the file was cut short"] if table.cut else []
+    unusable = [table.cut_short] if table.cut_short else []
+    problems = [*unusable]
     stated = {role: column for role, column in columns.items() if table.has(column)}
     try:
         assigned, unused = assign_columns(table, explicit=stated, free=(1,))
     except SubmissionError as error:
         assigned, unused = {}, ()
-        problems.append(str(error).removeprefix(f"{table.source}: "))
+        unusable.append(str(error).removeprefix(f"{table.source}: "))
+        problems.append(unusable[-1])
     unnamed = all(name.isdigit() for name in table.names)
     bare = not assigned and unnamed
     guessed = _suggest_columns(table) if bare else {}
@@ -117,7 +121,12 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
     # Without names everything else is missing too.
     further = [] if bare and not guessed else problems
-    clock = _clock(table, assigned, further) if "frequency" not in assigned else None
+    try:
+        clock = _clock(table, assigned, further) if "frequency" not in assigned else None
+    except SubmissionError as error:
+        clock = None
+        unusable.append(str(error).removeprefix(f"{table.source} "))
+        further.append(unusable[-1])
     kind, frequency = _guess(table, assigned, clock, further)
     problems += table.notes
     needs = []
@@ -137,6 +146,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         kind=kind,
         frequency=frequency,
         problems=tuple(problems),
+        unusable=tuple(unusable),
         needs=tuple(needs),
         variables=table.variables,
         guessed=guessed,
@@ -167,7 +177,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
     `state` is "broken" or "not_read"; `advice` says what to do.
     """
     nothing: dict[str, Any] = dict.fromkeys(field.name for field in fields(Inspection))
-    lists = {name: [] for name in ("columns", "needs", "variables")}
+    lists = {name: [] for name in ("columns", "unusable", "needs", "variables")}
     told = {"file": str(file), "problems": [problem], "advice": advice}
     return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **told}
 
@@ -216,18 +226,19 @@ def _looks_like_a_clock(values: Array) -> bool:
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock, or None where there is none that runs; what is wrong goes to problems."""
+    """Return the clock, or None without one; remarks on it go to `problems`.
+
+    Raises
+    ------
+    SubmissionError : its time stands still or goes back.
+    """
     column, n = columns.get("time"), table.values.shape[1]
     factor = conversion(column.unit, "s") if column else None
     if column is None or factor is None or n < 3:
         problems.append(NO_CLOCK if n >= 3 else f"only {n} samples")
         return None
     clock = read_clock(table.values[column.index] * factor)
-    try:
-        problems += clock_notes(table, column, clock, sample_rate=None)
-    except SubmissionError as error:
-        problems.append(str(error).removeprefix(f"{table.source} "))
-        return None
+    problems += clock_notes(table, column, clock, sample_rate=None)
     # Of the interval, rms: a clock worth a word.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
         problems.append(

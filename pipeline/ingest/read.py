@@ -156,11 +156,8 @@ def _read_bode(
 
 
 def _refuse_cut(table: FileTable) -> None:
-    if table.cut is not None:
-        raise SubmissionError(
-            f"{table.source} {table.cut}; the file was cut short: export it again, "
-            "or mend or delete its last line"
-        )
+    if table.cut_short:
+        raise SubmissionError(f"{table.source} {table.cut_short}")
 
 
 # ------------------------------------------------------------------------------ one record

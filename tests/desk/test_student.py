@@ -396,6 +396,17 @@ def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
     assert "what its columns are" in visitor.get(HERE).text
 
 
+def test_a_recording_that_was_cut_short_is_not_green(filled):
+    """A report does not take it, so its row says so and its group stays open."""
+    visitor, folder = filled
+    assert 'id="kind-decay" open' not in visitor.get(HERE).text
+    file = folder / "data" / "decay-1b.csv"
+    file.write_bytes(file.read_bytes()[:-3].rpartition(b",")[0])
+    page = visitor.get(HERE).text
+    assert 'id="kind-decay" open' in page
+    assert "the file was cut short: export it again" in page
+
+
 def test_edits_from_outside_show_and_are_not_written_over(filled):
     """A form of an older state is refused with both versions; so is an answer."""
     visitor, folder = filled

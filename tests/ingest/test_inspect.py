@@ -113,7 +113,22 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
     (tmp_path / "a.csv").write_text(text + "\n10.0")
     got = inspect_file(tmp_path / "a.csv")
     assert got.samples == 2000
-    assert got.problems == ("line 2002: expected 2 columns, found 1: the file was cut short",)
+    (problem,) = got.unusable
+    assert got.problems == (problem,)
+    assert problem.startswith("line 2002: expected 2 columns, found 1; the file was cut short")
+
+
+def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
+    """A column without a role is left out; the rest of the file is taken."""
+    got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
+    assert got.problems
+    assert got.unusable == ()
+
+
+def test_a_clock_that_goes_back_keeps_a_file_from_being_used(tmp_path):
+    """As in a report: two records pasted together are none."""
+    got = inspect(tmp_path, time=np.r_[T, T], x1=np.r_[X, X])
+    assert any("goes back" in said for said in got.unusable)
 
 
 def test_the_text_and_the_json_say_the_same(tmp_path):

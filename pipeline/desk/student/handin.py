@@ -1,6 +1,7 @@
 """The zip that is handed in: what the submission names, and nothing else."""
 
 import io
+import os
 import zipfile
 from pathlib import Path
 
@@ -65,6 +66,7 @@ def list_missing(folder: Path) -> list[str]:
 
 
 def _is_made(folder: Path, name: str) -> bool:
-    """Whether a file lies, also by a link, where what is computed lies: no zip takes that along."""
-    place = (folder / name).resolve()
-    return any(place.is_relative_to((folder / made).resolve()) for made in _MADE)
+    """Whether a file is in a folder of computed results, by its name or by a link."""
+    root = folder.resolve()
+    places = (Path(os.path.normpath(root / name)), (folder / name).resolve())
+    return any(place.is_relative_to(root / made) for place in places for made in _MADE)

@@ -147,11 +147,12 @@ def _describe(
         _question(field, table, look, carts=carts, marked=marked)
         for field in fill_experiment(document, index)
     )
-    problems = [] if look["format"] else ["it cannot be read"]
+    problems = [*look["unusable"]] if look["format"] else ["it cannot be read"]
     problems += [f"state {need} below" for need in look["needs"] if need not in table]
     if any(field.path.endswith("controller.type") and not field.value for field in fields):
         problems.append("say what controller ran")
     known = {said for cart, said in look["still"].items() if int(cart) not in carts}
+    known.update(problems)
     if "sample_rate" in table:
         known.add(NO_CLOCK)
     return Row(

@@ -51,8 +51,8 @@ class FileTable:
     values : (n_columns, n), all finite.
     whole : (n_columns,) the column holds nothing but whole numbers, written as such.
     lines : (n,) line of the file each row stands in; None in a binary file.
-    cut : what shows that the file was cut short, or None.
-    notes : what reading had to mend or leave out.
+    cut : the broken last line of a file that was cut short, or None.
+    notes : what reading repaired or left out.
     variables : of a binary file, in its order.
     """
 
@@ -65,6 +65,13 @@ class FileTable:
     cut: str | None = None
     notes: tuple[str, ...] = ()
     variables: tuple[Variable, ...] = ()
+
+    @property
+    def cut_short(self) -> str:
+        """What is wrong with a file that was cut short, and what to do; "" for a whole one."""
+        if self.cut is None:
+            return ""
+        return f"{self.cut}; the file was cut short: export it again, or delete its last line"
 
     def place(self, row: int) -> str:
         """Return "line 12" (or "sample 12" of a binary file) for a row counted from 0."""

@@ -108,7 +108,7 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
     submission = load_submission(folder)
     assert [experiment.id for experiment in submission.experiments] == recorded
     assert analyse(submission).records
-    diary = (folder / NAME).read_text(encoding="utf-8")
+    diary = (folder / NAME).read_text(encoding="utf-8").replace("\u00a0", " ")
     for turn in turns:
         assert f"{turn.seconds:.0f} s" in diary
 
