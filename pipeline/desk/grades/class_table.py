@@ -147,6 +147,7 @@ def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
         for submission, override in open_book(ask).changes_since(since):
             name = of_name.get(submission, STRANGER)
             given = "as graded" if override.points is None else points_text(override.points)
+            given = "a comment" if override.comment else given
             what = titles.get(override.criterion) or override.criterion
             at = to_the_second(override.at)
             text = f"{what}: {given}, by {override.by}: {override.why} ({at})"

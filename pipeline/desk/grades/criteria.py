@@ -7,6 +7,7 @@ from typing import Any
 
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.gradebook.open_book import TeamNow
+from pipeline.grading.gradebook.override import HandPoints
 from pipeline.grading.judge.costs import concerns
 from pipeline.grading.publish.feedback import (
     TONES,
@@ -107,7 +108,7 @@ def describe_criterion(
     typed : what was typed in its form and refused, and why: points, other, why, wrong.
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
-    given = now.entry.overrides.get(asked.id)
+    given = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
     points = points_text(own.points) if own else ""
     steps = [points_text(p) for p in point_steps(asked.points, step=now.rubric.step)]
     chosen = typed.get("points") or points
@@ -130,9 +131,15 @@ def describe_criterion(
         "wrong": typed.get("wrong", ""),
         "version": now.versions[asked.id],
         "changed": asked.id in now.changed,
-        "by_hand": f"By hand, {given.by}: {given.why}" if given else "",
+        "by_hand": _say_given(given) if given else "",
+        "is_comment": given is not None and given.comment,
         "own_reason": given.why if given else "",
     }
+
+
+def _say_given(given: HandPoints) -> str:
+    what = "Comment by" if given.comment else "Points by hand,"
+    return f"{what} {given.by}: {given.why}"
 
 
 def describe_flag(flag: Flag, units: Units | None) -> dict[str, Any]:

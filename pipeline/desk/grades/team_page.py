@@ -219,7 +219,8 @@ def _link_together(
         if many > 1:
             about = {"criterion": one["id"], "of": grade.submission}
             if one["by_hand"]:  # what was decided for this team is offered for all
-                about |= {"points": one["points"], "why": one["own_reason"]}
+                points = "same" if one["is_comment"] else one["points"]
+                about |= {"points": points, "why": one["own_reason"]}
             address = f"{ask.here}together?{urlencode(about)}&{wanted.query}"
             found.append((address, f"Apply to the {many} teams with {title}"))
     return found

@@ -124,20 +124,17 @@ def _wish(ask: Ask, shown: Class, asked: Criterion, name: str, *, typed: str) ->
     if name not in shown.teams:
         raise ConfigError("a team is not in the class any more")
     team = shown.teams[name]
-    if typed == _SAME:
-        judged = team.line.judged.get(asked.id)
-        if judged is None:
-            raise ConfigError(f"{name}: was never judged here, so a comment needs points")
-        points = judged["points"]
-    else:
-        points = read_points(typed)
-        if points is not None and not 0 <= points <= asked.points:
-            raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
+    points = None if typed == _SAME else read_points(typed)
+    if typed == _SAME and asked.id not in team.line.judged:
+        raise ConfigError(f"{name}: was never judged here, so a comment needs points")
+    if points is not None and not 0 <= points <= asked.points:
+        raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
     return WantedPoints(
         submission=team.submission,
         criterion=asked.id,
         points=points,
         why=ask.text("why"),
+        comment=typed == _SAME,
         seen=ask.text(f"seen.{name}"),
     )
 

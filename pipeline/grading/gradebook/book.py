@@ -337,6 +337,7 @@ class Gradebook:
             points=points,
             why=why,
             by=by,
+            comment=asked.comment,
             at=asked.at or self._at(),
             authors=last_named(connection, row.submission_id),
         )

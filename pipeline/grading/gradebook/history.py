@@ -32,7 +32,7 @@ class Event:
     at : ISO 8601, UTC.
     what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
         overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
-        taken back; `asked`, `answered`, `reopened`: another look at a criterion, `points` where the
+        taken back; `comment`: by hand, beside points that stay automatic; `asked`, `answered`, `reopened`: another look at a criterion, `points` where the
         answer gave others.
     points, out_of : of the submission, or of the one criterion that the event is about.
     text : flags, why, or the answer.
@@ -40,7 +40,9 @@ class Event:
     """
 
     at: str
-    what: Literal["graded", "listed", "removed", "override", "asked", "answered", "reopened"]
+    what: Literal[
+        "graded", "listed", "removed", "override", "comment", "asked", "answered", "reopened"
+    ]
     points: float | None
     out_of: float | None = None
     criterion: str = ""
@@ -73,7 +75,7 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
     for row in connection.execute(mine.order_by(overrides.c.id)):
         yield Event(
             at=row.at,
-            what="override",
+            what="comment" if row.comment else "override",
             points=row.points,
             criterion=row.criterion,
             text=row.why,
@@ -172,6 +174,8 @@ def event_words(event: Event) -> str:
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
+    if event.what == "comment":
+        return f"comment   {event.criterion}: by {event.by}: {event.text}"
     if event.what == "removed":
         return f"removed   {event.text}"
     if event.what in ("asked", "answered", "reopened"):

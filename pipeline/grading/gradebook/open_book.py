@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, func, insert, select
+from sqlalchemy import Connection, Row, Select, func, insert, or_, select
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
@@ -214,6 +214,8 @@ class OpenBook(Gradebook):
     ) -> HandPoints:
         """Give points by hand as `override` does, where nobody else did since.
 
+        The points that the criterion has already are not given: `why` is a comment beside them.
+
         Parameters
         ----------
         seen : what the change rests on, from `TeamNow.versions`.
@@ -225,8 +227,17 @@ class OpenBook(Gradebook):
         with self._database.changing() as connection:
             last, row = self._find(connection, team)
             _check_seen(connection, row, criterion, seen)
-            asked = WantedPoints(submission=team, criterion=criterion, points=points, why=why)
-            return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
+            rubric = read_rubric(last)
+            now = final_entry(connection, row, shared=read_flag(row.shared), rubric=rubric)
+            same = points is not None and points == points_of(now.grade, criterion)
+            asked = WantedPoints(
+                submission=team,
+                criterion=criterion,
+                points=None if same else points,
+                why=why,
+                comment=same,
+            ).beside(now.overrides.values())
+            return self._give(connection, row, asked, by=by, rubric=rubric)
 
     def undo(self, team: str, criterion: str, *, by: str, seen: str) -> HandPoints:
         """Give a criterion what it had before its last change; twice: what it had after.
@@ -257,7 +268,12 @@ class OpenBook(Gradebook):
         with self._database.changing() as connection:
             last = self._last(connection)
             rubric, at = read_rubric(last), self._at()
-            columns = submissions.c.name, gradings.c.id, gradings.c.submission_id
+            columns = (
+                submissions.c.name,
+                gradings.c.id,
+                gradings.c.submission_id,
+                gradings.c.authors,
+            )
             named = {row.name: row for row in connection.execute(class_list(last, *columns))}
             for wish in wishes:
                 where = f"line {wish.line}: " if wish.line else ""
@@ -266,11 +282,13 @@ class OpenBook(Gradebook):
                     raise ConfigError(f"{where}no such submission is in the class")
                 if wish.seen:
                     _check_seen(connection, row, wish.criterion, wish.seen)
-                newest = _newest_overrides(connection, row.submission_id).get(wish.criterion)
-                if newest is not None and (newest.points, newest.why) == (wish.points, wish.why):
+                newest = _newest_overrides(connection, row.submission_id)
+                ever = map(_read_override, newest.values())
+                asked = wish.beside(one for one in ever if one.concerns(row.authors))
+                if _is_same(asked, newest.get(asked.criterion)):
                     continue
                 try:
-                    self._give(connection, row, replace(wish, at=at), by=by, rubric=rubric)
+                    self._give(connection, row, replace(asked, at=at), by=by, rubric=rubric)
                 except ConfigError as error:
                     raise ConfigError(f"{where}{error}") from None
                 new += 1
@@ -350,7 +368,7 @@ class OpenBook(Gradebook):
                 .join(submissions)
                 .where(
                     submissions.c.assignment == self._last(connection).assignment,
-                    overrides.c.points.is_not(None),
+                    or_(overrides.c.points.is_not(None), overrides.c.comment),
                 )
                 .group_by(overrides.c.criterion, overrides.c.why)
                 .order_by(func.count().desc(), overrides.c.why)
@@ -405,13 +423,29 @@ def _overrides() -> Select:
 
 def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
     """Return what a criterion had by hand before its last change, of all that it ever had."""
-    last = earlier[-1] if earlier and earlier[-1].points is not None else None
+    last = earlier[-1] if earlier else None
+    if last is None or (last.points is None and not last.comment):
+        return WantedPoints(submission=team, criterion=criterion, points=None, why="taken back")
     return WantedPoints(
         submission=team,
         criterion=criterion,
-        points=last.points if last else None,
-        why=last.why if last else "taken back",
+        points=last.points,
+        why=last.why,
+        comment=last.comment,
     )
+
+
+def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
+    """Whether nothing is asked for but what was given last."""
+    if newest is None:
+        return False
+    given = newest.points, newest.comment, newest.why
+    return given == (asked.points, asked.comment, asked.why)
+
+
+def points_of(grade: Grade, criterion: str) -> float | None:
+    """Return the points of a criterion, None where it was never judged."""
+    return next((own.points for own in grade.criteria if own.id == criterion), None)
 
 
 def _changed_at(batch: Row, at: str) -> Select:
@@ -425,7 +459,9 @@ def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric
     shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
     rows = connection.execute(_overrides().where(own)).all()
     ever = [_read_override(one) for one in rows]
-    new = HandPoints(criterion=wish.criterion, points=wish.points, why=wish.why, by="", at="")
+    asked = wish.beside(one for one in ever if one.concerns(row.authors))
+    given = {name: getattr(asked, name) for name in ("criterion", "points", "why", "comment")}
+    new = HandPoints(**given, by="", at="")
     newest = {one.criterion: one for one in rows}.get(wish.criterion)
     return Tried(
         submission=row.name,

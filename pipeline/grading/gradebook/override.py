@@ -1,7 +1,7 @@
 """Points given by hand: who, when and why, one or many at once, and the grade with them in."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -21,9 +21,10 @@ class HandPoints:
 
     Attributes
     ----------
-    points : None where the automatic points are to hold again.
+    points : None where the automatic points hold, again or with a comment.
     at : ISO 8601, UTC.
     authors : of the submission at the time; the override goes with them.
+    comment : `why` is for the team to read, beside points that stay automatic.
     """
 
     criterion: str
@@ -32,6 +33,7 @@ class HandPoints:
     by: str
     at: str
     authors: tuple[str, ...] = ()
+    comment: bool = False
 
     def concerns(self, authors: tuple[str, ...]) -> bool:
         """Whether the submission is still that of the people it was given to."""
@@ -55,10 +57,11 @@ def read_points(text: str) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class WantedPoints:
-    """What somebody asks for; points None: the automatic ones again.
+    """What somebody asks for; points None: the automatic ones, again or with a comment.
 
     Attributes
     ----------
+    comment : `why` is to stand beside the points that hold; they are not given by hand.
     line : of a table that says so, 0 where none does.
     seen : what the change rests on, from `TeamNow.versions`; "" for whatever holds now.
     at : when; "" for now. Those given in one go have the same.
@@ -68,9 +71,22 @@ class WantedPoints:
     criterion: str
     points: float | None
     why: str
+    comment: bool = False
     line: int = 0
     seen: str = ""
     at: str = ""
+
+    def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":
+        """Return what a comment asks for beside all that was given before.
+
+        Points that are by hand already stay so, and the comment is their reason.
+        """
+        newest = None
+        for one in earlier:
+            newest = one if one.criterion == self.criterion else newest
+        if not self.comment or newest is None or newest.points is None:
+            return self
+        return replace(self, points=newest.points, comment=False)
 
 
 def read_wishes(path: Path) -> list[WantedPoints]:
@@ -104,6 +120,15 @@ def read_wishes(path: Path) -> list[WantedPoints]:
             )
         )
     return wishes
+
+
+def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
+    """Return the grade with comments, by criterion, at the end of what is said there."""
+    criteria = (
+        _with_comment(own, comments[own.id].why) if own.id in comments else own
+        for own in grade.criteria
+    )
+    return grade.model_copy(update={"criteria": tuple(criteria)})
 
 
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
@@ -144,10 +169,14 @@ def _unjudged(id_: str, title: str, out_of: float) -> Criterion:
     )  # fmt: skip
 
 
+def _with_comment(criterion: Criterion, why: str) -> Criterion:
+    return criterion.model_copy(update={"message": f"{criterion.message} {why}"})
+
+
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
     points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
-    if points == criterion.points:  # a comment alone
-        return criterion.model_copy(update={"message": f"{criterion.message} {why}"})
+    if points == criterion.points:
+        return _with_comment(criterion, why)
     changed = {
         "points": points,
         "outcome": "pass" if points >= criterion.out_of else "partial" if points > 0 else "fail",

@@ -7,7 +7,7 @@ from sqlalchemy import Connection, Row
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.open_book import Conflict, OpenBook, find_version
+from pipeline.grading.gradebook.open_book import Conflict, OpenBook, find_version, points_of
 from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradebook.requests import (
     MOST_OPEN,
@@ -187,7 +187,7 @@ class RequestBook(OpenBook):
 
         Parameters
         ----------
-        points : None: they stay.
+        points : None, or those that the criterion has: they stay.
         text : what the students read; the reason of the points too.
         seen : what the answer rests on, from `Queued.version`.
 
@@ -202,6 +202,8 @@ class RequestBook(OpenBook):
             last, row, request = self._find_request(connection, submission, criterion, seen=seen)
             if request.state != "asked":
                 raise RequestRefused("this request was answered already; reopen it for another")
+            if points == points_of(_entry(connection, last, row).grade, criterion):
+                points = None
             if points is not None:
                 wish = WantedPoints(
                     submission=submission, criterion=criterion, points=points, why=text

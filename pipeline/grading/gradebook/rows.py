@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, Row, Select, Table, func, inse
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade, read_grade
-from pipeline.grading.gradebook.override import HandPoints, with_overrides
+from pipeline.grading.gradebook.override import HandPoints, with_comments, with_overrides
 from pipeline.grading.gradebook.schema import (
     Database,
     batches,
@@ -45,7 +45,7 @@ class Entry:
     Attributes
     ----------
     grade : with shared data flagged, points given by hand, and lateness off those.
-    overrides : by criterion, those in force.
+    overrides, comments : by criterion, those in force.
     owner : who handed it in, as the learning platform calls them, or "".
     key : of all that it depends on, as handed in.
     grading : its number in the gradebook.
@@ -55,6 +55,7 @@ class Entry:
     submission: str
     grade: Grade
     overrides: Mapping[str, HandPoints]
+    comments: Mapping[str, HandPoints]
     owner: str
     key: str
     grading: int
@@ -197,12 +198,14 @@ def as_it_counts(
     """Return a line with all overrides that there ever were of its submission."""
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
     given = {key: override for key, override in newest.items() if override.points is not None}
+    comments = {key: override for key, override in newest.items() if override.comment}
     grade = read_grade(row.grade)
     grade = grade.with_flags(shared) if shared else grade
     return Entry(
         submission=row.name,
-        grade=with_overrides(grade, given, rubric=rubric),
+        grade=with_overrides(with_comments(grade, comments), given, rubric=rubric),
         overrides=given,
+        comments=comments,
         owner=row.owner,
         key=row.key,
         grading=row.id,

@@ -33,6 +33,7 @@ from sqlalchemy import (
     UniqueConstraint,
     create_engine,
     event,
+    false,
     func,
     insert,
     inspect,
@@ -40,6 +41,7 @@ from sqlalchemy import (
     select,
 )
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
+from sqlalchemy.schema import CreateColumn
 
 from pipeline.errors import ConfigError
 from pipeline.output import OWNER_ONLY
@@ -181,7 +183,8 @@ entries = Table(
     Index("entries_by_submission", "submission_id"),
 )
 
-# The newest of a criterion counts; no points: the automatic ones hold again.
+# The newest of a criterion counts; without points the automatic ones hold, with a comment beside
+# them or, as taken back, alone.
 overrides = Table(
     "overrides",
     metadata,
@@ -193,6 +196,7 @@ overrides = Table(
     Column("why", Words, nullable=False),
     Column("by", Words, nullable=False),
     Column("authors", Names, nullable=False),
+    Column("comment", Boolean, nullable=False, server_default=false()),
     Index("overrides_by_submission", "submission_id"),
 )
 
@@ -292,7 +296,7 @@ class Database:
                 whole = _is_whole(connection)
         except _SENSELESS as error:  # the driver reads the address when it first connects
             raise ConfigError(_NO_ADDRESS) from error
-        if not whole:  # of a version that had fewer tables
+        if not whole:  # of a version that had fewer tables or columns
             with self.writing() as connection:
                 _create(connection)
 
@@ -342,10 +346,19 @@ def _create(connection: Connection) -> None:
     # Where all is there nothing is made anew: whoever may only read and add could not.
     if not _is_whole(connection):
         metadata.create_all(connection)
+        if _lacks_comments(connection):
+            column = CreateColumn(overrides.c.comment).compile(dialect=connection.dialect)
+            connection.execute(DDL(f"ALTER TABLE {overrides.name} ADD COLUMN {column}"))
 
 
 def _is_whole(connection: Connection) -> bool:
-    return metadata.tables.keys() <= set(inspect(connection).get_table_names())
+    there = set(inspect(connection).get_table_names())
+    return metadata.tables.keys() <= there and not _lacks_comments(connection)
+
+
+def _lacks_comments(connection: Connection) -> bool:
+    columns = inspect(connection).get_columns(overrides.name)
+    return overrides.c.comment.name not in [column["name"] for column in columns]
 
 
 def _take_turns(connection: Connection) -> None:

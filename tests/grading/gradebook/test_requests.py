@@ -217,10 +217,12 @@ def test_of_two_answers_at_one_moment_one_counts(book, place):
             seen = book.queue().waiting[0].version
             ready = Barrier(2)
 
-            def give(who, by, *, seen=seen, ready=ready):
+            points = 0.25 + 0.5 * (number % 2)  # others than before
+
+            def give(who, by, *, seen=seen, ready=ready, points=points):
                 ready.wait()
                 try:
-                    who.answer("team-1", "laws", 0.75, text=f"from {by}", by=by, seen=seen)
+                    who.answer("team-1", "laws", points, text=f"from {by}", by=by, seen=seen)
                 except Conflict:
                     return "conflict"
                 return "taken"

@@ -1,0 +1,132 @@
+"""A comment beside points: the team reads it, and the points stay automatic."""
+
+import sqlite3
+from contextlib import closing
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from pipeline.grading.gradebook.history import history_text
+from pipeline.grading.gradebook.open_book import OpenBook
+from pipeline.grading.gradebook.override import WantedPoints
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradings import Batch
+from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric
+
+RUBRIC = two_cart_rubric()
+
+
+@pytest.fixture
+def book(place):
+    """A gradebook with a team that has half of all points."""
+    with OpenBook(place, assignment="lab", create=True) as opened:
+        grade(opened, share=0.5)
+        yield opened
+
+
+def grade(book, *, share):
+    """Grade the team, as after a change of the rubric or of the submission."""
+    outcome = make_outcome(make_grade("team-1", share=share), key=f"{share}")
+    book.put(outcome)
+    book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
+
+
+def change(book, points, why="Mind the unit.", criterion="pieces"):
+    """Save the form of a criterion, as the desk does."""
+    seen = book.team("team-1").versions[criterion]
+    book.change("team-1", criterion, points, why=why, by="Ada", seen=seen)
+
+
+def comment_all(book, why="Mind the unit."):
+    """Comment on one criterion of several teams at once."""
+    wish = WantedPoints(
+        submission="team-1", criterion="pieces", points=None, why=why, comment=True
+    )
+    return book.change_all([wish], by="Ada")
+
+
+def pieces(book):
+    """Return the criterion as it counts."""
+    return next(c for c in book.entry("team-1").grade.criteria if c.id == "pieces")
+
+
+@pytest.mark.parametrize("say", [lambda book: change(book, 0.5), comment_all])
+def test_a_comment_does_not_freeze_points(book, say):
+    """Graded again, the team has the new points, and still the comment."""
+    assert pieces(book).points == 0.5
+    say(book)
+    assert pieces(book).message == "omega_1 is off. Mind the unit."
+    assert book.entry("team-1").overrides == {}
+    grade(book, share=1.0)
+    assert pieces(book).points == 1.0
+    assert pieces(book).outcome == "pass"
+    assert pieces(book).message == "As expected. Mind the unit."
+    assert "comment   pieces: by Ada: Mind the unit." in history_text(*book.history("team-1"))
+
+
+@pytest.mark.parametrize("say", [lambda book: change(book, 0.0), comment_all])
+def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
+    """What was given by hand survives, with the new reason."""
+    change(book, 0.0, why="copied")
+    say(book)
+    assert "to 0 of 1: Mind the unit." in pieces(book).message
+    grade(book, share=1.0)
+    assert pieces(book).points == 0.0
+
+
+def test_a_comment_is_undone_and_given_back(book):
+    """Undo takes it away, or gives back the comment that was there before."""
+
+    def undo():
+        book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
+
+    comment_all(book)
+    undo()
+    assert pieces(book).message == "omega_1 is off."
+    comment_all(book)
+    change(book, 1.0, why="right")
+    undo()
+    assert pieces(book).message == "omega_1 is off. Mind the unit."
+    assert (pieces(book).points, book.entry("team-1").overrides) == (0.5, {})
+    together = comment_all(book, why="See page 3.")
+    assert comment_all(book, why="See page 3.").teams == 0
+    book.undo_all(together.at, by="Ada")
+    assert pieces(book).message == "omega_1 is off. Mind the unit."
+
+
+def test_what_a_comment_would_change_is_shown_first(book):
+    """Nothing but the message."""
+    wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why="x", comment=True)
+    (tried,) = book.try_all([wish])
+    assert tried.after.points == tried.now.points
+    assert [c.message for c in tried.after.criteria if c.id == "pieces"] == ["omega_1 is off. x"]
+
+
+def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
+    """Whoever looked again and found the points right gave none."""
+    with RequestBook(place) as shared:
+        shared.release(True, by="prof")
+        shared.ask("team-1", "pieces", why="please", by="s1")
+        (queued,) = shared.queue().waiting
+        shared.answer("team-1", "pieces", 0.5, text="right", by="Ada", seen=queued.version)
+    grade(book, share=1.0)
+    assert pieces(book).points == 1.0
+
+
+def test_a_gradebook_without_comments_gets_them(book, place):
+    """One of an earlier cartlab: its overrides stay as they are, and comments can be added."""
+    book.override("team-1", "laws", 0.0, why="no", by="Ada")
+    book.close()
+    if "://" in place:
+        engine = create_engine(place.replace("postgresql:", "postgresql+psycopg:"))
+        with engine.begin() as old:
+            old.execute(text("ALTER TABLE overrides DROP COLUMN comment"))
+        engine.dispose()
+    else:
+        with closing(sqlite3.connect(f"{place}/{FILE}")) as old:
+            old.execute("ALTER TABLE overrides DROP COLUMN comment")
+    with OpenBook(place) as opened:
+        assert opened.entry("team-1").overrides["laws"].points == 0.0
+        comment_all(opened)
+        assert pieces(opened).message == "omega_1 is off. Mind the unit."
