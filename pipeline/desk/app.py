@@ -69,7 +69,7 @@ def _stop(ask: Ask) -> Response:
 
 async def _tell_news(ask: Ask) -> Response:
     """Tell of the work in the place of the address."""
-    return StreamingResponse(_news(ask, ask.grades()), media_type="text/event-stream")
+    return StreamingResponse(_news(ask, ask.place_or_404()), media_type="text/event-stream")
 
 
 async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
@@ -78,7 +78,8 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
-            said = " ".join(ask.user.told(job.said).split())
+            shown = ask.job or job
+            said = " ".join(ask.user.told(shown.said).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
         elif quiet > 5.0:  # s
             quiet = 0.0
@@ -249,7 +250,7 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
         if request.method == "POST":
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)
         ask = Ask(desk=desk, user=user, request=request, form=form)
-        if room == "student" and is_refused(ask, path):
+        if room == "student" and is_refused(path, user, ask.place):
             raise HTTPException(403, REFUSED)
         try:
             if iscoroutinefunction(handler):

@@ -18,8 +18,9 @@ from pipeline import __version__
 from pipeline.desk.benches import Benches
 from pipeline.desk.books import Books
 from pipeline.desk.browse import find_root
-from pipeline.desk.jobs import Jobs, WorkerPool
+from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.rooms import list_rooms
+from pipeline.desk.student.seeing import show_job
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError
 from pipeline.processes import Failed
@@ -148,16 +149,25 @@ class Ask:
         ------
         ConfigError : it is about a class in a database.
         """
-        place = self.grades()
+        place = self.place_or_404()
         if isinstance(place, str):
             raise ConfigError("a class in a database is graded and written by cartlab grade")
         return place
 
-    def grades(self) -> Place:
-        """Return the place that the address is about: a folder, or a database of grades."""
+    def place_or_404(self) -> Place:
+        """Return the place that the address is about, a folder or a database, else refuse."""
         if self.place is None:
             raise HTTPException(404, "there is nothing here that is yours to see")
         return self.place
+
+    @property
+    def job(self) -> Job | None:
+        """The last work in the place of the address, as this person may read of it."""
+        place = self.place
+        if place is None:
+            return None
+        folder = place if isinstance(place, Path) else None
+        return show_job(self.desk.jobs.of(place), self.user, folder)
 
     def start(self, task: str, *, title: str, **given: Any) -> None:
         """Begin a long task in the folder that the address is about."""
@@ -202,7 +212,7 @@ class Ask:
             "rooms": list_rooms(self.user, self.request.url.path, self.desk.books),
             "version": __version__,
             "folder": folder,
-            "job": folder and self.desk.jobs.of(folder),
+            "job": self.job,
             "said": lambda place="": self.desk.said.pop(self._room(place), []),  # once
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)

@@ -99,7 +99,7 @@ class Books:
             return 0
         try:
             return self.book(place).n_waiting()
-        except ConfigError:  # its own page says why
+        except (ConfigError, OSError):  # its own page says why
             return 0
 
     def of(self, place: Path | str) -> Class:

@@ -72,15 +72,16 @@ def list_folders(root: Path, inside: str) -> FolderList:
     names, more = _list_names(folder)
     paths = dict.fromkeys((folder / name).resolve() for name in names)
     kept = [path for path in paths if _is_shown(path, root)]
-    found = [_describe(path, root) for path in kept[:MOST]]
+    found = [_describe(path, root) for path in kept]
     openable = ("submission", "grading")
+    found.sort(key=lambda one: one.kind not in openable)
     parts = folder.relative_to(root).parts
     steps = ["/".join(parts[:depth]) for depth in range(len(parts))]
     return FolderList(
         here=_describe(folder, root),
         above=tuple((Path(step).name or root.name or str(root), step) for step in steps),
-        found=tuple(sorted(found, key=lambda one: one.kind not in openable)),
-        left_off=more or len(kept) > MOST,
+        found=tuple(found[:MOST]),
+        left_off=more or len(found) > MOST,
     )
 
 

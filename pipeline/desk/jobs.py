@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,6 +49,10 @@ class Job:
         """Whether nothing more happens."""
         return self.state in ("done", "failed", "stopped")
 
+    def without_talk(self) -> "Job":
+        """Return how it stands, without what it says, for somebody who may not read that."""
+        return replace(self, title="Work in this folder", said="done" if self.over else "under way")
+
     def tell(self, state: State, said: str) -> None:
         """Note what it is about."""
         self.state, self.said, self.news = state, said, self.news + 1
@@ -75,8 +79,8 @@ class Jobs:
             if before and not before.over:
                 if before.asked != asked:
                     raise Busy(
-                        f"{before.title} is under way in this folder ({before.said}): wait for its "
-                        "end or stop it first"
+                        f"{before.title} is under way in this folder: wait for its end or stop it "
+                        "first"
                     )
                 return before
             job = self._jobs[place] = Job(title=title, place=place, asked=asked)

@@ -112,6 +112,17 @@ def test_their_room_offers_the_check_in_place_of_the_report(lab):
     assert f'href="{HERE}check"' not in lab("s2").get(HERE).text
 
 
+def test_nobody_elses_work_tells_them_a_number(lab):
+    """An instructor makes a report in their folder: they learn that work is under way, no more."""
+    student, instructor = lab("s1"), lab("i")
+    assert instructor.post(f"{HERE}make-report").status == 303
+    assert "The report" not in words_of(student.get(f"{HERE}hand-in"))
+    told = set(re.findall(r"^data: (.+)$", student.get(f"{HERE}events").text, re.MULTILINE))
+    assert told <= {"under way", "done"}
+    assert "Work in this folder: done" not in instructor.get(HERE).text
+    assert "asks" not in words_of(student.get(f"{HERE}hand-in"))  # nor what the report asks
+
+
 def test_first_which_then_where_and_the_count_is_shown(lab, root):
     """Names with a mark, a hint for the number asked about; no digit of the value anywhere."""
     student = lab("s1")

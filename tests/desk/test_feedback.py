@@ -11,6 +11,9 @@ from pipeline.desk.users import read_users
 from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.gradebook.requests import MOST_LETTERS, MOST_OPEN
+from pipeline.grading.gradings import Batch
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.resources import RUBRICS
 from tests.helpers.desks import Answer, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import two_cart_rubric, write_class
 from tests.helpers.hostile import SECRET
@@ -309,3 +312,31 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
         assert "your grade cannot be read now; tell your instructor" in answer.text
         assert str(tmp_path) not in answer.text
         assert "gradebook" not in answer.text
+
+
+@pytest.mark.parametrize("by_class", [False, True])
+def test_who_is_to_find_the_numbers_reads_none(tmp_path, by_class):
+    """Points, outcomes and names of remarks; their own rubric decides, else that of the class."""
+    write_class(tmp_path / "grades")
+    a_submission(tmp_path / "five")
+    text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
+    lab = tmp_path / "lab.toml"
+    lab.write_text(text + '\n[students]\nsee = "check"\n', encoding="utf-8")
+    user = USERS.replace("[[users]]", '[[users]]\nrubric = "lab.toml"', 1)
+    if by_class:
+        user, rubric = USERS, load_rubric(lab)
+        with RequestBook(tmp_path / "grades", assignment="lab") as book:
+            keys = tuple(entry.key for entry in book.entries())
+            book.finish(Batch(keys=keys, shared={}), rubric=rubric)
+    with DeskServer(users=write_users(tmp_path, user)) as server:
+        port = urlsplit(server.url).port or 0
+        through_proxy(port, "prof").post(ROOM + "release", do="release")
+        student, ta = through_proxy(port, "s4"), through_proxy(port, "Ada")
+        page = student.get(HERE)
+        assert "of 20 points" in page.text
+        assert "Hz where rad/s" in page.text
+        assert not re.search(r"3\.12|19\.6|<table", page.text)
+        assert f"{HERE}whole" not in page.text
+        assert student.get(HERE + "whole").status == 403
+        assert "19.6" in ta.get(ROOM + "team?of=team-04").text
+        assert ask(student, why="please").status == 303

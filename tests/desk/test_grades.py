@@ -689,6 +689,17 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
     assert again.status == 303  # looked through once more
 
 
+def test_only_a_decision_for_several_is_undone_as_one(ta, grades):
+    """Nothing that was not one, nor of another class; the change of one team stays."""
+    change(ta, "team-01", points="0.5", why="alone")
+    with Gradebook(grades) as book:
+        moment = book.entry("team-01").overrides["laws"].at
+    for sent in (moment, "", "2026-01-01"):
+        assert ta.post(ROOM + "together", do="undo", set=sent).status == 404
+    with Gradebook(grades) as book:
+        assert book.entry("team-01").overrides["laws"].points == 0.5
+
+
 def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
     """Whoever was changed since stays, and is named; the class page has each decision."""
     page = ta.get(together())

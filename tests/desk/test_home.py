@@ -76,6 +76,15 @@ def test_a_large_folder_is_cut_and_says_so(root):
     assert f"Only the first {MOST} folders are listed" in page
 
 
+def test_what_can_be_opened_is_never_cut_off(root):
+    """A submission whose name comes last is the first of a long list."""
+    for number in range(MOST + 5):
+        (root / "years" / f"team-{number:03d}").mkdir()
+    (root / "years" / "zoe").mkdir()
+    (root / "years" / "zoe" / "submission.toml").write_text("", encoding="utf-8")
+    assert list_folders(root, "years").found[0].inside == "years/zoe"
+
+
 def test_the_whole_disk_is_no_root(monkeypatch):
     """A desk that was started from an icon lists the home folder."""
     monkeypatch.chdir(Path(Path.cwd().anchor))

@@ -46,12 +46,12 @@ class Counted:
 
 def read_class(ask: Ask) -> Class:
     """Return the class that the address is about."""
-    return ask.desk.books.of(ask.grades())
+    return ask.desk.books.of(ask.place_or_404())
 
 
 def open_book(ask: Ask) -> RequestBook:
     """Return the gradebook that the address is about."""
-    return ask.desk.books.book(ask.grades())
+    return ask.desk.books.book(ask.place_or_404())
 
 
 def find_team(shown: Class, name: str) -> Listing:
@@ -83,7 +83,7 @@ def show(ask: Ask) -> Response:
     unseen = (name for name, team in shown.teams.items() if not team.seen)
     return ask.page(
         "grades",
-        title=shown.rubric.title or name_place(ask.grades()),
+        title=shown.rubric.title or name_place(ask.place_or_404()),
         teams=chosen[_ROWS * (page - 1) : _ROWS * page],
         points=points_text,
         found=len(chosen),
@@ -106,7 +106,7 @@ def show(ask: Ask) -> Response:
         to_page=lambda number: f"?{urlencode({'page': number})}&{wanted.query}",
         drawn="-".join(map(str, shown.state)),
         news=list_news(ask, shown, since=shown.state[1]),
-        asked=ask.desk.books.asked.get(ask.grades(), {}),
+        asked=ask.desk.books.asked.get(ask.place_or_404(), {}),
         n_requests=open_book(ask).n_waiting(),
         released=open_book(ask).released,
         may_release=may_release(ask),
@@ -167,7 +167,7 @@ def _read_number(ask: Ask, name: str) -> int:
 
 def draw_distribution(ask: Ask) -> Response:
     """Draw how many submissions have how many points."""
-    return show_drawing(ask.desk.books.drawn(ask.grades(), "distribution", _distribution))
+    return show_drawing(ask.desk.books.drawn(ask.place_or_404(), "distribution", _distribution))
 
 
 def _distribution(shown: Class) -> str:
@@ -198,7 +198,7 @@ def show_class_page(ask: Ask) -> Response:
         lines = [team.line for team in teams]
         return class_page(lines, rubric=shown.rubric, doubles=doubles, clusters=clusters)
 
-    return show_own_page(ask.desk.books.drawn(ask.grades(), "class", draw))
+    return show_own_page(ask.desk.books.drawn(ask.place_or_404(), "class", draw))
 
 
 def show_feedback(ask: Ask) -> Response:

@@ -5,15 +5,14 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
+from pipeline.desk.evidence import is_about, show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.gradebook.open_book import TeamNow
 from pipeline.grading.gradebook.override import HandPoints
-from pipeline.grading.judge.costs import concerns
 from pipeline.grading.publish.feedback import (
     TONES,
     alternative,
     evidence_table,
-    numbers_table,
     sentence,
 )
 from pipeline.grading.publish.feedback_figures import is_response, numbers_in
@@ -22,11 +21,10 @@ from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
-from pipeline.report.document import paragraph
 from pipeline.report.render.html import render_blocks
 from pipeline.set_up import Units
 from pipeline.words.numbers import NOTHING
-from pipeline.words.text import capital, name_span, rich, with_symbols
+from pipeline.words.text import capital, name_span, with_symbols
 
 MOST_STEPS = 9  # a key each, from 1
 _QUARTERS = 4
@@ -60,11 +58,11 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))
         for flag in grade.flags
-        if not any(_is_about(flag, asked, now.rubric) for asked in now.rubric.criteria)
+        if not any(is_about(flag, asked, now.rubric) for asked in now.rubric.criteria)
     ]
     for asked in now.rubric.criteria:
         own = judged.get(asked.id)
-        flagged = any(_is_about(flag, asked, now.rubric) for flag in grade.flags)
+        flagged = any(is_about(flag, asked, now.rubric) for flag in grade.flags)
         earned = points_text(own.points) if own else NOTHING
         items.append(
             Item(
@@ -81,11 +79,6 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
     return sorted(items, key=lambda item: (not item.doubt, not item.is_remark, -item.lost))
 
 
-def find_remarks(grade: Grade, asked: Asked, rubric: Rubric) -> list[Flag]:
-    """Return the remarks of a grade that are about a criterion."""
-    return [flag for flag in grade.flags if _is_about(flag, asked, rubric)]
-
-
 def point_steps(out_of: float, *, step: float) -> list[float]:
     """Return the points that a criterion can be given by a key: at most nine, nothing and all too.
 
@@ -96,6 +89,11 @@ def point_steps(out_of: float, *, step: float) -> list[float]:
     if (len(fine)) * exact(step) < whole:
         fine = [to_step(whole * n / _QUARTERS, step) for n in range(_QUARTERS)]
     return [float(points) for points in dict.fromkeys([*fine, whole])]
+
+
+def list_steps(out_of: float, rubric: Rubric) -> list[str]:
+    """Return these points as pages write them."""
+    return [points_text(points) for points in point_steps(out_of, step=rubric.step)]
 
 
 def describe_criterion(
@@ -110,10 +108,9 @@ def describe_criterion(
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     given = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
     points = points_text(own.points) if own else ""
-    steps = [points_text(p) for p in point_steps(asked.points, step=now.rubric.step)]
+    steps = list_steps(asked.points, now.rubric)
     chosen = typed.get("points") or points
     other = typed.get("other", "") or ("" if chosen in steps else chosen)
-    table = own and numbers_table(own, check=asked.check, units=grade.units, numbers=count(0))
     return {
         "id": asked.id,
         "title": capital(asked.title or asked.id),
@@ -122,8 +119,8 @@ def describe_criterion(
         "outcome": WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
         "tone": TONES[own.outcome] if own else "quiet",
         "lost": own is not None and own.points < own.out_of,
-        "text": render_blocks([paragraph(rich(sentence(own.message)))]) if own else "",
-        "numbers": render_blocks([table]) if table else "",
+        "text": show_message(own) if own else "",
+        "numbers": show_numbers(own, asked.check, grade.units) if own else "",
         "steps": steps,
         "chosen": "" if other else chosen,
         "other": other,
@@ -170,10 +167,6 @@ def show_figures(
     about = [(file, svg) for file, svg in drawn if _belongs(file, asked, own)]
     about.sort(key=lambda one: (one[0] != first, not _shows(one[0], worst)))
     return [{"file": file, "short": _shorten(file), "alt": alternative(svg)} for file, svg in about]
-
-
-def _is_about(flag: Flag, asked: Asked, rubric: Rubric) -> bool:
-    return flag.code != "shared_data" and concerns(flag, asked, names=rubric.names)
 
 
 def _belongs(file: str, asked: Asked | None, own: Criterion | None) -> bool:

@@ -9,6 +9,7 @@ from starlette.responses import Response
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
 from pipeline.desk.grades.class_table import find_signature, find_team, open_book, read_class
+from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.team_page import sign
 from pipeline.desk.request_steps import describe_steps
 from pipeline.errors import ConfigError
@@ -16,11 +17,8 @@ from pipeline.grading.gradebook.open_book import Conflict
 from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.gradebook.request_book import Queued
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
-from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
 from pipeline.words.numbers import NOTHING
-
-_MOST_STEPS = 20  # points to choose from; where the rubric's steps are finer they are typed
 
 
 def show(ask: Ask) -> Response:
@@ -104,20 +102,11 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
         "steps": describe_steps(request.events, **hidden),
         "state": request.state,
         "version": queued.version,
-        "choices": _list_points(asked.points, rubric) if asked else None,
+        "choices": list_steps(asked.points, rubric) if asked else None,
         "typed": ask.text("points") if failed else "",
         "text": ask.text("text") if failed else "",
         "wrong": wrong if failed else "",
     }
-
-
-def _list_points(most: float, rubric: Rubric) -> list[str]:
-    """Return the points that a criterion can have, none where they are too many to choose from."""
-    n = round(most / rubric.step)
-    if n > _MOST_STEPS:
-        return []
-    steps = [k * rubric.step for k in range(n + 1) if k * rubric.step < most]
-    return [points_text(points) for points in (*steps, most)]
 
 
 def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:

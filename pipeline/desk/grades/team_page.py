@@ -9,6 +9,7 @@ from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
+from pipeline.desk.evidence import find_remarks
 from pipeline.desk.grades.class_table import (
     find_signature,
     find_team,
@@ -20,7 +21,6 @@ from pipeline.desk.grades.criteria import (
     Item,
     describe_criterion,
     describe_flag,
-    find_remarks,
     list_items,
     show_figures,
 )

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
 from pipeline.desk.grades.class_table import find_signature, open_book, read_class
-from pipeline.desk.grades.criteria import point_steps
+from pipeline.desk.grades.criteria import list_steps
 from pipeline.desk.grades.filters import Filter
 from pipeline.desk.grades.team_page import sign, write_address
 from pipeline.errors import ConfigError
@@ -77,13 +77,15 @@ def apply(ask: Ask) -> Response:
     said = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
     if unchanged := len(wishes) - done.teams:
         said += f" {unchanged} had the same already."
-    return ask.back(_address(ask, done=done.at if done.teams else ""), said, place=_DONE)
+    return ask.back(_address(ask, done=done.at if done.teams > 1 else ""), said, place=_DONE)
 
 
 def _undo(ask: Ask) -> Response:
     """Take back one go; what somebody changed since stays, and is named."""
-    shown = read_class(ask)
-    undone = open_book(ask).undo_all(ask.text("set"), by=sign(ask))
+    shown, book = read_class(ask), open_book(ask)
+    if ask.text("set") not in [one.at for one in book.changed_together()]:
+        raise HTTPException(404, "this class has no such decision for several teams")
+    undone = book.undo_all(ask.text("set"), by=sign(ask))
     said = f"{count(undone.back, 'team')} taken back."
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
@@ -91,7 +93,7 @@ def _undo(ask: Ask) -> Response:
         said += f" Changed since, so as before: {kept}."
     if not ask.query("criterion"):  # from the list on the class page
         return ask.back(f"{ask.here}#sets", said, place=_DONE)
-    return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.back > 1 else ""), said, place=_DONE)
 
 
 def _address(ask: Ask, *, done: str) -> str:
@@ -149,7 +151,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
     except ConfigError as error:
         wrong, status = wrong or f"{capital(str(error))}.", 422
         rows = _list_rows(ask, shown, asked, typed=_SAME)
-    steps = [points_text(p) for p in point_steps(asked.points, step=shown.rubric.step)]
+    steps = list_steps(asked.points, shown.rubric)
     team = ask.query("of")
     return ask.page(
         "together",

@@ -6,18 +6,23 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
-from pipeline.desk.evidence import show_evidence
+from pipeline.desk.evidence import find_remarks, show_evidence
 from pipeline.desk.request_steps import describe_steps
 from pipeline.desk.served_files import show_own_page
+from pipeline.desk.student.seeing import REFUSED, hides_values
 from pipeline.desk.users import OwnGrade
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.gradebook.request_book import OwnFeedback, RequestBook, points_lost
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
 from pipeline.grading.publish.anonymous import anonymise
-from pipeline.grading.publish.feedback import TONES, feedback_page
+from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
+from pipeline.grading.rubric import Criterion as Asked
 from pipeline.grading.words import WORDS, points_text
+from pipeline.report.document import paragraph
+from pipeline.report.render.html import render_blocks
 from pipeline.words.numbers import NOTHING
+from pipeline.words.text import capital, rich
 
 
 def show(ask: Ask) -> Response:
@@ -43,6 +48,8 @@ def show_whole(ask: Ask) -> Response:
     own, found = _find_own(ask), _read(ask)
     if found is None:
         raise HTTPException(404, "your feedback is not out")
+    if hides_values(ask.user, found.rubric):
+        raise HTTPException(403, REFUSED)
     figures = _open_book(ask).figures(found.entry)
     grade = _hide_others(found, own)
     page = feedback_page(grade, rubric=found.rubric, figures=figures, name=own.submission)
@@ -93,7 +100,8 @@ def _show_page(
             "feedback", status=status, title="Feedback", submission=own.submission, found=None
         )
     grade = _hide_others(found, own)
-    criteria = _describe_criteria(found, grade, refused=refused or {})
+    hidden = hides_values(ask.user, found.rubric)
+    criteria = _describe_criteria(found, grade, refused=refused or {}, hidden=hidden)
     return ask.page(
         "feedback",
         status=status,
@@ -107,13 +115,19 @@ def _show_page(
         n_waiting=sum(request.state == "asked" for request in found.requests.values()),
         n_answered=sum(request.state == "answered" for request in found.requests.values()),
         most=MOST_LETTERS,
+        hidden=hidden,
     )
 
 
 def _describe_criteria(
-    found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]]
+    found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
 ) -> list[dict[str, Any]]:
-    """Return every criterion of the rubric, those that were never judged too."""
+    """Return every criterion of the rubric, those that were never judged too.
+
+    Parameters
+    ----------
+    hidden : no number is shown that a student must find.
+    """
     judged = {criterion.id: criterion for criterion in grade.criteria}
     lost = points_lost(grade, found.rubric)
     described = []
@@ -125,7 +139,8 @@ def _describe_criteria(
                 "id": asked.id,
                 "title": asked.title or asked.id,
                 "out_of": points_text(asked.points),
-                **_describe_judged(judged.get(asked.id), asked.check, grade),
+                **_describe_judged(judged.get(asked.id)),
+                "evidence": _show_why(asked, grade, found, hidden=hidden),
                 "lost": asked.id in lost or request is not None,
                 "request": request,
                 "steps": describe_steps(request.events if request else ()),
@@ -137,12 +152,23 @@ def _describe_criteria(
     return described
 
 
-def _describe_judged(own: Criterion | None, check: str, grade: Grade) -> dict[str, Any]:
+def _describe_judged(own: Criterion | None) -> dict[str, Any]:
     if own is None:
-        return {"points": NOTHING, "outcome": "not judged", "tone": "quiet", "evidence": ""}
+        return {"points": NOTHING, "outcome": "not judged", "tone": "quiet"}
     return {
         "points": points_text(own.points),
         "outcome": WORDS.text(f"outcome_{own.outcome}"),
         "tone": TONES[own.outcome],
-        "evidence": show_evidence(own, check, grade.units),
     }
+
+
+def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -> str:
+    """Return what decided a criterion; hidden: only what the remarks are called, and reasons."""
+    own = next((c for c in grade.criteria if c.id == asked.id), None)
+    if own is None or not hidden:
+        return show_evidence(own, asked.check, grade.units) if own else ""
+    remarks = find_remarks(grade, asked, found.rubric)
+    said = [capital(WORDS.text(f"title_{flag.code}")) for flag in remarks]
+    given = found.entry.overrides.get(asked.id) or found.entry.comments.get(asked.id)
+    said += [given.why] if given else []
+    return render_blocks([paragraph(rich(sentence(one))) for one in dict.fromkeys(said)])

@@ -78,7 +78,7 @@ def look_around(
     form = fill_form(document)
     every = [f for group in form for f in group.fields] + [f for row in rows for f in row.fields]
     shown, left = mark_errors(every, changed, error)
-    check = tell_state(folder) if sees_check(ask) else None
+    check = tell_state(folder) if sees_check(ask.user, ask.folder()) else None
     report = "none" if check else last_report.find_state(folder)
     told = last_report.NOTHING_TOLD if check else last_report.read_told(folder)
     asked = ask_doubts(

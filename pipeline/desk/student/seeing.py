@@ -1,8 +1,12 @@
 """Whether a student sees the report, or only the check of their own numbers."""
 
-from pipeline.desk.ask import Ask
+from pathlib import Path
+
+from pipeline.desk.jobs import Job
 from pipeline.desk.student.form import read_document
+from pipeline.desk.users import User
 from pipeline.errors import SubmissionError
+from pipeline.grading.rubric import Rubric
 from pipeline.submission.edit import submission_text
 
 # The parts of the student's room that show no computed number; a new part is refused until it is
@@ -11,30 +15,43 @@ _SHOWS_NONE = frozenset(
     {"", "files", "fill", "aside", "save", "experiments", "check", "hand-in", "hand-in.zip",
      "events", "stop"}
 )  # fmt: skip
+_TELLS_NONE = frozenset({"check_numbers"})  # tasks whose stages and end show no computed number
 REFUSED = (
     "in this lab you find the numbers yourself: the report is for your TA. "
     "The check tells which of your numbers disagree with your recordings"
 )
 
 
-def sees_check(ask: Ask) -> bool:
-    """Whether the room has the check in place of the report.
+def sees_check(user: User, folder: Path | None) -> bool:
+    """Whether the room of a folder has the check in place of the report.
 
     The rubric that a lab server's list of users names decides. Without one the submission's own
     `[students] see` holds, which is an agreement: who has the folder can change it.
     """
-    if ask.user.role == "instructor" or ask.place is None:
+    if user.role == "instructor" or folder is None:
         return False
-    if ask.user.see is not None:
-        return ask.user.see == "check"
+    if user.see is not None:
+        return user.see == "check"
     try:
-        students = read_document(submission_text(ask.folder())).get("students")
+        students = read_document(submission_text(folder)).get("students")
     except (SubmissionError, OSError):  # the page says what is wrong with it
         return False
     return isinstance(students, dict) and students.get("see") == "check"
 
 
-def is_refused(ask: Ask, path: str) -> bool:
+def hides_values(user: User, rubric: Rubric) -> bool:
+    """Whether a student reads their feedback without the numbers that they must find."""
+    return (user.see or rubric.students.see) == "check"
+
+
+def is_refused(path: str, user: User, folder: Path | None) -> bool:
     """Whether an address may show computed numbers to a student who must find them."""
     parts = path.split("/")
-    return parts[1] == "student" and parts[3] not in _SHOWS_NONE and sees_check(ask)
+    return parts[1] == "student" and parts[3] not in _SHOWS_NONE and sees_check(user, folder)
+
+
+def show_job(job: Job | None, user: User, folder: Path | None) -> Job | None:
+    """Return work in a folder as somebody may read of it: others may make a report there."""
+    if job is None or job.asked[0] in _TELLS_NONE or not sees_check(user, folder):
+        return job
+    return job.without_talk()

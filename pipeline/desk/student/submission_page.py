@@ -96,7 +96,7 @@ def save_experiment(ask: Ask) -> Response:
 
 def start_hand_in(ask: Ask) -> Response:
     """Have the report made anew where anything was changed since; show what is handed in."""
-    if not sees_check(ask) and last_report.find_state(ask.folder()) != "current":
+    if not sees_check(ask.user, ask.folder()) and last_report.find_state(ask.folder()) != "current":
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
 
@@ -105,14 +105,14 @@ def show_hand_in(ask: Ask) -> Response:
     """Show what is done and what is not, what was assumed, and what the zip holds."""
     folder, room = ask.folder(), look_around(ask)
     keeps = list_missing(folder)
-    names = [] if keeps else list_held(folder, report=not sees_check(ask))
+    names = [] if keeps else list_held(folder, report=not sees_check(ask.user, ask.folder()))
     return ask.page(
         "handin",
         title=f"Hand in: {folder.name}",
         room=room,
         keeps=keeps,
         files=[(name, (folder / name).stat().st_size) for name in names],
-        unanswered=last_report.list_unanswered(folder),
+        unanswered=[] if room.facts.check else last_report.list_unanswered(folder),
         authors=_list_authors(room),
     )
 
@@ -124,7 +124,7 @@ def download_hand_in(ask: Ask) -> Response:
     disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
     headers = {"Content-Disposition": disposition}
     made_of = last_report.stat_sources(ask.folder())
-    packed = pack(ask.folder(), report=not sees_check(ask))
+    packed = pack(ask.folder(), report=not sees_check(ask.user, ask.folder()))
     ask.desk.handed[ask.folder()] = made_of
     return Response(packed, media_type="application/zip", headers=headers)
 

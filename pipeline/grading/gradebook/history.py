@@ -32,8 +32,8 @@ class Event:
     at : ISO 8601, UTC.
     what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
         overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
-        taken back; `comment`: by hand, beside points that stay automatic; `asked`, `answered`, `reopened`: another look at a criterion, `points` where the
-        answer gave others.
+        taken back; `comment`: by hand, beside points that stay automatic; `asked`, `answered`,
+        `reopened`: another look at a criterion, `points` where the answer gave others.
     points, out_of : of the submission, or of the one criterion that the event is about.
     text : flags, why, or the answer.
     by : who, of an override and of a request; "" for a student who is not to be named.

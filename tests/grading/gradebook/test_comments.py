@@ -40,9 +40,7 @@ def change(book, points, why="Mind the unit.", criterion="pieces"):
 
 def comment_all(book, why="Mind the unit."):
     """Comment on one criterion of several teams at once."""
-    wish = WantedPoints(
-        submission="team-1", criterion="pieces", points=None, why=why, comment=True
-    )
+    wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why=why, comment=True)
     return book.change_all([wish], by="Ada")
 
 

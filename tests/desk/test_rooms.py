@@ -1,0 +1,17 @@
+"""The line at the top of every page."""
+
+from pipeline.desk.books import Books
+from pipeline.desk.rooms import list_rooms
+from pipeline.desk.users import User
+
+
+def test_a_gradebook_that_cannot_be_reached_breaks_no_page(tmp_path, monkeypatch):
+    """A share that went away: the link stays, without a count."""
+    books = Books()
+
+    def gone(place):
+        raise OSError("stale file handle")
+
+    monkeypatch.setattr(books, "book", gone)
+    user = User(name="", role="owner", gradebooks=[tmp_path / "class"])
+    assert [room.name for room in list_rooms(user, "/", books)] == ["Desk", "class"]
