@@ -28,6 +28,7 @@ from pipeline.desk.grades import (
 from pipeline.desk.home import enter, open_place, show_folders, show_home
 from pipeline.desk.instructor import exercise_pages, rubric_editor, rubric_preview_page
 from pipeline.desk.scratch import clear_scratch
+from pipeline.desk.seeing import REFUSED, is_refused
 from pipeline.desk.served_files import serve_file, serve_static
 from pipeline.desk.student import (
     check_page,
@@ -36,7 +37,6 @@ from pipeline.desk.student import (
     report_page,
     submission_page,
 )
-from pipeline.desk.student.seeing import REFUSED, is_refused
 from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN

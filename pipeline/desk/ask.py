@@ -20,7 +20,7 @@ from pipeline.desk.books import Books
 from pipeline.desk.browse import find_root
 from pipeline.desk.jobs import Job, Jobs, WorkerPool
 from pipeline.desk.rooms import list_rooms
-from pipeline.desk.student.seeing import show_job
+from pipeline.desk.seeing import show_job
 from pipeline.desk.users import Place, User, name_place
 from pipeline.errors import ConfigError
 from pipeline.processes import Failed
@@ -164,10 +164,9 @@ class Ask:
     def job(self) -> Job | None:
         """The last work in the place of the address, as this person may read of it."""
         place = self.place
-        if place is None:
+        if not isinstance(place, Path):
             return None
-        folder = place if isinstance(place, Path) else None
-        return show_job(self.desk.jobs.of(place), self.user, folder)
+        return show_job(self.desk.jobs.of(place), self.user, place)
 
     def start(self, task: str, *, title: str, **given: Any) -> None:
         """Begin a long task in the folder that the address is about."""

@@ -110,7 +110,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     assert (submission.title, submission.system.springs) == ("One <cart>", (True, False))
     assert submission.reported is not None
     assert str(submission.reported.final["K"]) == "28.90"  # digits as typed
-    assert "# Not sure what a data file holds?" in (folder / NAME).read_text(encoding="utf-8")
+    assert "# Leave out anything you do not have." in (folder / NAME).read_text(encoding="utf-8")
 
     assert visitor.post(HERE + "make-report").status == 303
     until(lambda: "Read the report" in visitor.get(HERE).text)

@@ -8,8 +8,8 @@ from starlette.responses import Response
 from pipeline.desk.ask import Ask
 from pipeline.desk.evidence import find_remarks, show_evidence
 from pipeline.desk.request_steps import describe_steps
+from pipeline.desk.seeing import REFUSED, hides_values
 from pipeline.desk.served_files import show_own_page
-from pipeline.desk.student.seeing import REFUSED, hides_values
 from pipeline.desk.users import OwnGrade
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade

@@ -7,11 +7,11 @@ from typing import Any
 
 from pipeline.desk import last_report
 from pipeline.desk.ask import Ask
+from pipeline.desk.seeing import sees_check
 from pipeline.desk.student.check_state import tell_state
 from pipeline.desk.student.doubts import NO_DOUBTS, ask_doubts
 from pipeline.desk.student.form import Field, Group, fill_form, mark_errors, read_document
 from pipeline.desk.student.rows import Row, list_rows
-from pipeline.desk.student.seeing import sees_check
 from pipeline.desk.student.summaries import summarise
 from pipeline.desk.student.way import Facts, Step, find_steps, next_step
 from pipeline.errors import SubmissionError

@@ -13,6 +13,7 @@ from starlette.responses import Response
 
 from pipeline.desk import last_report
 from pipeline.desk.ask import Ask, Said
+from pipeline.desk.seeing import sees_check
 from pipeline.desk.student.files import put_aside, take_uploads
 from pipeline.desk.student.form import (
     Field,
@@ -28,7 +29,6 @@ from pipeline.desk.student.form import (
 from pipeline.desk.student.handin import list_held, list_missing, pack
 from pipeline.desk.student.room import Room, look_around
 from pipeline.desk.student.rows import gather_remarks, group_rows, look_at_all
-from pipeline.desk.student.seeing import sees_check
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.processes import Failed

@@ -3,11 +3,12 @@
 from pathlib import Path
 
 from pipeline.desk.jobs import Job
-from pipeline.desk.student.form import read_document
-from pipeline.desk.users import User
+from pipeline.desk.users import Place, User
 from pipeline.errors import SubmissionError
 from pipeline.grading.rubric import Rubric
 from pipeline.submission.edit import submission_text
+from pipeline.submission.load import NAME
+from pipeline.submission.toml_file import parse_toml
 
 # The parts of the student's room that show no computed number; a new part is refused until it is
 # named here.
@@ -22,18 +23,19 @@ REFUSED = (
 )
 
 
-def sees_check(user: User, folder: Path | None) -> bool:
+def sees_check(user: User, folder: Place | None) -> bool:
     """Whether the room of a folder has the check in place of the report.
 
     The rubric that a lab server's list of users names decides. Without one the submission's own
     `[students] see` holds, which is an agreement: who has the folder can change it.
     """
-    if user.role == "instructor" or folder is None:
+    if user.role == "instructor" or not isinstance(folder, Path):
         return False
     if user.see is not None:
         return user.see == "check"
     try:
-        students = read_document(submission_text(folder)).get("students")
+        text = submission_text(folder)
+        students = parse_toml(text, where=NAME, error=SubmissionError).get("students")
     except (SubmissionError, OSError):  # the page says what is wrong with it
         return False
     return isinstance(students, dict) and students.get("see") == "check"
@@ -44,13 +46,13 @@ def hides_values(user: User, rubric: Rubric) -> bool:
     return (user.see or rubric.students.see) == "check"
 
 
-def is_refused(path: str, user: User, folder: Path | None) -> bool:
+def is_refused(path: str, user: User, folder: Place | None) -> bool:
     """Whether an address may show computed numbers to a student who must find them."""
     parts = path.split("/")
     return parts[1] == "student" and parts[3] not in _SHOWS_NONE and sees_check(user, folder)
 
 
-def show_job(job: Job | None, user: User, folder: Path | None) -> Job | None:
+def show_job(job: Job | None, user: User, folder: Path) -> Job | None:
     """Return work in a folder as somebody may read of it: others may make a report there."""
     if job is None or job.asked[0] in _TELLS_NONE or not sees_check(user, folder):
         return job
