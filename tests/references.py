@@ -117,12 +117,13 @@ def _grades(out: Path) -> None:
         file = teams / "team-2" / "submission.toml"
         text = file.read_text(encoding="utf-8")
         file.write_text(re.sub(r"omega_n = .+", "omega_n = 0.987", text), encoding="utf-8")
-        rubric = ROOT / "rubrics" / "throne-1dof.toml"
-        _run(out / "said.txt", "grade", teams, "--rubric", rubric, "--out", out / "grades")
+        # One process: in the order of their names, as the numbers of the rows tell.
+        how = ("--rubric", ROOT / "rubrics" / "throne-1dof.toml", "--jobs", "1")
+        _run(out / "said.txt", "grade", teams, *how, "--out", out / "grades")
         book = out / "grades"
         change = (book, "team-2", "final", "1", "--why", "seen", "--by", "TA")
         _run(out / "override.txt", "override", *change)
-        _run(out / "again.txt", "grade", teams, "--rubric", rubric, "--out", book)
+        _run(out / "again.txt", "grade", teams, *how, "--out", book)
         for lms in ("canvas", "moodle", "gradescope"):
             _run(out / f"{lms}.csv", "export", book, "--lms", lms)
 

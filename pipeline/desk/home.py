@@ -63,6 +63,8 @@ def open_place(ask: Ask) -> Response:
     address = enter(ask.user, read_path(typed, wanted="name a folder"))
     if to in _ROOMS and address.startswith("/student/"):
         address = address.replace("student", to, 1)
+    elif to == "compare" and address.startswith("/student/"):
+        address += to
     return RedirectResponse(address, status_code=303)
 
 

@@ -2,7 +2,8 @@
 "use strict";
 const keys = document.querySelector("#keys");
 if (keys) {
-  keys.closest("details").hidden = false;
+  const help = keys.closest("details"), nothing = document.querySelector("#no-key");
+  help.hidden = false;
   keys.checked = localStorage.getItem("keys") !== "off";
   const mark = () => document.body.classList.toggle("keyed", keys.checked);
   mark();
@@ -18,6 +19,11 @@ if (keys) {
       return;
     }
     const wanted = document.querySelector(`[data-key="${CSS.escape(event.key)}"]`);
+    if (event.key === "Escape") help.open = false;
+    if (nothing) {
+      nothing.hidden = Boolean(wanted) || !nothing.dataset[event.key];
+      nothing.textContent = nothing.dataset[event.key] ?? "";
+    }
     if (!wanted) return;
     event.preventDefault();
     if (!wanted.matches("input")) return wanted.click();

@@ -19,6 +19,8 @@ from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.publish.export import export
+from pipeline.resources import RUBRICS
+from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
 from tests.helpers.waiting import until
@@ -689,13 +691,31 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
     assert again.status == 303  # looked through once more
 
 
-def test_only_a_decision_for_several_is_undone_as_one(ta, grades):
-    """Nothing that was not one, nor of another class; the change of one team stays."""
+def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
+    """Those that were graded; once a file of the folder is another, nothing is offered."""
+    team = a_submission(tmp_path / "lab" / "team-1")
+    rubric, out = RUBRICS / "throne-1dof.toml", tmp_path / "grades"
+    cartlab_here("grade", tmp_path / "lab", "--rubric", rubric, "--out", out, "--jobs", 1,
+                 "--no-figures")  # fmt: skip
+    with DeskServer() as server:
+        owner = Visitor.of(server.url)
+        owner.post("/open", folder=str(out))
+        page = owner.get(at("team-1"))
+        assert "Compare recordings and models" in page.text
+        opened = owner.post("/open", folder=page.value("folder"), to=page.value("to"))
+        assert opened.headers["location"] == "/student/0/compare"
+        owner.post("/student/0/compare")
+        until(lambda: owner.get("/student/0/compare").status == 303)
+        assert "Compare recordings and models" in owner.get(at("team-1")).text
+        (team / "data" / "new.csv").write_text("t,x1\n0,1\n", encoding="utf-8")
+        assert "Compare recordings and models" not in owner.get(at("team-1")).text
+
+
+def test_only_a_decision_of_this_class_is_undone(ta, grades):
+    """What the browser sends is looked up first; of another moment nothing is taken back."""
     change(ta, "team-01", points="0.5", why="alone")
-    with Gradebook(grades) as book:
-        moment = book.entry("team-01").overrides["laws"].at
-    for sent in (moment, "", "2026-01-01"):
-        assert ta.post(ROOM + "together", do="undo", set=sent).status == 404
+    for moment in ("", "2026-01-01", "%"):
+        assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
     with Gradebook(grades) as book:
         assert book.entry("team-01").overrides["laws"].points == 0.5
 

@@ -396,6 +396,16 @@ def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
     assert "what its columns are" in visitor.get(HERE).text
 
 
+def test_an_essay_and_an_empty_file_are_no_recordings(filled):
+    """They need a person, and are not counted."""
+    visitor, folder = filled
+    before = re.search(r"(\d+) recordings, all understood", visitor.get(HERE).text)
+    assert before
+    (folder / "data" / "essay.txt").write_text("We measured much.\n" * 20, encoding="utf-8")
+    (folder / "data" / "empty.csv").write_text("", encoding="utf-8")
+    assert f"{before[1]} recordings, 2 files need you" in visitor.get(HERE).text
+
+
 def test_a_recording_that_was_cut_short_is_not_green(filled):
     """A report does not take it, so its row says so and its group stays open."""
     visitor, folder = filled
@@ -869,4 +879,4 @@ def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
     (folder / "data" / "bad.csv").write_bytes(b"")
     page = visitor.get(HERE).text
     assert 'id="kind-unknown" open><summary>' in page
-    assert "1 need" in page
+    assert "1 file needs you" in page

@@ -121,7 +121,19 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
         expect(heading).to_have_text(teams[1])
 
         window.keyboard.press("?")
-        expect(window.get_by_text("apply to everybody")).to_be_visible()
+        expect(window.get_by_text("apply to everybody")).to_be_in_viewport()
+        window.keyboard.press("Escape")
+        press(window, "u")
+        expect(window.get_by_role("button", name="Redo")).to_be_visible()
+        press(window, "u")
+        expect(window.get_by_role("button", name="Undo")).to_be_visible()
+        while "The pieces asked for" not in title.inner_text():
+            press(window, "j")
+        window.keyboard.press("u")
+        expect(window.get_by_text("Nothing was changed by hand here.")).to_be_in_viewport()
+        for line in window.locator(".criteria .title").all():
+            assert line.evaluate("one => one.scrollWidth <= one.clientWidth")
+        window.keyboard.press("?")
         window.get_by_label("Keys are on").uncheck()
         window.keyboard.press("n")
         window.reload()

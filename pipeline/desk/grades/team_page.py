@@ -25,6 +25,7 @@ from pipeline.desk.grades.criteria import (
     show_figures,
 )
 from pipeline.desk.grades.filters import Filter
+from pipeline.desk.grades.recordings import find_recordings
 from pipeline.desk.served_files import show_drawing
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Flag, Grade
@@ -122,6 +123,7 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
         news=list_news(ask, shown, since=shown.state[1]),
         signature=find_signature(ask),
         requests=book.request_states(team.submission),
+        recordings=find_recordings(ask, shown, now.entry),
         requests_at=f"{ask.here}again?{urlencode({'of': name})}",
         **_show_chosen(ask, shown, grade, now, chosen=chosen, wrong=wrong),
     )

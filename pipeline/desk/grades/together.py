@@ -77,14 +77,14 @@ def apply(ask: Ask) -> Response:
     said = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
     if unchanged := len(wishes) - done.teams:
         said += f" {unchanged} had the same already."
-    return ask.back(_address(ask, done=done.at if done.teams > 1 else ""), said, place=_DONE)
+    return ask.back(_address(ask, done=done.at if done.teams else ""), said, place=_DONE)
 
 
 def _undo(ask: Ask) -> Response:
     """Take back one go; what somebody changed since stays, and is named."""
     shown, book = read_class(ask), open_book(ask)
-    if ask.text("set") not in [one.at for one in book.changed_together()]:
-        raise HTTPException(404, "this class has no such decision for several teams")
+    if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
+        raise HTTPException(404, "nothing of this class was changed at that moment")
     undone = book.undo_all(ask.text("set"), by=sign(ask))
     said = f"{count(undone.back, 'team')} taken back."
     if undone.kept:
@@ -93,7 +93,7 @@ def _undo(ask: Ask) -> Response:
         said += f" Changed since, so as before: {kept}."
     if not ask.query("criterion"):  # from the list on the class page
         return ask.back(f"{ask.here}#sets", said, place=_DONE)
-    return ask.back(_address(ask, done=undone.at if undone.back > 1 else ""), said, place=_DONE)
+    return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
 
 
 def _address(ask: Ask, *, done: str) -> str:

@@ -99,7 +99,7 @@ def look_around(
         wrong=tuple(left),
         told=told,
         facts=Facts(
-            recordings=len(rows),
+            recordings=sum(row.is_recording for row in rows),
             to_look_at=sum(row.needs_a_person for row in rows),
             missing=tuple(group.title for group in groups if group.missing),
             sound=bool(text) and error is None,

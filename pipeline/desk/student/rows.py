@@ -59,6 +59,11 @@ class Row:
         return stated or (f"{found:.3g}" if found and self.kind == "sine" else "")
 
     @property
+    def is_recording(self) -> bool:
+        """Whether it is one: an essay or an empty file in the folder is none."""
+        return self.index is not None or bool(self.look["format"])
+
+    @property
     def needs_a_person(self) -> bool:
         """Whether somebody has to look at it."""
         return bool(self.problems) or any(f.wrong or f.asked for f in self.fields)

@@ -14,7 +14,7 @@ class Facts:
 
     Attributes
     ----------
-    recordings, to_look_at : how many there are, and how many of them need a person.
+    recordings : how many there are; to_look_at : how many files need a person.
     missing : groups of the set-up that lack something.
     sound : whether `submission.toml` is there and valid.
     report : "none", "current", or "older" than what it is made of.

@@ -330,8 +330,8 @@ class OpenBook(Gradebook):
                 back += 1
         return Undone(at=now, back=back, kept=tuple(kept))
 
-    def changed_together(self) -> list[Together]:
-        """Return what was given to several submissions in one go, the newest first."""
+    def changed_together(self, *, least: int = 2) -> list[Together]:
+        """Return what was given to at least so many submissions in one go, the newest first."""
         with self._database.reading() as connection:
             last = self._last(connection)
             of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
@@ -340,7 +340,7 @@ class OpenBook(Gradebook):
             mine = select(*columns, func.min(overrides.c.criterion).label("criterion"),
                           func.max(overrides.c.why).label("why"), teams.label("teams"))  # fmt: skip
             mine = mine.where(overrides.c.submission_id.in_(of_class)).group_by(*columns)
-            mine = mine.having(teams > 1).order_by(func.max(overrides.c.id).desc())
+            mine = mine.having(teams >= least).order_by(func.max(overrides.c.id).desc())
             return [Together(**row) for row in connection.execute(mine).mappings()]
 
     def mark(self, team: str, *, by: str, seen: bool) -> None:

@@ -1,0 +1,43 @@
+"""Where the recordings of a graded team lie on this computer: a gradebook keeps no folder."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from pipeline.desk.ask import Ask
+from pipeline.desk.books import Class
+from pipeline.desk.last_report import PLOTS, PLOTS_OF
+from pipeline.grading.gradebook.rows import Entry
+from pipeline.grading.intake.files import digest
+from pipeline.output import LOCK
+from pipeline.submission.load import NAME
+
+# What making the plots adds to a folder.
+_ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
+
+
+def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
+    """Return the folder that was graded, None where it is not found or not for this person.
+
+    It holds the very files of the grading: a later version would show other recordings. Plots
+    that were made there since do not count.
+    """
+    if not ask.user.owns or shown.names is not None:
+        return None
+    graded = entry.key.rpartition("-")[2]
+    for folder in dict.fromkeys(_list_candidates(ask, entry.submission)):
+        if (folder / NAME).is_file():
+            now = (digest([folder], without=added) for added in ((), _ADDED))
+            if graded in now:
+                return folder
+    return None
+
+
+def _list_candidates(ask: Ask, name: str) -> Iterator[Path]:
+    """Yield folders of this name: open at the desk, graded from here, or beside the gradebook."""
+    place = ask.place_or_404()
+    yield from (folder for folder in ask.user.folders if folder.name == name)
+    for path in ask.desk.books.asked.get(place, {}).get("paths", "").splitlines():
+        yield from (Path(path), Path(path) / name)
+    if isinstance(place, Path):
+        yield place.parent / name
+        yield from (beside / name for beside in sorted(place.parent.iterdir()))
