@@ -44,6 +44,7 @@ document.addEventListener("htmx:sendError", () => {
 // So does what somebody unfolded.
 const unsaved = new Map(), sent = new WeakMap(), opened = new Set();
 let going_on = []; // where the request came from: it does not fold while somebody types there
+let typing = null; // the field in which somebody types, and where in it
 document.addEventListener("click", (event) => {
   const folded = event.target.closest("summary")?.parentElement;
   if (folded?.id) opened[folded.open ? "delete" : "add"](heading() + folded.id);
@@ -70,6 +71,8 @@ document.addEventListener("htmx:beforeSwap", (event) => {
   const went = sent.get(event.detail.xhr) ?? new Map();
   const kept = typed(event.detail.target).filter((one) => (went.has(one) ? state(one) !== went.get(one) : differs(one)));
   before = heading();
+  const field = document.activeElement;
+  typing = field.id && { id: field.id, at: field.selectionStart, to: field.selectionEnd };
   going_on = [];
   for (let around = event.detail.requestConfig?.elt.closest("form, details"); around; around = around.parentElement.closest("details"))
     going_on.push(around.id, ...[...around.querySelectorAll("details[open]")].map((one) => one.id));
@@ -78,13 +81,36 @@ document.addEventListener("htmx:beforeSwap", (event) => {
 document.addEventListener("htmx:afterSwap", (event) => {
   if (event.detail.target.id !== "main") return;
   const kept = unsaved.get(heading()) ?? new Map();
+  const back = [];
   for (const one of event.detail.target.querySelectorAll("details[id]")) one.open ||= opened.has(heading() + one.id) || going_on.includes(one.id);
   for (const one of typed(event.detail.target)) {
     if (!kept.has(key(one))) continue;
     one[switched(one) ? "checked" : "value"] = kept.get(key(one));
+    back.push(one);
     for (let around = one.closest("details"); around; around = around.parentElement.closest("details")) around.open = true;
   }
-  if (heading() !== before) scrollTo(0, 0); // another page altogether
+  if (heading() !== before) return scrollTo(0, 0); // another page altogether
+  go_on_typing();
+  rows = back.filter((one) => one.form?.dataset.row);
+});
+// What is folded cannot have the focus, so it comes back after that.
+const go_on_typing = () => {
+  const field = typing && document.getElementById(typing.id);
+  if (!field || field === document.activeElement) return;
+  field.focus();
+  if (typing.at != null) field.setSelectionRange(typing.at, typing.to);
+};
+// A row saves itself: also what was typed in it while its last answer was on the way.
+let rows = [];
+document.addEventListener("htmx:afterSettle", () => {
+  for (const one of rows) {
+    const save = () => {
+      if (one.isConnected && differs(one) && going.get(one) !== state(one)) one.dispatchEvent(new Event("change", { bubbles: true }));
+    };
+    if (one === document.activeElement) one.addEventListener("blur", save, { once: true });
+    else save();
+  }
+  rows = [];
 });
 
 // What is made of what is saved waits where something typed is not, nor on its way: what stands behind it says how to go on.

@@ -358,3 +358,23 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
         desk.send_signal(number)
         assert desk.wait(PATIENCE) == 0
         assert desk.stderr.read() == f"cartlab: the desk ends: {number.name}\n"
+
+
+def test_a_row_is_typed_through_without_waiting(show, tmp_path):
+    """While one field is saved the next is typed: no letter, no field and no notice is lost."""
+    folder = a_submission(tmp_path / "team")
+    with DeskServer(folder=folder) as server:
+        window = show(server.url)
+        window.locator("#kind-decay > summary").press("Enter")
+        window.locator("#more-0 > summary").press("Enter")
+        window.locator("[name='experiments.0.window']").focus()
+        for text in ("0.1, 5", "my note", "", "100", ""):  # … and out of the row
+            window.keyboard.type(text, delay=15)
+            window.keyboard.press("Tab")
+
+        def is_saved() -> bool:
+            first = load_submission(folder).experiments[0]
+            return (first.window, first.note, first.sample_rate) == ((0.1, 5), "my note", 100)
+
+        until(is_saved)
+        expect(window.get_by_text("Saved.").first).to_be_visible()
