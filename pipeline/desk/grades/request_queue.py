@@ -17,8 +17,10 @@ from pipeline.grading.gradebook.open_book import Conflict
 from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.gradebook.request_book import Queued
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
 from pipeline.words.numbers import NOTHING
+from pipeline.words.text import capital
 
 
 def show(ask: Ask) -> Response:
@@ -39,7 +41,7 @@ def act(ask: Ask) -> Response:
         elif what == "answer":
             points = _read_points(ask.text("points"))
             book.answer(name, criterion, points, text=ask.text("text"), by=by, seen=seen)
-            said = f"Answered: {team.line.submission}, {criterion}."
+            said = f"Answered: {team.line.submission}, {_find_title(shown.rubric, criterion)}."
         else:
             raise HTTPException(400, "there is no such button")
     except Conflict as conflict:
@@ -95,7 +97,7 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
     return {
         "team": name,
         "criterion": request.criterion,
-        "title": asked.title or asked.id if asked else request.criterion,
+        "title": _find_title(rubric, request.criterion),
         "points": points_text(own.points) if own else NOTHING,
         "out_of": points_text(asked.points) if asked else NOTHING,
         "address": f"{ask.here}team?{urlencode(place)}#chosen",
@@ -107,6 +109,12 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
         "text": ask.text("text") if failed else "",
         "wrong": wrong if failed else "",
     }
+
+
+def _find_title(rubric: Rubric, criterion: str) -> str:
+    """Return what a criterion is called, which the rubric may no longer have."""
+    titles = {asked.id: asked.title for asked in rubric.criteria}
+    return capital(titles.get(criterion) or criterion)
 
 
 def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
@@ -127,7 +135,7 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
     return ask.page(
         "conflict",
         status=409,
-        title=f"{name}: {criterion}",
+        title=f"{name}: {_find_title(shown.rubric, criterion)}",
         typed={"points": typed, "why": ask.text("text"), "by": find_signature(ask)},
         now={"points": points, "why": why, "by": by},
         back=_write_address(ask, ask.query("of")),

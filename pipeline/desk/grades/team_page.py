@@ -38,6 +38,7 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import WORDS, points_text
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.html import render_drawing
+from pipeline.words.text import capital
 
 _POINTS = "points"  # the place of the page where points are changed
 
@@ -238,7 +239,7 @@ def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) ->
     return ask.page(
         "conflict",
         status=409,
-        title=f"{team.line.submission}: {titles.get(criterion) or criterion}",
+        title=f"{team.line.submission}: {capital(titles.get(criterion) or criterion)}",
         typed={
             "points": "undo" if undoing else ask.text("other") or ask.text("points"),
             "why": ask.text("why"),

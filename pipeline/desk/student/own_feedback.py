@@ -137,7 +137,7 @@ def _describe_criteria(
         described.append(
             {
                 "id": asked.id,
-                "title": asked.title or asked.id,
+                "title": capital(asked.title or asked.id),
                 "out_of": points_text(asked.points),
                 **_describe_judged(judged.get(asked.id)),
                 "evidence": _show_why(asked, grade, found, hidden=hidden),
