@@ -20,6 +20,7 @@ from pipeline.grading.gradebook.open_book import OpenBook
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.grading.publish.export import export
 from pipeline.resources import RUBRICS
+from pipeline.words.text import capital
 from tests.helpers.commandline import cartlab_here
 from tests.helpers.desks import BOUNDARY, Answer, Visitor, a_submission, through_proxy, write_users
 from tests.helpers.grades import fill_book, make_grade, make_outcome, two_cart_rubric, write_class
@@ -247,19 +248,24 @@ def test_what_lost_points_comes_first_and_is_shown(ta):
     with_all = ta.get(at("a-name-without-end-" * 5)).text
     titles = {asked.id: asked.title for asked in two_cart_rubric().criteria}
     assert "To look at" in with_all
-    change(ta, "team-06", "final-gains", points="2", why="right after all")
+    assert change(ta, "team-01", "final-gains", points="1", why="two are swapped").status == 303
+
+    def listed_in(part: str, page: str) -> list[str]:
+        section = page.split(f'id="{part}-title"')[1].split("</section>")[0]
+        return re.findall(r"criterion=([\w-]+)", section)
+
+    passed = listed_in("passed", ta.get(at("team-01")).text)
+    doubts = listed_in("doubts", ta.get(at("team-01")).text)
+    assert doubts == ["data", "final-gains"]  # one has a remark, one was changed by hand
+    assert {*passed, *doubts} == set(titles)
     page = ta.get(at("team-06")).text
-    doubts, passed = (page.split(f'id="{part}-title"')[1].split("</section>")[0]
-                      for part in ("doubts", "passed"))  # fmt: skip
-    order = re.findall(r"criterion=([\w-]+)", doubts)
+    order = listed_in("doubts", page)
     lost = {asked.id: asked.points for asked in two_cart_rubric().criteria}
     assert [lost[one] for one in order] == sorted((lost[one] for one in order), reverse=True)
-    assert re.findall(r"criterion=([\w-]+)", passed) == ["final-gains"]
-    assert "2 / 2" in passed
     chosen = re.search(r'id="chosen-title">(.*): ', page)
     assert chosen
     assert chosen[1].lower() == titles[order[0]].lower()
-    for criterion in (*order, "final-gains"):
+    for criterion in order:
         own = ta.get(at("team-06", criterion=criterion)).text
         assert f'name="criterion" value="{criterion}"' in own
         assert own.count('aria-current="true"') == 1
@@ -689,6 +695,21 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
         assert {name: own["laws"].why for name, own in given.items() if own} == {names[1]: "mine"}
     again = apply(ta, together(), sent(answer, *names, do="apply", points="0.5", why="one unit"))
     assert again.status == 303  # looked through once more
+
+
+def test_what_was_decided_keeps_its_place_in_the_list(ta):
+    """Whoever goes on to the next criterion skips none, whatever points were given."""
+
+    def titles() -> list[str]:
+        found = re.findall(r'<span class="title">(.*?)</span>', ta.get(at("team-05")).text)
+        return [unescape(title) for title in found]
+
+    before = titles()
+    with_most = before[0]
+    criterion = next(c.id for c in two_cart_rubric().criteria if capital(c.title) == with_most)
+    for points in ("1", "2"):
+        assert change(ta, "team-05", criterion, points=points, why="seen").status == 303
+        assert titles() == before
 
 
 def test_the_recordings_of_a_team_are_one_click_away(tmp_path):

@@ -128,7 +128,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
         press(window, "u")
         expect(window.get_by_role("button", name="Undo")).to_be_visible()
         while "The pieces asked for" not in title.inner_text():
-            press(window, "j")
+            press(window, "k")
         window.keyboard.press("u")
         expect(window.get_by_text("Nothing was changed by hand here.")).to_be_in_viewport()
         for line in window.locator(".criteria .title").all():

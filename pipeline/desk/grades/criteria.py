@@ -37,8 +37,9 @@ class Item:
     Attributes
     ----------
     id : of the criterion, or the code of the remark.
-    lost : points.
-    doubt : whether a person should look: points are lost, it was not judged, or it has a remark.
+    lost : points, before those given by hand: what was decided keeps its place in the list.
+    doubt : whether a person should look, or did: points are lost, it was not judged, it has a
+        remark, or points by hand.
     """
 
     id: str
@@ -64,6 +65,7 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
         own = judged.get(asked.id)
         flagged = any(is_about(flag, asked, now.rubric) for flag in grade.flags)
         earned = points_text(own.points) if own else NOTHING
+        by_hand = asked.id in now.entry.overrides
         items.append(
             Item(
                 id=asked.id,
@@ -71,9 +73,9 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
                 points=f"{earned} / {points_text(asked.points)}",
                 outcome=WORDS.text(f"outcome_{own.outcome}") if own else "not judged",
                 tone=TONES[own.outcome] if own else "quiet",
-                lost=asked.points - own.points if own else 0.0,
-                doubt=own is None or own.outcome != "pass" or flagged,
-                by_hand=asked.id in now.entry.overrides,
+                lost=asked.points - now.entry.automatic.get(asked.id, asked.points),
+                doubt=own is None or own.outcome != "pass" or flagged or by_hand,
+                by_hand=by_hand,
             )
         )
     return sorted(items, key=lambda item: (not item.doubt, not item.is_remark, -item.lost))

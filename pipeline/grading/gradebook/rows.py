@@ -45,6 +45,7 @@ class Entry:
     Attributes
     ----------
     grade : with shared data flagged, points given by hand, and lateness off those.
+    automatic : points by criterion, before those given by hand.
     overrides, comments : by criterion, those in force.
     owner : who handed it in, as the learning platform calls them, or "".
     key : of all that it depends on, as handed in.
@@ -54,6 +55,7 @@ class Entry:
 
     submission: str
     grade: Grade
+    automatic: Mapping[str, float]
     overrides: Mapping[str, HandPoints]
     comments: Mapping[str, HandPoints]
     owner: str
@@ -204,6 +206,7 @@ def as_it_counts(
     return Entry(
         submission=row.name,
         grade=with_overrides(with_comments(grade, comments), given, rubric=rubric),
+        automatic={criterion.id: criterion.points for criterion in grade.criteria},
         overrides=given,
         comments=comments,
         owner=row.owner,
