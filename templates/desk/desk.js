@@ -91,7 +91,8 @@ document.addEventListener("htmx:afterSwap", (event) => {
   }
   if (heading() !== before) return scrollTo(0, 0); // another page altogether
   go_on_typing();
-  rows = back.filter((one) => one.form?.dataset.row);
+  rows = back.filter((one) => one.form?.dataset.row && (left.has(key(one)) || one === document.activeElement));
+  left.clear();
 });
 // What is folded cannot have the focus, so it comes back after that.
 const go_on_typing = () => {
@@ -100,8 +101,10 @@ const go_on_typing = () => {
   field.focus();
   if (typing.at != null) field.setSelectionRange(typing.at, typing.to);
 };
-// A row saves itself: also what was typed in it while its last answer was on the way.
+// A row saves itself when a field is left: also if its last answer was on the way then.
 let rows = [];
+const left = new Set();
+document.addEventListener("change", (event) => left.add(key(event.target)), true);
 document.addEventListener("htmx:afterSettle", () => {
   for (const one of rows) {
     const save = () => {
