@@ -14,17 +14,17 @@ from pipeline.words.text import rich
 
 
 def show_evidence(criterion: Criterion, check: str, units: Units | None) -> str:
-    """Return what was said and the numbers, theirs beside ours, as HTML."""
+    """Return the message and the numbers, theirs beside ours, as HTML."""
     return show_message(criterion) + show_numbers(criterion, check, units)
 
 
 def show_message(criterion: Criterion) -> str:
-    """Return what was said, as HTML."""
+    """Return the criterion's message as HTML."""
     return render_blocks([paragraph(rich(sentence(criterion.message)))])
 
 
 def show_numbers(criterion: Criterion, check: str, units: Units | None) -> str:
-    """Return the numbers, theirs beside ours, as HTML; "" where there are none."""
+    """Return the numbers, theirs beside ours, as HTML; "" without numbers."""
     table = numbers_table(criterion, check=check, units=units, numbers=count(0))
     return render_blocks([table]) if table else ""
 

@@ -698,7 +698,7 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
 
 
 def test_what_was_decided_keeps_its_place_in_the_list(ta):
-    """Whoever goes on to the next criterion skips none, whatever points were given."""
+    """Going on to the next criterion never skips one, whatever points were given."""
 
     def titles() -> list[str]:
         found = re.findall(r'<span class="title">(.*?)</span>', ta.get(at("team-05")).text)
@@ -733,7 +733,7 @@ def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
 
 
 def test_only_a_decision_of_this_class_is_undone(ta, grades):
-    """What the browser sends is looked up first; of another moment nothing is taken back."""
+    """Undo looks up the browser's moment first, and refuses one that is not in this class."""
     change(ta, "team-01", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):
         assert ta.post(ROOM + "together", do="undo", set=moment).status == 404

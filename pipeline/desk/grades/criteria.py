@@ -36,9 +36,9 @@ class Item:
 
     Attributes
     ----------
-    id : of the criterion, or the code of the remark.
-    lost : points, before those given by hand: what was decided keeps its place in the list.
-    doubt : whether a person should look, or did: points are lost, it was not judged, it has a
+    id : Of the criterion, or the code of the remark.
+    lost : Points before those given by hand. So a decided criterion keeps its place in the list.
+    doubt : Whether a person should look, or did: points are lost, it was not judged, it has a
         remark, or points by hand.
     """
 

@@ -60,7 +60,7 @@ class Row:
 
     @property
     def is_recording(self) -> bool:
-        """Whether it is one: an essay or an empty file in the folder is none."""
+        """Whether the file is a recording; an essay or an empty file is not."""
         return self.index is not None or bool(self.look["format"])
 
     @property

@@ -23,8 +23,8 @@ class HandPoints:
     ----------
     points : None where the automatic points hold, again or with a comment.
     at : ISO 8601, UTC.
-    authors : of the submission at the time; the override goes with them.
-    comment : `why` is for the team to read, beside points that stay automatic.
+    authors : Of the submission at the time. The override follows these people.
+    comment : Whether `why` is only a comment for the team: the points stay automatic.
     """
 
     criterion: str
@@ -57,14 +57,15 @@ def read_points(text: str) -> float | None:
 
 @dataclass(frozen=True, kw_only=True)
 class WantedPoints:
-    """What somebody asks for; points None: the automatic ones, again or with a comment.
+    """Points, or a comment, that somebody wants for one criterion of a submission.
 
     Attributes
     ----------
-    comment : `why` is to stand beside the points that hold; they are not given by hand.
-    line : of a table that says so, 0 where none does.
-    seen : what the change rests on, from `TeamNow.versions`; "" for whatever holds now.
-    at : when; "" for now. Those given in one go have the same.
+    points : None for the automatic points, again or with a comment.
+    comment : Whether `why` is only a comment for the team.
+    line : Of the table that asks for it; 0 without a table.
+    seen : The state that the person saw, from `TeamNow.versions`; "" for the current one.
+    at : When; "" for now. All points given in one go have the same moment.
     """
 
     submission: str
@@ -123,7 +124,7 @@ def read_wishes(path: Path) -> list[WantedPoints]:
 
 
 def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
-    """Return the grade with comments, by criterion, at the end of what is said there."""
+    """Return the grade with a comment at the end of each criterion's message."""
     criteria = (
         _with_comment(own, comments[own.id].why) if own.id in comments else own
         for own in grade.criteria
@@ -132,7 +133,7 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 
 
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
-    """Return the grade with points given by hand, by criterion; lateness is taken off anew.
+    """Return the grade with points given by hand, by criterion, and lateness off the sum.
 
     A criterion that was never judged, as the submission could not be graded, is added.
     """
