@@ -43,6 +43,7 @@ class Job:
     said: str = "waiting for its turn"
     news: int = 0
     stop: threading.Event = field(default_factory=threading.Event)
+    lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @property
     def over(self) -> bool:
@@ -55,7 +56,13 @@ class Job:
 
     def tell(self, state: State, said: str) -> None:
         """Note what it is about."""
-        self.state, self.said, self.news = state, said, self.news + 1
+        with self.lock:
+            self.state, self.said, self.news = state, said, self.news + 1
+
+    def at_this_moment(self) -> "Job":
+        """Return a copy that no longer changes: its state and what it says belong together."""
+        with self.lock:
+            return replace(self)
 
 
 class Jobs:
@@ -88,12 +95,15 @@ class Jobs:
         return job
 
     def of(self, place: Path) -> Job | None:
-        """Return the last job in a folder."""
-        return self._jobs.get(place)
+        """Return the last job in a folder, as it is now."""
+        job = self._jobs.get(place)
+        return job and job.at_this_moment()
 
     def list_of(self, task: str) -> list[Job]:
         """Return the jobs of one task, the newest first."""
-        return [job for job in reversed(self._jobs.values()) if job.asked[0] == task]
+        with self._lock:
+            jobs = [job for job in reversed(self._jobs.values()) if job.asked[0] == task]
+        return [job.at_this_moment() for job in jobs]
 
     def close(self) -> None:
         """Stop all, and wait until their processes have ended."""
