@@ -21,12 +21,12 @@ from tests.helpers.compiled import await_compiler, start_compiler
 from tests.helpers.places import REAL_DATA
 from tests.helpers.waiting import PATIENCE
 
-# Where Python is told to keep nothing that it compiled, as in containers, each of the hundred
-# programs that tests start would compile the package anew, and each worker all tests.
+# Containers may forbid Python to store compiled code. Then each of the hundred programs that tests
+# start would compile the package again, and so would each worker.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
-# Desks of tests write no log into the home of whoever runs them.
+# Desks started by tests write no log into the user's home folder.
 os.environ["XDG_STATE_HOME"] = tempfile.mkdtemp(prefix="cartlab-tests-")
 atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 
@@ -55,7 +55,7 @@ _LONGEST = {  # which end long after the others where they begin last
 }  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
 
-# A shell starts what runs in the background deaf to Ctrl-C, and its children inherit that.
+# A shell starts background jobs with Ctrl-C ignored, and their children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -64,7 +64,7 @@ FLAGS = "--headless --no-sandbox --disable-gpu --no-first-run --disable-backgrou
 
 @pytest.fixture(scope="session", autouse=True)
 def _silent_progress() -> Iterator[None]:
-    """What a command says here does not depend on how long it takes."""
+    """Show no progress, so that what a command prints does not depend on how long it takes."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.cli.common.FIRST_WORD", PATIENCE)
         yield
@@ -80,15 +80,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Run a file or two in this process; one of several waits for a bench, not the processor."""
+    """Run a file or two in this process;
+
+    else use several workers, as tests often wait for a bench.
+    """
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
     return 0 if few else (os.cpu_count() or 1) + 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have those begin that wait for benches, then the longest files, then those of few tests.
+    """Start with tests that wait for benches, then the longest files.
 
-    So at the end no worker is left alone with a long one.
+    The short files come last, so that no worker ends alone with a long one.
     """
     groups = [_group(item.nodeid) for item in items]
     size = Counter(groups)
@@ -99,7 +102,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave thousands of tests and modules out of what is looked through for garbage from now."""
+    """Exclude the thousands of collected tests and modules from later garbage collections."""
     gc.freeze()
     if "PYTEST_XDIST_WORKER" in os.environ:
         await_compiler()
@@ -107,9 +110,9 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
-    """Give each file to one worker, and to one all that wait for benches, which they share."""
+    """Give each file to one worker; all files that wait for benches share a worker."""
     if config.getoption("dist") != "loadscope":
-        return None  # whoever runs the tests wants another way
+        return None  # unless the user chose another way
     from xdist.scheduler import LoadScopeScheduling
 
     class ByGroup(LoadScopeScheduling):
@@ -126,7 +129,7 @@ def _group(nodeid: str) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def _patient_host() -> Iterator[None]:
-    """Bear with virtual benches, which have no processor of their own on a machine that is busy."""
+    """Allow virtual benches longer to answer: on a busy machine they have no core of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.bench.host.session.SILENCE", 3.0)
         for module in ("session", "serial_line"):
@@ -136,7 +139,7 @@ def _patient_host() -> Iterator[None]:
 
 @pytest.fixture
 def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Desks do their work in this process, not in others."""
+    """Run the desk's jobs in this process."""
     from tests.helpers.desks import WorkerHere
 
     monkeypatch.setattr("pipeline.desk.jobs.Supervisor", WorkerHere)
@@ -144,7 +147,7 @@ def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def browser():
-    """A real browser; where there is none, what needs it skips."""
+    """Return a real browser; tests that need it are skipped where it is missing."""
     if CHROMIUM is None:
         pytest.skip("no chromium on the path: apt-get install chromium")
     from playwright.sync_api import expect, sync_playwright
@@ -160,7 +163,7 @@ def browser():
 
 @pytest.fixture(scope="session")
 def fast() -> Iterator[Emulator]:
-    """A virtual bench twenty times as fast as a real one, with fewer lines a second."""
+    """Return a virtual bench that runs twenty times as fast as a real one and sends fewer lines."""
     with emulator("--speed", "20", "--period", "5.003") as bench:
         yield bench
 
@@ -174,9 +177,9 @@ def real_bench() -> Iterator[Emulator]:
 
 @pytest.fixture
 def real(real_bench: Emulator) -> Emulator:
-    """The bench in real time, its carts at rest, with nothing to tell of earlier tests.
+    """Return the bench in real time, with its carts at rest and no faults left from earlier tests.
 
-    The last to be told of is a run of ten lines, which no test asks for.
+    The last fault it could report is in a run of ten lines, which no test records.
     """
     from pipeline.bench.host.serial_line import open_line
     from pipeline.bench.protocol.messages import Hands, Start, Wave

@@ -1,8 +1,8 @@
-"""Whether the program still writes what it wrote: a refactoring must not move a byte.
+"""Check that a refactoring does not change a byte of the program's output.
 
-`python -m tests.references save FOLDER` runs the commands and keeps what they write;
-`python -m tests.references compare FOLDER` runs them again and lists every file that differs.
-Name parts (report, solution, gap, grade, inspect, plan) to run only those.
+`python -m tests.references save FOLDER` runs the commands and keeps their output; `python -m
+tests.references compare FOLDER` runs them again and lists every file that differs. Name parts
+(report, solution, gap, grade, inspect, plan) to run only those.
 """
 
 import argparse
@@ -27,7 +27,7 @@ BOOKKEEPING = frozenset({".lock", ".turn", ".made.json"})  # of this version alo
 
 
 def main() -> int:
-    """Save the references, or compare with them; 1 where something differs."""
+    """Save the references, or compare with them; return 1 if something differs."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=("save", "compare"))
     parser.add_argument("folder", type=Path)
@@ -52,7 +52,7 @@ def main() -> int:
 
 
 def write(part: str, out: Path) -> None:
-    """Run the commands of one part; what they write, and what they say, goes to `out`."""
+    """Run the commands of one part; write their files and messages to `out`."""
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir(parents=True)
     PARTS[part](out)
@@ -64,7 +64,7 @@ def write(part: str, out: Path) -> None:
 
 
 def differences(old: Path, new: Path) -> Iterator[str]:
-    """Yield the files that are missing, new, or hold other bytes."""
+    """Yield the files that are missing, new or different."""
     names = {path.relative_to(top) for top in (old, new) for path in top.rglob("*")}
     for name in sorted(names):
         before, after = old / name, new / name
@@ -117,7 +117,7 @@ def _grades(out: Path) -> None:
         file = teams / "team-2" / "submission.toml"
         text = file.read_text(encoding="utf-8")
         file.write_text(re.sub(r"omega_n = .+", "omega_n = 0.987", text), encoding="utf-8")
-        # One process: in the order of their names, as the numbers of the rows tell.
+        # One process, so that rows are numbered in the order of the submissions' names.
         how = ("--rubric", ROOT / "rubrics" / "throne-1dof.toml", "--jobs", "1")
         _run(out / "said.txt", "grade", teams, *how, "--out", out / "grades")
         book = out / "grades"
@@ -160,7 +160,7 @@ PARTS = {
 
 
 def _run(said: Path, *command: str | Path) -> None:
-    """Run one command; its exit code and all it says are kept, without the paths of this run."""
+    """Run one command; keep its exit code and messages, without the paths of this run."""
     done = subprocess.run(
         [sys.executable, "-m", "pipeline", *map(str, command)],
         cwd=ROOT,
@@ -177,7 +177,7 @@ def _run(said: Path, *command: str | Path) -> None:
 
 
 def _rows(book: Path) -> Iterator[str]:
-    """Yield every row of a gradebook as text, without what tells when it was written."""
+    """Yield every row of a gradebook as text, without its times of writing."""
     with sqlite3.connect(book) as open_book:
         query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
         for (table,) in open_book.execute(query).fetchall():

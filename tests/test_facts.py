@@ -1,4 +1,4 @@
-"""Facts are asked for: nobody reads them back out of our own sentences, ids and names."""
+"""Code asks for facts; it never reads them back out of our own sentences, ids and names."""
 
 import ast
 from collections.abc import Iterator
@@ -19,14 +19,14 @@ READERS = {
     "removeprefix",
     "removesuffix",
 }
-# What is said or named: as an attribute of anything, or as a variable.
+# Names of messages and ids: an attribute of anything, or a variable.
 SAID = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
         "partial"}  # fmt: skip
 # In these rooms such a variable holds the name of a parameter, never that of a file.
 ROOMS = ("checks", "identify", "soundness", "report/equations", "grading/mistakes", "grading/judge",
          "grading/references")  # fmt: skip
 PARAMETERS = {"name", "omega", "zeta", "worst"}
-# A reason is shown line by line: one line for each thing that is wrong.
+# A reason is shown line by line: one line for each fault.
 ALLOWED = {'grade.reason.split("\\n")', 'reason.split("\\n")'}
 
 
@@ -59,7 +59,10 @@ def _is_said(node: ast.expr, names: set[str]) -> bool:
 
 
 def _is_part(index: ast.expr) -> bool:
-    """Whether letters are taken: a slice, or a letter by its number."""
+    """Return whether an expression takes letters of a text:
+
+    a slice, or one letter by its number.
+    """
     return isinstance(index, ast.Slice) or (
         isinstance(index, ast.Constant) and isinstance(index.value, int)
     )
@@ -92,5 +95,5 @@ def test_no_fact_is_read_back_from_words(path: Path):
     ],
 )
 def test_what_stood_there_before_is_found(slip: str):
-    """Each of these once read a fact out of a sentence, an id or a name."""
+    """Each of these lines was in the program once; the test recognises all of them."""
     assert read_back(slip, of_parameters=True)

@@ -1,4 +1,4 @@
-"""A command looks for garbage seldom, and not at its end."""
+"""A command collects garbage rarely, and not when it ends."""
 
 import subprocess
 import sys
@@ -17,7 +17,7 @@ except SystemExit:
 
 
 def test_a_command_looks_for_garbage_a_few_times_only():
-    """By default it is a hundred times, for the imports of this one alone."""
+    """By default the imports of this command alone would start a hundred collections."""
     command = [sys.executable, "-c", LOOKS]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert int(done.stderr.split()[-1]) < 40
@@ -36,6 +36,9 @@ Cycle()
 
 
 def test_what_is_left_at_the_end_is_the_systems():
-    """Python would look through everything that was loaded, twice."""
+    """At exit Python would search everything that was loaded, twice;
+
+    the system frees it instead.
+    """
     done = subprocess.run([sys.executable, "-c", ENDS], capture_output=True, text=True, check=True)
     assert done.stdout == ""

@@ -99,7 +99,7 @@ def _imports(path: Path) -> list[str]:
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             names = [f"{node.module}.{alias.name}" for alias in node.names]
-            # Of a room that stands for its modules alone nothing is imported but those.
+            # A room that only groups modules is never imported itself.
             modules = all((ROOT / f"{name.replace('.', '/')}.py").exists() for name in names)
             found += names if modules else [node.module or "", *names]
     return found
@@ -140,18 +140,18 @@ def test_each_package_has_a_home():
 
 
 def test_a_file_is_read_in_one_sitting():
-    """None of those that identify and explain has more than 400 lines, but for the maps."""
+    """No module that identifies or explains has more than 400 lines, except the maps of types."""
     rooms = ("plant", "estimation", "stages", "identify", "gap")
     files = [
         *PIPELINE.glob("*.py"),
         *(path for room in rooms for path in (PIPELINE / room).rglob("*.py")),
     ]
     long = [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > 400]
-    assert sorted(long) == ["results.py", "types.py"]  # the map, and that of the gap
+    assert sorted(long) == ["results.py", "types.py"]  # the maps of types
 
 
 def test_tests_stand_in_folders_named_as_what_they_test():
-    """Beside those of the whole, of statistics, of benchmarks, and what tests are made with."""
+    """Exceptions: tests of the whole program, statistics, benchmarks, and the helpers."""
     others = {"helpers", "truth", "system", "statistics", "benchmarks"}
     folders = {path.parent.relative_to(ROOT / "tests") for path in ROOT.glob("tests/**/test_*.py")}
     homeless = [str(f) for f in folders if f.parts and f.parts[0] not in others
@@ -160,6 +160,6 @@ def test_tests_stand_in_folders_named_as_what_they_test():
 
 
 def test_every_folder_is_a_package():
-    """A folder with modules has an `__init__.py`: the pages of the interface find it by that."""
+    """A folder with modules has an `__init__.py`; the API pages find it by that."""
     folders = {path.parent for path in MODULES}
     assert [str(folder) for folder in folders if not (folder / "__init__.py").exists()] == []

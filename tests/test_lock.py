@@ -35,10 +35,10 @@ def other(tmp_path):
 
 
 def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
-    """It is told the process that writes there, whose scratch stays as long as it lives.
+    """The message names the process that writes there; its scratch folder stays while it lives.
 
-    The lock of a dead one is gone with it; the next run removes its scratch, and its own at the
-    end.
+    When that process is dead its lock is gone too. The next run removes its scratch folder, and its
+    own at the end.
     """
     refused = pytest.raises(ConfigError, match=rf"another cartlab \(process {other.pid}\) writes")
     with refused, alone_in(tmp_path):
@@ -58,14 +58,14 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 
 
 def test_a_lock_that_is_none_is_said(tmp_path):
-    """A file of that name that is no lock is no reason to go on."""
+    """A file of that name that is not a lock stops the run with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
     with pytest.raises(ConfigError, match="no lock of cartlab"), alone_in(tmp_path):
         pass
 
 
 def test_a_folder_nothing_came_of_goes_again(tmp_path):
-    """What was made for a run that ended at once is removed; a folder that was there stays."""
+    """A folder made for a run that ended at once is removed; a folder that existed stays."""
     for out in (tmp_path / "new" / "out", tmp_path):
         with pytest.raises(ZeroDivisionError), alone_in(out), scratch_in(out):
             raise ZeroDivisionError

@@ -1,4 +1,4 @@
-"""Parameter names are read in one place, and the orders of a chain are those of its names."""
+"""Parameter names are read in one place, and the laws of a chain hold for its names."""
 
 import pytest
 
@@ -30,7 +30,7 @@ def test_a_rigid_body_has_a_damping_but_no_ratio():
 
 
 def test_a_table_without_its_last_resonance_sets_no_upper_bound():
-    """A cart alone may be faster than the first resonance, whatever else is missing."""
+    """A cart alone may be faster than the first resonance if the table lacks the last one."""
     names = ["K_1", "K_2", "omega_1", "omega_2", "omega_a"]
     found = [(lesser, greater) for lesser, greater, _ in orders(names)]
     assert found == [("K_2", "K_1"), ("omega_a", "omega_1"), ("omega_a", "omega_2")]
@@ -38,7 +38,7 @@ def test_a_table_without_its_last_resonance_sets_no_upper_bound():
 
 @pytest.mark.parametrize("preset", ["throne-2dof", "throne-3dof"])
 def test_a_real_chain_obeys_them(preset):
-    """What the paper's own carts have lies where it should."""
+    """The paper's own carts satisfy every inequality."""
     values = PRESETS[preset].parameters()
     for low, middle, high, _ in brackets(PRESETS[preset].n):
         assert values[low] < values[middle] < values[high]
@@ -47,7 +47,7 @@ def test_a_real_chain_obeys_them(preset):
 
 
 def test_names_are_said_in_words():
-    """As one speaks of them; what is no such name stays as it is."""
+    """Names are written in words; any other text stays as it is."""
     said = {name: read_name(name).words for name in ("zeta", "zeta_1", "omega_n", "omega_b",
             "omega_x", "K_2", "mass")}  # fmt: skip
     assert said == {

@@ -1,4 +1,7 @@
-"""The notebook: one import, results that show themselves, and the example runs to its end."""
+"""The notebook:
+
+one import, results that display themselves, and an example that runs to the end.
+"""
 
 import ast
 import json
@@ -31,13 +34,13 @@ def lab() -> Lab:
 
 
 def test_analyse_is_the_packages_own(lab):
-    """`from pipeline import analyse` is this function, and gives the very results of a report."""
+    """`from pipeline import analyse` is this function and gives the results of a report."""
     assert pipeline.analyse is analyse
     assert json_text(lab.results) == json_text(analysed("two-cart"))
 
 
 def test_nothing_heavy_is_loaded_until_it_is_asked_for():
-    """Importing the package alone loads nothing heavy; another name is no name."""
+    """Importing the package loads nothing heavy; an unknown name is an error."""
     code = (
         "import sys, pipeline; "
         "print({'numpy', 'matplotlib', 'pandas', 'control'} & set(sys.modules))"
@@ -61,24 +64,24 @@ def test_the_system_is_the_identified_chain(lab):
 
 
 def test_one_cart_held_is_a_system_of_its_own(lab):
-    """With cart 1 held, what is left is cart 2 alone, which nothing drives."""
+    """With cart 1 held only cart 2 is left, and nothing drives it."""
     alone = lab.chain.to_control(free=(2,))
     assert (alone.state_labels, alone.output_labels) == (["x2", "v2"], ["x2"])
     assert_array_equal(alone.B, np.zeros((2, 1)))
 
 
 def test_transfer_functions_are_those_of_the_system(lab):
-    """By output, with the frequency response of the state model."""
+    """One for each output, with the frequency response of the state model."""
     omega = np.geomspace(1.0, 100.0, 20)
     assert list(lab.transfer_functions) == ["x1", "x2"]
     for row, (name, found) in enumerate(lab.transfer_functions.items()):
         assert found.output_labels == [name]
-        # Near a resonance of zeta 0.03 the polynomial of degree four loses two digits.
+        # Near a resonance of zeta 0.03 a polynomial of degree four loses two digits.
         assert_allclose(found(1j * omega), lab.chain.frequency_response(omega)[row], rtol=1e-11)
 
 
 def test_the_closed_loop_is_the_designed_one(lab):
-    """It is sampled as the design is, and its poles are the design's and the delay's."""
+    """It has the sample time of the design; its poles are those of the design and of the delay."""
     loop, design = lab.closed_loop, lab.design
     assert loop.dt == design.sample_time
     assert loop.input_labels == ["r"]
@@ -89,7 +92,7 @@ def test_the_closed_loop_is_the_designed_one(lab):
 
 
 def test_tables_have_the_names_of_the_results(lab):
-    """One row a parameter, check, decay, step and dwell; units in the attributes."""
+    """One row for each parameter, check, decay, step and dwell; units are in the attributes."""
     results = plain(lab.results, digits=17)
     for frame, rows in (
         (lab.parameters, results["parameters"]),
@@ -156,7 +159,7 @@ def test_each_section_shows_itself(lab):
 
 
 def test_a_folder_that_is_none_is_one_clear_error(tmp_path):
-    """The reader of a notebook gets the message of the command line."""
+    """A notebook gets the same message as the command line."""
     with pytest.raises(SubmissionError, match="no such folder"):
         analyse(tmp_path / "nowhere")
 
@@ -176,7 +179,7 @@ def test_the_style_sheet_stays_inside(lab):
 
 
 def test_the_example_notebook_runs(monkeypatch):
-    """Every code cell runs, in order, and what ends a cell shows itself."""
+    """Every code cell runs, in order, and the last value of a cell displays itself."""
     mpl.use("agg")
     monkeypatch.chdir(EXAMPLES.parent)
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
@@ -198,7 +201,7 @@ def test_the_example_notebook_runs(monkeypatch):
     assert shown["checks"].empty
     assert "omega_a falls from 10.138 to" in shown["heavier"]
     steps = shown["steps"]
-    # The bench ran the designed loop; a controller of one's own settles too, and overshoots.
+    # The bench ran the designed loop; another controller settles too, and overshoots.
     assert steps.loc["designed", "SettlingTime"] == steps.loc["measured", "SettlingTime"]
     assert_allclose(steps["SteadyStateValue"], 1.0, rtol=5e-3)  # two encoder steps of 0.0023 cm
     assert 5 < steps.loc["mine", "Overshoot"] < 10

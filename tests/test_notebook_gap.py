@@ -27,7 +27,7 @@ def gap(tmp_path_factory) -> ExplainedGap:
 
 
 def test_effects_are_a_table(gap):
-    """A row an effect, in the order found, and a row a parameter with its unit."""
+    """One row for each effect, in the order found, and one for each parameter with its unit."""
     assert pipeline.explain is explain
     assert gap.verdict == "named"
     assert sorted(gap.effects["effect"]) == ["actuator_lag", "coulomb_friction"]
@@ -41,7 +41,7 @@ def test_effects_are_a_table(gap):
 
 
 def test_a_recording_is_simulated_by_both_models(gap):
-    """By time: measured, linear, with the effects; only these come near the measurement."""
+    """By time: measured, linear, with the effects; only the last comes near the measurement."""
     frame = gap.simulate(gap.records[-1])
 
     assert frame.index.name == "time"
@@ -53,7 +53,7 @@ def test_a_recording_is_simulated_by_both_models(gap):
 
 
 def test_the_systems_are_those_of_the_models(gap):
-    """The linear one is the chain's; the other has a lag, and friction that stops a release."""
+    """The linear one is the chain; the other has a lag, and friction that stops a release."""
     assert gap.linear.state_labels == ["x1", "v1"]
     assert_allclose(gap.linear.A, gap.results.linear.chain.state_space()[0])
     assert isinstance(gap.system, control.NonlinearIOSystem)
@@ -76,7 +76,7 @@ def test_the_systems_are_those_of_the_models(gap):
 
 
 def test_the_force_left_is_a_table(gap):
-    """A row for each window; of a right model only noise is left."""
+    """One row for each window; if the model is right, only noise is left."""
     assert list(gap.residual.columns) == [
         "experiment", "time", "cart", "position", "velocity", "input", "force",
     ]  # fmt: skip
@@ -86,7 +86,7 @@ def test_the_force_left_is_a_table(gap):
 
 
 def test_the_plots_show_what_the_gap_found(gap):
-    """Held-out runs by the model with effects: the same lines, and the errors of `gap.json`."""
+    """Held-out runs simulated with the effects: the same curves as the gap, and its errors."""
     runs = {run.id: run for run in compare_runs(gap.analysis, gap=gap.results, progress=silent)}
     held = [row for row in gap.results.by_record if row.held_out]
     assert {runs[row.experiment].kind for row in held} >= {"decay", "step"}
@@ -97,6 +97,6 @@ def test_the_plots_show_what_the_gap_found(gap):
         frame = gap.simulate(row.experiment)
         shown = found.y[-len(frame) :]
         swing = np.ptp(cart.measured)
-        # The start of each run is fitted anew, within the noise of some readings.
+        # The start of each run is fitted again, within the noise of some readings.
         assert_allclose(shown, frame["with_effects", "x1"], atol=2 * row.noise_floor * swing)
         assert found.nrmse < max(1.2 * row.final, 1.1 * row.noise_floor)

@@ -35,7 +35,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 
 
 def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
-    """Whole, whoever came last; what cannot be written leaves nothing."""
+    """The file is one writer's, whole; a failed write leaves no file behind."""
     path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda text: write_file(path, text), 5 * texts))
@@ -47,7 +47,10 @@ def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
 
 
 def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
-    """Only what is old and ours: others may be writing, a student may call files so."""
+    """Only old files of ours are removed:
+
+    others may be writing, or a student may use such a name.
+    """
     names = [f".{16 * '0'}.part", f".{16 * '1'}.part", ".mine.part", "left.part"]
     for name in names:
         (tmp_path / name).write_text("half")
@@ -58,7 +61,7 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
 
 
 def test_a_folder_is_looked_through_once(tmp_path):
-    """Among thousands of files a look takes longer than a write."""
+    """A folder of thousands of files is searched once: a search takes longer than a write."""
     write_file(tmp_path / "notes.md", "whole")
     left = tmp_path / f".{16 * '0'}.part"
     left.write_text("half")
@@ -68,7 +71,7 @@ def test_a_folder_is_looked_through_once(tmp_path):
 
 
 def test_a_link_is_replaced_not_followed(tmp_path):
-    """A link that a submission brought does not lead our output to another file."""
+    """A link inside a submission does not lead our output to another file."""
     victim = tmp_path / "victim"
     victim.write_text("precious")
     link = tmp_path / "report.html"
@@ -85,7 +88,7 @@ def test_a_linked_folder_inside_a_submission_is_refused(tmp_path):
     (tmp_path / "report").symlink_to(elsewhere)
     with pytest.raises(ConfigError, match="is a link; name another folder with --out"):
         own_folder(tmp_path, "report")
-    assert check_folder(tmp_path / "report").is_dir()  # where the user says so himself
+    assert check_folder(tmp_path / "report").is_dir()  # if the user names it
 
 
 def test_a_file_in_the_way_is_refused(tmp_path):
@@ -97,7 +100,7 @@ def test_a_file_in_the_way_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
 def test_a_file_s_name_is_no_new_folder(tmp_path, name):
-    """Who types one expects a file; a folder that is called so already is one."""
+    """A name with an ending is a file; an existing folder of that name is a folder."""
     with pytest.raises(ConfigError, match="name a folder with --out"):
         named_folder(tmp_path / name)
     (tmp_path / name).mkdir()
@@ -106,7 +109,7 @@ def test_a_file_s_name_is_no_new_folder(tmp_path, name):
 
 
 def test_stale_files_go(tmp_path):
-    """Only what matches is removed, links included, folders not."""
+    """Only files that match are removed, also links, but no folders."""
     (tmp_path / "a.svg").write_text("")
     (tmp_path / "keep.txt").write_text("")
     (tmp_path / "b.svg").mkdir()
@@ -115,7 +118,7 @@ def test_stale_files_go(tmp_path):
 
 
 def test_a_folder_with_something_in_it_is_not_new(tmp_path):
-    """A submission is never written over another; an empty folder will do."""
+    """A submission is never written over another; an empty folder is accepted."""
     assert new_folder(tmp_path / "fresh") == tmp_path / "fresh"
     assert new_folder(tmp_path) == tmp_path
     (tmp_path / "submission.toml").write_text("")
@@ -130,7 +133,7 @@ def test_a_folder_with_something_in_it_is_not_new(tmp_path):
     "text", ["-1.5", "+3", "1e-3", "-.5", "7", "-", "ünal-lab", "K_1: 2; K_2: 3"]
 )
 def test_numbers_and_words_are_left_alone(text):
-    """A minus sign before a number is no formula, nor is one in a word."""
+    """A minus sign before a number is not a formula, nor is one inside a word."""
     assert harmless(text) == text
 
 
@@ -145,7 +148,7 @@ _HIDING = [
 @pytest.mark.parametrize("hidden", _HIDING)
 @pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
 def test_formulas_are_neutralised(before, hidden, sign):
-    """Behind whatever shows as nothing, at the start of a cell or where a semicolon begins one."""
+    """Formulas are found behind invisible characters, at a cell's start and after a semicolon."""
     text = harmless(before + hidden + sign)
     assert text.isprintable()
     assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)
@@ -157,7 +160,7 @@ _MEANT = st.text(st.sampled_from("=+-@;,\"'\r\n\t \u3000\u00ad\u200eab1")) | st.
 @given(st.lists(st.lists(_MEANT, min_size=2, max_size=2), max_size=4))
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
-    """Whatever separates the cells of a spreadsheet: rows as many as written, no formula in one."""
+    """With any separator of a spreadsheet: as many rows as were written, and no formula."""
     text = csv_text(("a", "b"), rows)
     assert not [c for c in text if unicodedata.category(c).startswith("C") and c != "\n"]
     assert text.count("\n") == len(rows) + 1
@@ -165,12 +168,13 @@ def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
     if separator == ",":
         assert back == [["a", "b"], *([harmless(cell) for cell in row] for row in rows)]
     cells = [cell for row in back for cell in row]
-    # A dash for nothing stands bare; read in one cell with the comma behind it it is no formula.
+    # A dash for a missing value is not quoted; a program that joins it with the next comma sees no
+    # formula.
     number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-(,.*)?", re.IGNORECASE | re.DOTALL)
     assert not [c for c in cells if c.lstrip()[:1] in [*"=+-@"] and not number.fullmatch(c)]
 
 
 def test_numbers_stay_bare_and_texts_are_quoted():
-    """A number is one to every program; none where there is none."""
+    """Every program reads a number as a number; a missing number is an empty cell."""
     rows = [("1024", 17.50, np.float64(1 / 3), np.int64(3), float("nan"), None, 'a "b"')]
     assert csv_text("abcdefg", rows).splitlines()[1] == '"1024",17.5,0.3333333333,3,,,"a ""b"""'

@@ -1,4 +1,4 @@
-"""results.json: the documented form, plain numbers only, the same bytes every time."""
+"""results.json has the documented form, plain numbers only, and the same bytes every time."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def test_it_has_every_documented_key(results):
 
 
 def test_parameters_follow_the_papers_table(results):
-    """The rows stand in the order of Table 2, with units and both estimates."""
+    """The rows have the order of Table 2, with units and both estimates."""
     rows = results["parameters"]
     assert [row["name"] for row in rows] == [
         "K_1",
@@ -67,7 +67,7 @@ def test_shapes_agree_with_the_number_of_carts(results):
 
 
 def test_hardware_has_one_entry_a_run_and_cart(results):
-    """The loop that ran and the plant driven by the measured input share one entry."""
+    """The loop that ran and the plant driven by the measured input have one entry each."""
     keys = [(entry["experiment"], entry["cart"]) for entry in results["hardware"]]
     assert len(keys) == len(set(keys)) == 2
     assert all(entry["loop"] == "closed" for entry in results["hardware"])

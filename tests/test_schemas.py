@@ -1,4 +1,4 @@
-"""The JSON files and their schemas: what is shipped is what is written."""
+"""The JSON files and their schemas: the shipped schemas describe the files we write."""
 
 import json
 import subprocess
@@ -45,14 +45,14 @@ def example(request):
 
 
 def test_real_results_obey_the_schema(example):
-    """Results and reference of every shipped example fit, with no key that the schema lacks."""
+    """Results and solution of every shipped example fit the schema; it lacks no key."""
     assert_fits("results", json_text(example))
     assert_fits("solution", solution_text(example))
 
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_results_with_gaps_obey_the_schema(carts):
-    """What could not be had is null, and allowed to be."""
+    """A number that could not be determined is null, and the schema allows that."""
     analysis = make_analysis(carts)
     for poorer in (analysis, replace(analysis, fit=None, rows=(), feedback=None, hardware=())):
         assert_fits("results", json_text(poorer))
@@ -67,7 +67,7 @@ def test_gaps_obey_the_schema(verdict):
 
 
 def test_grades_obey_the_schema(tmp_path):
-    """Of a class of all sorts: graded, failed, flagged, shared, late, and points given by hand."""
+    """A class with every kind of row: graded, failed, flagged, shared, late, changed by hand."""
     files = sorted((write_class(tmp_path) / "feedback").glob("*/grade.json"))
     assert len(files) == 16
     for file in files:
@@ -89,7 +89,7 @@ def test_a_broken_file_does_not_obey():
 
 
 def test_the_command_prints_it():
-    """`cartlab schema gap` is the shipped text; another name is refused with those there are."""
+    """`cartlab schema gap` is the shipped text; an unknown name is refused with a list of names."""
     command = [sys.executable, "-m", "pipeline", "schema"]
     done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The straight line: the shipped examples, and submissions from which a part is missing."""
+"""The whole workflow on the shipped examples, and on submissions that lack a part."""
 
 import math
 import shutil
@@ -24,14 +24,14 @@ def analyses():
 
 @pytest.mark.parametrize("name", PRESET_OF)
 def test_examples_give_back_the_carts_that_made_them(analyses, name):
-    """Every named parameter of the final column is the preset's, within four standard errors."""
+    """Every final parameter is that of the preset within four standard errors."""
     truth = PRESETS[PRESET_OF[name]].parameters()
     final = {row.name: row.final for row in analyses[name].rows}
     assert list(final) == list(truth)
     for parameter, estimate in final.items():
         # Four sigma on 32 parameters: one in 500 fixed seeds would fail by chance.
         assert abs(estimate.value - truth[parameter]) < 4 * estimate.std, parameter
-        # And the standard errors themselves are small: about 30 dwells at 0.1 %.
+        # The standard errors themselves are small: about 30 dwells at 0.1 %.
         assert estimate.std < 2e-3 * truth[parameter], parameter
 
 
@@ -52,7 +52,7 @@ def test_same_input_gives_same_bytes(analyses):
 
 
 def test_how_the_records_follow_is_handed_on(analyses):
-    """Who asks how well the records follow the carts need not follow them once more."""
+    """The fit of the records to the carts is computed once and handed on."""
     for analysis in analyses.values():
         fits = follow(analysis.records, analysis.chain)
         assert fits
@@ -89,7 +89,8 @@ def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
     analysis = analyse(_without(tmp_path, kinds=[kind]))
     assert stage in {skip.name for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
-    # Without dwells the fit rests on steps and a sweep of encoder counts: percents, not per mille.
+    # Without dwells the fit rests on steps and a sweep in encoder counts: percents, not tenths of a
+    # percent.
     assert analysis.chain is not None
     assert_allclose(analysis.chain.m, truth.m, rtol=0.01)
     assert_allclose(analysis.chain.k[1:], truth.k[1:], rtol=0.01)
@@ -106,7 +107,7 @@ def test_steps_alone_still_give_a_full_report(tmp_path):
 
 
 def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
-    """With decays only there is no final estimate; everything that needs one says why."""
+    """Decays alone give no final estimate; everything that needs one gives the reason."""
     analysis = analyse(_without(tmp_path, kinds=["sine", "sweep", "step", "closed_loop"]))
     assert analysis.chain is None
     stages = {skip.stage for skip in analysis.skipped}
@@ -126,7 +127,7 @@ def test_no_controller_is_designed_for_a_goal_that_nobody_stated():
 
 
 def test_the_design_can_be_left_out_and_had_later(analyses):
-    """Grading does without the design; asked for by itself it is the one of the whole line."""
+    """Grading skips the design; computed later it is the same as in the whole workflow."""
     submission, whole = load_submission(EXAMPLES / "one-cart"), analyses["one-cart"].feedback
     without = analyse(submission, design=False)
     assert without.feedback is None

@@ -1,4 +1,4 @@
-"""Virtual benches that tell the desks of their person that they run."""
+"""Virtual benches announce themselves to the desks of the same user."""
 
 import json
 import os
@@ -11,13 +11,13 @@ from pipeline.simulated.emulator.announce import RunningBench, announced, runnin
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path, monkeypatch):
-    """Another runtime folder than that of the benches of other tests."""
+    """Use a runtime folder apart from that of the benches of other tests."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path
 
 
 def test_a_bench_is_listed_while_it_runs():
-    """And not before, and not after."""
+    """It is listed neither before nor after."""
     bench = RunningBench(name="throne-1dof", address="socket://127.0.0.1:7")
     assert running_benches() == []
     with announced(bench):
@@ -41,7 +41,7 @@ def test_a_bench_that_was_killed_is_not_listed(own_folder):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_folder_that_others_can_write_to_is_not_believed(own_folder):
-    """Nor one that is a link."""
+    """A link to a folder is not trusted either."""
     bench = RunningBench(name="b", address="socket://127.0.0.1:8")
     with announced(bench):
         (folder,) = own_folder.iterdir()

@@ -39,7 +39,7 @@ def read(text: str) -> tuple[float, float]:
         (31.27, 0.0, "31.27"),
         (31.27, math.inf, "31.27"),
         (1 / 3, None, "0.3333"),
-        (12.5, 1e-12, "12.500000"),  # exact data: an error that says nothing
+        (12.5, 1e-12, "12.500000"),  # exact data: the error says nothing
         (5e6, 1e3, "(5.0000 ± 0.0010) × 10⁶"),
     ],
 )
@@ -53,7 +53,7 @@ def test_rounds_value_and_error_together(value, std, expected):
     st.floats(1e-7, 1e7),
 )
 def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
-    """What is read back lies within a twentieth of the error of what was written."""
+    """The value read back differs from the true one by at most a twentieth of the error."""
     std = ratio * abs(value) or ratio
 
     got, got_std = read(with_error(value, std))
@@ -77,12 +77,12 @@ def test_rounding_changes_nothing_that_the_error_could_tell(value, ratio):
     ],
 )
 def test_significant_digits(value, expected):
-    """Four digits; a power of ten where plain digits would be long; a dash for nothing."""
+    """Four digits; a power of ten if plain digits would be long; a dash for a missing number."""
     assert significant(value) == expected
 
 
 def test_percentages_carry_their_sign_where_they_are_changes():
-    """A change shows its sign, a share does not; a missing one is a dash."""
+    """A change has a sign, a share has none; a missing one is a dash."""
     assert percent(5.14, signed=True) == "+5.1 %"
     assert percent(-148.2, signed=True) == "−148 %"
     assert percent(5.14) == "5.1 %"
@@ -100,7 +100,7 @@ def test_listing_reads_as_english():
 
 
 def test_margins_say_lag_lead_and_no_limit():
-    """A negative phase margin is a lead; where no gain or phase is the edge, there is no limit."""
+    """A negative phase margin is a lead; without a critical gain or phase there is no limit."""
     lag = Margins(gain=4.0, phase_deg=60.0, modulus=0.7, omega_gain=0.0, omega_phase=20.0)
     assert margin_rows(lag) == [
         ("gain margin", "4.00", "", "at 0 rad/s"),
@@ -116,7 +116,7 @@ def test_margins_say_lag_lead_and_no_limit():
 
 
 def test_a_column_has_one_form():
-    """Where one number needs a power of ten all of the column have one."""
+    """If one number needs a power of ten, the whole column has one."""
     small, large = (3.12812e-4, 1.2e-6), (0.1274769, 3.9e-6)
     assert with_errors([large]) == ["0.1274769 ± 0.0000039"]
     assert with_errors([small, large]) == ["(3.128 ± 0.012) × 10⁻⁴", "(1.274769 ± 0.000039) × 10⁻¹"]

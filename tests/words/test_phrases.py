@@ -1,4 +1,4 @@
-"""The sentences that an instructor may edit: found by key, values put in, marks set."""
+"""The sentences that an instructor may edit: found by key, values inserted, markup set."""
 
 import ast
 import re
@@ -20,7 +20,7 @@ SUBJECTS = sorted(path.stem for path in (TEMPLATES / "words").glob("*.toml"))
 
 
 def written(folder: Path, text: str) -> Phrases:
-    """Return the sentences of a file of one's own."""
+    """Return the sentences of an edited file."""
     path = folder / "gap.toml"
     path.write_text(text + "\n", encoding="utf-8")
     return Phrases(path)
@@ -28,10 +28,10 @@ def written(folder: Path, text: str) -> Phrases:
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_every_sentence_is_said_somewhere(subject):
-    """A catalogue holds no sentence that nothing asks for."""
+    """Every sentence of a catalogue is used somewhere."""
     asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
     strings: set[str] = set()
-    parts: set[str] = set()  # of keys that are built, as in f"title_{verdict}"
+    parts: set[str] = set()  # keys that are built, as in f"title_{verdict}"
     for path in PIPELINE.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         constants = [n.value for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant)]
@@ -46,7 +46,7 @@ def test_every_sentence_is_said_somewhere(subject):
 
 
 def test_marks_are_set_and_values_are_never_markup(tmp_path):
-    """Strong, code and links come from the sentence alone."""
+    """Bold text, code and links come from the sentence, never from a value."""
     words = written(tmp_path, 'a = "**Yes: **{name}, see `f` under [here](#x)."')
     assert words.spans("a", name="**no** [b](#y)") == (
         Span("Yes: ", "strong"),
@@ -63,7 +63,7 @@ def test_marks_are_set_and_values_are_never_markup(tmp_path):
 
 @pytest.mark.parametrize("subject", SUBJECTS)
 def test_a_catalogue_is_plain_toml(subject):
-    """One table of strings, whose braces are values or stand apart."""
+    """One table of strings, in which a brace always belongs to a value."""
     found = tomllib.loads((TEMPLATES / "words" / f"{subject}.toml").read_text(encoding="utf-8"))
     for key, text in found.items():
         assert isinstance(text, str), key
@@ -84,7 +84,7 @@ def test_a_catalogue_is_plain_toml(subject):
     ],
 )
 def test_a_slip_in_a_sentence_is_told_in_one_line(tmp_path, text, named):
-    """The file, the key and the values that it may name; with marks and without."""
+    """The message names the file, the key and the values allowed there, with and without markup."""
     words = written(tmp_path, text)
     for say in (words.text, words.spans):
         with pytest.raises(ConfigError) as error:

@@ -1,4 +1,4 @@
-"""A plan carried out on a virtual bench over a real line."""
+"""A plan is carried out on a virtual bench over a real line."""
 
 import json
 import os
@@ -41,7 +41,7 @@ NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it with
 
 
 class Alone(Notes):
-    """Nobody is there."""
+    """A session without a person at the bench."""
 
     def confirm(self, instruction: str) -> None:
         """Refuse."""
@@ -63,7 +63,7 @@ def decay(name: str, cart: int = 1) -> Recording:
 
 
 def last_run(bench) -> dict:
-    """Return what the bench says of the run that was stopped or cut last."""
+    """Return the bench's account of the run that was last stopped or cut."""
     while (sent := bench.event("run"))["ended"] not in ("stopped", "watchdog"):
         pass
     return sent
@@ -73,9 +73,9 @@ def last_run(bench) -> dict:
 
 
 def test_a_plan_becomes_a_submission(tmp_path, fast):
-    """Decays, a dwell and a closed loop: each has its file and its table; units come out right.
+    """Decays, a dwell and a closed loop each get a file and a table, in the right units.
 
-    The virtual hands hold and let go, so nobody is asked; comments that stood there are kept.
+    The virtual hands hold and let go, so nobody is asked; existing comments are kept.
     """
     loop = Recording(
         id="control",
@@ -125,7 +125,7 @@ def test_a_plan_becomes_a_submission(tmp_path, fast):
 
 
 def test_a_folder_without_a_submission_gets_one(tmp_path):
-    """What the bench says of itself begins a submission; a plan is proposed and written."""
+    """The bench's description starts the submission; a plan is proposed and written."""
     with emulator("--speed", "20", "--period", "5.003", preset="throne-1dof") as bench:
         outcomes = acquire(
             tmp_path / "new", port=bench.address, observers=[Notes()], only=["step-1"]
@@ -138,7 +138,7 @@ def test_a_folder_without_a_submission_gets_one(tmp_path):
 
 
 def test_what_is_recorded_is_skipped(tmp_path, fast):
-    """A second session records what is left, and nothing twice."""
+    """A second session records only what is missing."""
     work = write_work(tmp_path, [sine("a", seconds=1), sine("b", seconds=1)])
     first = acquire(work, port=fast.address, observers=[Notes()], only=["a"])
     notes = Notes()
@@ -150,7 +150,7 @@ def test_what_is_recorded_is_skipped(tmp_path, fast):
 
 
 def test_a_stock_bench_is_driven_by_people(tmp_path):
-    """A bench that knows no extension has its carts held by a person, and no guard, as is said."""
+    """If the bench has no extension, a person holds its carts and no watchdog guards the motor."""
     work = write_work(tmp_path, [sine("dwell", seconds=1, settle=0.3)], scales="")
     text = (work / "submission.toml").read_text(encoding="utf-8")
     scaled = text.replace('unit = "cm"', 'unit = "cm", per_count = 0.00227')
@@ -167,7 +167,7 @@ def test_a_stock_bench_is_driven_by_people(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_pty_is_a_port_like_any_other(tmp_path):
-    """Over a pseudo-terminal the same plan gives the same kind of record."""
+    """A pseudo-terminal gives the same kind of record from the same plan."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--port", "pty", "--speed", "5") as bench:
         *_, outcome = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
@@ -178,7 +178,7 @@ def test_a_pty_is_a_port_like_any_other(tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
-    """Emulate with dry friction, acquire what is proposed, report, gap: the friction has a name."""
+    """Emulate with dry friction, acquire the proposed plan, report, gap: friction is named."""
     work = tmp_path / "work"
     hidden = "coulomb_friction:cart=1,force=0.0025"
     with emulator("--hide", hidden, "--speed", "20", "--period", "8.84") as bench:
@@ -205,7 +205,7 @@ def test_the_whole_loop_names_what_the_bench_hides(tmp_path):
 
 
 def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
-    """One line in a hundred spoilt in each way: every valid one is kept, every fault counted."""
+    """One line in a hundred is spoilt in each way: all valid lines are kept, all faults counted."""
     work = write_work(tmp_path, [sine("dwell", seconds=8)])
     options = [o for kind in ("drop", "garble", "merge") for o in ("--fault", f"{kind}=0.01")]
     with emulator(*options, "--speed", "10") as bench:
@@ -224,7 +224,8 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     points = analyse(submission).sine_points
     true = np.abs(PRESETS["throne-2dof"].frequency_response(np.array([points[0].omega])))[:, 0]
     for point in points:
-        # The input is sent in counts of 0.12 mV, of 10 mV; stamps are good to half a ms of 500.
+        # The input is sent in counts of 0.12 mV, here of 10 mV; stamps are good to half a ms of
+        # 500.
         assert point.gain == pytest.approx(true[point.cart - 1], rel=3e-3)
 
 
@@ -236,14 +237,17 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
     ],
 )
 def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, fault, why):
-    """What came before is kept where no report takes it for the whole; the next try succeeds."""
+    """The partial record is kept where no report mistakes it for a whole one;
+
+    the retry succeeds.
+    """
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
     with emulator("--fault", fault) as bench:
         outcomes = acquire(work, port=bench.address, observers=[notes], only=["dwell"])
     assert [bool(o.partial) for o in outcomes] == [True, False]
     assert why in outcomes[0].partial
-    # Why it is asked for again stands beside the request.
+    # The reason is beside the request.
     assert notes.confirmed == [f"dwell ended early: {outcomes[0].partial}. Record dwell again"]
     assert (work / "data" / "dwell.partial.txt").exists()
     assert [e.file for e in load_submission(work).experiments] == ["data/dwell.txt"]
@@ -252,7 +256,7 @@ def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, 
 
 
 def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
-    """The port is not looked at again before the stop; the run is no experiment."""
+    """The stop goes out before the port is read again; the run is not added as an experiment."""
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=NEAR)
     (outcome,) = acquire(work, port=real.address, observers=[Alone()], only=["dwell"])
     assert last_run(real)["ended"] == "stopped"
@@ -264,7 +268,7 @@ def test_a_run_that_passes_the_travel_limit_is_stopped_at_once(tmp_path, real):
 
 
 def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
-    """What the motor is given is watched as well, whoever asked for it."""
+    """The input to the motor is watched as well, no matter which program set it."""
     recording, system = sine("dwell", seconds=4), System(carts=2, springs=(True,) * 3)
     with open_line(real.address, baud=115_200) as line:
         order = make_order(
@@ -284,7 +288,7 @@ def test_a_run_that_passes_the_input_limit_is_stopped_at_once(tmp_path, real):
 
 
 def assert_stopped_at_once(raw: Path, offending: int) -> None:
-    """No look came after the one in which the offending line was judged: with its successor."""
+    """Check that the port was not read again after the look that found the offending line."""
     run = read_raw(raw)
     *_, last = [lump for lump, _ in run.lumps()]
     seen = readings_of(replace(run, content=run.content[: -len(last)], arrivals=run.arrivals[:-1]))
@@ -292,7 +296,7 @@ def assert_stopped_at_once(raw: Path, offending: int) -> None:
 
 
 def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
-    """A plan that asks for more than its own limits is refused before the port sees a start."""
+    """A plan that asks for more than its own limits is refused before anything is sent."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     plan = (work / "plan.toml").read_text(encoding="utf-8")
     (work / "plan.toml").write_text(plan.replace("input = 0.5", "input = 0.005"), encoding="utf-8")
@@ -303,7 +307,7 @@ def test_an_amplitude_past_the_limits_is_never_sent(tmp_path, real):
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows knows no SIGTERM to catch")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["ctrl-c", "sigterm"])
 def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
-    """Ctrl-C and SIGTERM end a run with a stop, not a watchdog; the partial record is there."""
+    """Ctrl-C and SIGTERM end a run with a stop, not by the watchdog; the partial record is kept."""
     work = write_work(tmp_path, [sine("dwell", seconds=30)])
     with host(work, real.address, "--only", "dwell") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
@@ -317,7 +321,7 @@ def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
 
 
 def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, fast):
-    """After kill -9 the watchdog cuts the motor; the file lacks at most what was on its way."""
+    """After kill -9 the watchdog cuts the motor; the file lacks only what was still on its way."""
     work = write_work(tmp_path, [sine("dwell", seconds=10)])
     with emulator(watchdog=2.0) as bench:
         with host(work, bench.address, "--only", "dwell", "--yes") as process:
@@ -327,8 +331,8 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
         sent = last_run(bench)["lines"]
     kept = readings_of(read_raw(work / "raw" / "dwell-1.raw"))
     assert silent >= 1999
-    # The bench streamed on until its watchdog bit; up to its last heartbeat all is there but what
-    # a busy machine had not yet handed over.
+    # The bench streamed until its watchdog cut in. Up to its last heartbeat only lines that a busy
+    # machine had not yet delivered may be missing.
     assert kept[-1].ms > 1.0024 * sent - silent - 500
     notes = Notes()
     *_, outcome = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
@@ -349,20 +353,20 @@ def test_a_stuck_encoder_is_said(tmp_path):
 
 
 def test_nobody_at_the_port_is_said_at_once():
-    """A port where nothing listens is one line that says what to do."""
+    """A port where nothing listens gives one line that says what to do."""
     with pytest.raises(HardwareError, match="nobody listens there; start the bench"):
         open_line("socket://127.0.0.1:9", baud=115_200)
 
 
 def test_a_port_that_is_not_there_names_those_that_are():
-    """A device that does not exist is one line, with the ports of this machine."""
+    """A device that does not exist gives one line, with the ports of this machine."""
     with pytest.raises(HardwareError, match=r"no such port; is the bench plugged in\?; .*port"):
         open_line("/dev/ttyNONE7", baud=115_200)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_a_port_that_another_program_has_is_said():
-    """Of two programs on one port the second is told so."""
+    """If two programs open one port, the second gets a clear message."""
     controller, device = os.openpty()
     import fcntl
 
@@ -377,7 +381,7 @@ def test_a_port_that_another_program_has_is_said():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_what_is_no_bench_is_said():
-    """A device that answers other things is not taken for a bench."""
+    """A device that gives other answers is not taken for a bench."""
     controller, device = os.openpty()
     echo = subprocess.Popen(
         [sys.executable, "-c", f"import os\nwhile os.read({controller}, 99): "
@@ -405,7 +409,7 @@ BENCH = Description(
 
 
 def test_scales_are_added_without_touching_the_rest(tmp_path):
-    """What the bench states goes into [system]; every comment and the order of keys stay."""
+    """The scales from the bench go into [system]; all comments and the order of keys stay."""
     text = """# first
 version = 1  # one
 
@@ -427,7 +431,7 @@ cart = 1
 
 @pytest.mark.parametrize("stock", [True, False])
 def test_a_scale_that_nobody_knows_is_asked_for(tmp_path, stock):
-    """Units the bench does not state are one line that says what to add."""
+    """If the bench does not state its units, one line says what to add."""
     text = 'version = 1\n[system]\ncarts = 2\nposition = { unit = "mm" }\n'
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
     wanted = r'position = \{ unit = "mm", per_count = … \} under \[system\]'
@@ -445,14 +449,14 @@ def test_more_carts_than_encoders_is_refused(tmp_path):
 
 @pytest.mark.parametrize("options", [[], ["--port", "x", "--import", "y"]])
 def test_either_a_port_or_a_folder(tmp_path, options):
-    """Neither, or both, is a mistake that is said."""
+    """Giving neither or both is refused with a clear message."""
     result = CliRunner().invoke(app, ["acquire", str(tmp_path), *options])
     assert isinstance(result.exception, ConfigError)
     assert "either --port or --import" in str(result.exception)
 
 
 def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
-    """`--only` with a name of no recording lists those there are."""
+    """`--only` with an unknown name lists the recordings of the plan."""
     work = write_work(tmp_path, [sine("a", seconds=1)])
     with pytest.raises(ConfigError, match=r"--only nine: plan.toml has a$"):
         acquire(work, port=real.address, observers=[Notes()], only=["nine"])
@@ -462,13 +466,13 @@ def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
 
 
 def shown(*, terminal: bool, **options) -> tuple[Terminal, StringIO]:
-    """Return a terminal view and what it prints."""
+    """Return a terminal view and what it printed."""
     out = StringIO()
     return Terminal(console=Console(file=out, force_terminal=terminal, width=100), **options), out
 
 
 def test_the_view_tells_plan_rate_faults_and_positions():
-    """While a run goes on: what is done and left, what is lost, where the carts are."""
+    """During a run it shows what is done and left, what is lost, and where the carts are."""
     view, out = shown(terminal=True)
     plan = Plan(limits=LIMITS, recordings=(sine("a", seconds=30), sine("b", seconds=45)))
     with view:
@@ -487,7 +491,7 @@ def test_the_view_tells_plan_rate_faults_and_positions():
 
 
 def test_without_a_terminal_only_trouble_is_told():
-    """In a log file a run that went well leaves nothing, one that did not leaves its reason."""
+    """In a log file a good run leaves no line, and a bad one leaves its reason."""
     view, out = shown(terminal=False)
     well = RunOutcome(recording=sine("a", seconds=1), lines=998)
     with view:
@@ -501,7 +505,7 @@ def test_without_a_terminal_only_trouble_is_told():
 
 
 def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
-    """Without a keyboard an instruction ends the session; `--yes` takes it as done, and says so."""
+    """Without a keyboard an instruction ends the session; `--yes` takes it as done and says so."""
     monkeypatch.setattr("sys.stdin", StringIO())
     view, _ = shown(terminal=False)
     with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard \(--yes"):
@@ -515,5 +519,5 @@ def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
     ("values", "bars"), [([5, 5], "▁▁"), ([0, 7], "▁█"), (range(8), "▁▂▃▄▅▆▇█")]
 )
 def test_a_sparkline_goes_from_the_least_to_the_greatest(values, bars):
-    """One bar a value, the least lowest, the greatest highest; equal values lie low."""
+    """One bar for each value, the least lowest and the greatest highest; equal values are low."""
     assert sparkline(values) == bars

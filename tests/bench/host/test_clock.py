@@ -1,4 +1,4 @@
-"""Benches whose clock, line or motor is not what they state: said, and what came is kept."""
+"""Benches whose clock, line or motor differs from what they state; the data are kept."""
 
 import socket
 import threading
@@ -89,17 +89,17 @@ def _with(reading: Reading, **changes: int) -> Reading:
 
 
 def frozen(lines: list[Reading]) -> Iterator[Reading]:
-    """The clock stands still from 0.5 s on."""
+    """Freeze the clock from 0.5 s on."""
     return (lines[min(r.ms, 500)] for r in lines)
 
 
 def never_began(lines: list[Reading]) -> Iterator[Reading]:
-    """The clock never goes."""
+    """Keep the clock at zero."""
     return (lines[0] for _ in lines)
 
 
 def leapt(lines: list[Reading]) -> Iterator[Reading]:
-    """The clock leaps by a hundred days."""
+    """Advance the clock by a hundred days."""
     return (_with(r, ms=r.ms if r.ms < 500 else r.ms + 8_640_000_000) for r in lines)
 
 
@@ -112,7 +112,7 @@ def leapt(lines: list[Reading]) -> Iterator[Reading]:
     ],
 )
 def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kept):
-    """The run is partial, says why, and its lines up to there are in a file, at no great cost."""
+    """The run is partial and says why; its lines up to then are in a file, at little cost."""
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     tracemalloc.start()
     outcomes = acquire(work, port=OddBench(lines).address, observers=[Notes()], only=["dwell"])
@@ -127,7 +127,7 @@ def test_a_clock_that_cannot_be_believed_ends_the_run(tmp_path, lines, said, kep
 
 
 def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
-    """A computer may keep for any while what the bench sent before it heard the stop."""
+    """A computer may deliver lines that the bench sent before it heard the stop much later."""
     first = iter([True])
 
     def reset(lines: list[Reading]) -> Iterator[Reading]:
@@ -143,7 +143,7 @@ def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
 
 @pytest.mark.parametrize("share", [0.1, 0.3, 0.6])
 def test_lost_lines_are_told_however_many(tmp_path, share):
-    """A bench that stated its period is believed: what is missing of it is lost, and noted."""
+    """The stated period of a bench is believed; missing lines are counted as lost and noted."""
     lost = np.random.default_rng(5).random(RUN) < share
 
     def thinned(lines: list[Reading]) -> Iterator[Reading]:
@@ -158,7 +158,7 @@ def test_lost_lines_are_told_however_many(tmp_path, share):
 
 @pytest.mark.parametrize("lost", [(), (500, 1700, 1701)])
 def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
-    """A line every 1.3 ms where 1.0 was stated: it is said once, and only what is lost counts."""
+    """A line every 1.3 ms instead of 1.0 is noted once, and only lines really lost are counted."""
 
     def slow(lines: list[Reading]) -> Iterator[Reading]:
         for k in range(round(len(lines) / 1.3)):
@@ -174,7 +174,7 @@ def test_a_clock_slower_than_stated_loses_nothing(tmp_path, lost):
 
 @pytest.mark.parametrize("factor", [25, -1])
 def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, factor):
-    """In open loop the duty is the target; one that is not is no run, and is not tried again."""
+    """In open loop the duty is the target; if they differ, the run ends and is not tried again."""
 
     def driven(lines: list[Reading]) -> Iterator[Reading]:
         return (_with(r, duty=factor * r.duty) for r in lines)
@@ -192,7 +192,10 @@ def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, f
     stated=st.booleans(),
 )
 def test_any_stamps_have_a_clock(steps, still, period, stated):
-    """Whatever the stamps, so long as they do not fall: a positive period, no fewer than 0 lost."""
+    """Whatever the stamps, if they do not fall:
+
+    a positive period and no negative number of losses.
+    """
     stamps = np.cumsum([0, *steps, *[still] * 60])
     fit = fit_stamps(stamps, period=period, stated=stated)
     assert fit.period > 0

@@ -1,4 +1,4 @@
-"""What people get wrong at a bench is said, and harms nothing that was recorded."""
+"""Mistakes of people at a bench are reported and harm no recorded data."""
 
 import re
 import signal
@@ -24,7 +24,7 @@ from tests.helpers.benches import emulator
 
 
 def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
-    """A submission of two carts takes nothing from a bench that states one."""
+    """A submission of two carts refuses data from a bench with one cart."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
         with pytest.raises(ConfigError, match=r"has 2 carts, the bench 'throne-1dof' has 1: is"):
@@ -33,7 +33,7 @@ def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
 
 
 def test_a_bench_of_more_carts_is_said(tmp_path):
-    """Whoever holds the third cart by hand may go on; the wrong cable is named."""
+    """A person who holds the third cart by hand may go on; the wrong cable is named."""
     submission = load_submission(write_work(tmp_path, []))
     bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
     (remark,) = cart_remarks(submission, bench)
@@ -42,7 +42,7 @@ def test_a_bench_of_more_carts_is_said(tmp_path):
 
 
 def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
-    """Two encoders that are not plugged in make no dwell; it is offered again, twice."""
+    """Two unplugged encoders do not make a dwell; the run is offered again, twice."""
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
     dead = ("--fault", "stuck=1@0", "--fault", "stuck=2@0")
@@ -53,7 +53,7 @@ def test_a_run_in_which_nothing_moves_is_not_recorded(tmp_path):
 
 
 def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
-    """It is told which process records there, and what that one records stays whole."""
+    """The message names the process that records there; its data stay whole."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
     with host(work, real.address, "--only", "dwell", "--yes") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
@@ -66,7 +66,7 @@ def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
 
 
 class Late(Notes):
-    """Keeps the computer busy once, for longer than a watchdog waits."""
+    """An observer that once keeps the computer busy for longer than the watchdog waits."""
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
         """Note the lines, and be slow after the first of them."""
@@ -76,7 +76,7 @@ class Late(Notes):
 
 
 def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
-    """A host that sends no heartbeat for too long says so, not only that the bench is silent."""
+    """If the host sends no heartbeat for too long, the message names the busy computer."""
     work = write_work(tmp_path, [sine("dwell", seconds=5)])
     notes = Late()
     with emulator(watchdog=WATCHDOG) as bench:
@@ -88,7 +88,7 @@ def test_a_busy_computer_is_named_where_the_watchdog_bites(tmp_path):
 
 
 class LastMoment(Notes):
-    """Presses Ctrl-C when the last lines are there."""
+    """An observer that presses Ctrl-C when the last lines have arrived."""
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
         """Note the lines."""
@@ -98,7 +98,7 @@ class LastMoment(Notes):
 
 
 def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
-    """A run that was over when Ctrl-C came is recorded; the session ends all the same."""
+    """A run that was over when Ctrl-C came is kept; the session ends all the same."""
     work = write_work(tmp_path, [sine("first", seconds=2), sine("second", seconds=2)])
     notes = LastMoment()
     with emulator("--speed", "4") as bench, pytest.raises(KeyboardInterrupt):
@@ -109,27 +109,27 @@ def test_an_interrupt_after_the_last_line_keeps_the_run(tmp_path):
 
 
 def test_a_network_port_typed_as_a_device_is_told_how_to_write_it():
-    """Neither a number nor HOST:PORT is a device; the form that works is named."""
+    """Neither a number nor HOST:PORT is a device; the message names the form that works."""
     for port in ("41001", "127.0.0.1:41001"):
         with pytest.raises(HardwareError, match=r"is written socket://HOST:PORT"):
             open_line(port, baud=115_200)
 
 
 def test_a_port_that_is_taken_says_what_to_choose():
-    """A second emulator on the port of the first is told that 0 takes any."""
+    """A second emulator on the same port is told that port 0 picks a free one."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         with pytest.raises(ConfigError, match="choose another port, or 0 for any"):
             open_link(f"socket://127.0.0.1:{taken.getsockname()[1]}")
 
 
 def test_one_is_not_many():
-    """One line, one encoder, two resets."""
+    """The noun agrees with the number: one line, one encoder, two resets."""
     assert str(Anomalies(lost=1, stuck=1, resets=2)) == "1 line lost, 2 resets, 1 encoder stuck"
     assert str(Anomalies(lost=2, stuck=2, resets=1)) == "2 lines lost, 1 reset, 2 encoders stuck"
 
 
 def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
-    """Springs stand there to be checked; authors and goal need but their # taken away."""
+    """The springs are there to be checked; authors and design only need their # removed."""
     bench = Description(name="two", encoders=2, carts=2, commands=EXTENSIONS, position_unit="cm")
     folder = tmp_path / "new"
     assert prepare_submission(folder, bench, stock=False).authors == ()
@@ -143,7 +143,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
 
 
 def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
-    """A limit that is too small is said with what to do; `report` would have nothing to read."""
+    """The message says which limit is too small; no report is offered, as nothing was recorded."""
     near = PlanLimits(input=0.5, travel=0.05)
     work = write_work(tmp_path, [sine("dwell", seconds=4)], limits=near)
     with host(work, fast.address, "--only", "dwell", "--yes") as process:
@@ -155,7 +155,7 @@ def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
 
 
 def test_files_need_a_submission_to_go_to(tmp_path):
-    """A folder that is not there is told how to be made."""
+    """If the folder does not exist, the message says how to make it."""
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
     assert isinstance(done.exception, ConfigError)

@@ -1,4 +1,4 @@
-"""The raw file: it says what it is, holds the bytes as they came, and survives everything."""
+"""The raw file describes itself, holds the bytes as they came, and survives every interruption."""
 
 import pytest
 
@@ -27,7 +27,7 @@ LUMPS = [b"".join(map(format_reading, LINES[start : start + 8])) for start in ra
 
 @pytest.fixture
 def raw(tmp_path):
-    """Return the path of a raw file of five lumps."""
+    """Return the path of a raw file of five chunks."""
     path = tmp_path / "raw" / "sine-1.raw"
     with RawWriter(path, HEADER) as writer:
         for lump in LUMPS:
@@ -36,7 +36,7 @@ def raw(tmp_path):
 
 
 def test_what_was_written_is_read(raw):
-    """Header, bytes and the lumps they came in are all there again, times rising."""
+    """Header, bytes and chunks all come back, with rising times."""
     run = read_raw(raw)
     assert run.header == HEADER
     assert run.content == b"".join(LUMPS)
@@ -47,7 +47,7 @@ def test_what_was_written_is_read(raw):
 
 
 def test_the_bytes_follow_the_first_line_as_they_came(raw):
-    """After the header line the file is what the port gave, byte for byte."""
+    """After the header line the file is exactly what the port delivered."""
     head, _, content = raw.read_bytes().partition(b"\n")
     assert b'"schema": "cartlab-raw/1"' in head
     assert content == b"".join(LUMPS)
@@ -55,7 +55,7 @@ def test_the_bytes_follow_the_first_line_as_they_came(raw):
 
 @pytest.mark.parametrize("which", [".raw", ".times"])
 def test_a_file_cut_at_any_byte_is_read_up_to_there(raw, which):
-    """Wherever the writing ended, every line that is whole by then is read; none is made up."""
+    """Wherever the file ends, every complete line before is read, and no line is invented."""
     path = raw.with_suffix(which)
     whole = path.read_bytes()
     first = len(HEADER.to_json().encode()) + 1 if which == ".raw" else 0
@@ -69,7 +69,7 @@ def test_a_file_cut_at_any_byte_is_read_up_to_there(raw, which):
 
 
 def test_a_raw_file_is_never_written_over(raw):
-    """A second run of the same name is refused; the first one stays."""
+    """A second run of the same name is refused and the first file stays."""
     with pytest.raises(FileExistsError), RawWriter(raw, HEADER):
         pass
     assert read_raw(raw).content == b"".join(LUMPS)
@@ -87,7 +87,7 @@ def test_a_raw_file_is_never_written_over(raw):
     ],
 )
 def test_what_is_no_raw_file_is_refused(tmp_path, content, why):
-    """A file without a whole header of this form is one error that names it."""
+    """A file without a whole header is one error that names the file."""
     path = tmp_path / "strange.raw"
     path.write_bytes(content)
     with pytest.raises(DataError, match=f"strange.raw: .*{why}"):
@@ -95,7 +95,7 @@ def test_what_is_no_raw_file_is_refused(tmp_path, content, why):
 
 
 def test_the_record_reads_as_a_bench_log(raw, tmp_path):
-    """The data file is the bench log every reader knows: counts scaled, stamps straightened."""
+    """The data file is an ordinary bench log, with scaled counts and straight stamps."""
     text = """version = 1
 [system]
 carts = 2
@@ -117,14 +117,14 @@ file = "data/sine-µ.txt"
 
 
 def test_a_closed_loop_has_its_reference():
-    """Under feedback the target is a column of its own, which the reader takes as reference."""
+    """Under feedback the target is a column of its own, read as the reference."""
     heading, first, *_ = log_text(LINES, carts=1, reference=True).splitlines()
     assert heading == "Sample\tTime\tEncoder 1 Pos\tTarget\tControl Effort"
     assert first == "0\t0.000\t0\t0\t0"
 
 
 def test_a_raw_file_of_a_few_lines_makes_no_record(tmp_path):
-    """Seven lines are no record; the message says so."""
+    """Seven lines are too few for a record, and the message says so."""
     path = tmp_path / "short-1.raw"
     with RawWriter(path, HEADER) as writer:
         writer.write(b"".join(map(format_reading, LINES[:7])))

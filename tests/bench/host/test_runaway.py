@@ -1,4 +1,4 @@
-"""Whatever state a session is in, a bench that misbehaves is stopped and not started again."""
+"""A bench that misbehaves is stopped and not started again, in every state of a session."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -49,47 +49,47 @@ def decay(name: str) -> Recording:
 
 
 def before_start(bench: RunawayBench) -> bool:
-    """From its first answer until the first run."""
+    """Return a bench that misbehaves from its first answer until the first run."""
     return bench.resets > 0 and not bench.starts
 
 
 def resting(bench: RunawayBench) -> bool:
-    """While the carts come to rest."""
+    """Return a bench that misbehaves while the carts come to rest."""
     return bench.run_on is not None and bench.run_on.amplitude == 0 and bench.run_on.frequency < 2
 
 
 def resting_again(bench: RunawayBench) -> bool:
-    """Likewise before the second recording: the carts have been zeroed at rest."""
+    """Return one that misbehaves before the second recording, with the carts zeroed at rest."""
     return resting(bench) and len(bench.starts) > 2
 
 
 def running(bench: RunawayBench) -> bool:
-    """While the motor is to move the carts."""
+    """Return one that misbehaves while the motor should move the carts."""
     return bench.run_on is not None and bench.run_on.amplitude != 0
 
 
 def between(bench: RunawayBench) -> bool:
-    """From the stop after the first recording on, before the rest for the second."""
+    """Return one that misbehaves between the stop of the first run and the next rest."""
     return bench.is_stopped and len(bench.starts) == 2
 
 
 def tried(bench: RunawayBench) -> bool:
-    """In the run of nothing in which a host looks whether a stock bench is there."""
+    """Return one that misbehaves in the empty run with which a host looks for a stock bench."""
     return bench.run_on is not None and len(bench.starts) == 1
 
 
 def ended(bench: RunawayBench) -> bool:
-    """Once a stock bench, which nobody stops then, has carried out its first recording."""
+    """Return one that misbehaves after a stock bench has finished its first recording."""
     return bench.run_on is None and len(bench.starts) == 3
 
 
 def at_the_end(bench: RunawayBench) -> bool:
-    """After the last recording."""
+    """Return one that misbehaves after the last recording."""
     return bench.is_stopped and len(bench.starts) == 4
 
 
 def assert_over(bench: RunawayBench) -> None:
-    """It misbehaved, was told to stop at once, and was not started again."""
+    """Check that it misbehaved, was stopped at once, and was not started again."""
     assert bench.offence is not None
     assert bench.told is not None
     assert bench.told - bench.offence <= AT_ONCE
@@ -99,7 +99,7 @@ def assert_over(bench: RunawayBench) -> None:
 def session(
     work: Path, bench: RunawayBench, *, notes: Notes | None = None, only: Sequence[str] = ()
 ) -> tuple[list[str], str]:
-    """Acquire; return why the runs ended that were not whole, and what ended the session."""
+    """Acquire; return the reasons of the incomplete runs, and what ended the session."""
     notes, error = notes or Notes(), ""
     everything = [recording.id for recording in plan()]
     try:
@@ -112,7 +112,7 @@ def session(
 @pytest.mark.parametrize("wrong", [before_start, between, at_the_end])
 @pytest.mark.parametrize("commands", [EXTENSIONS, BY_HANDS], ids=["hands", "people"])
 def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, commands):
-    """Before the first run, between two and after the last the line is looked at as well."""
+    """The line is watched before the first run, between two runs and after the last one."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=FULL, commands=commands) as bench:
         partial, error = session(work, bench)
@@ -126,7 +126,7 @@ def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, co
 @pytest.mark.parametrize("duty", [FULL, 3])
 @pytest.mark.parametrize("wrong", [resting, resting_again, running])
 def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, duty):
-    """In a rest, in a run: full duty and a few counts that nothing asked for."""
+    """In a rest or a run: full duty, or a few counts, that nothing asked for."""
     work = write_work(tmp_path, plan())
     with RunawayBench(wrong, duty=duty) as bench:
         (partial,), error = session(work, bench)
@@ -138,7 +138,7 @@ def test_a_motor_that_is_not_driven_as_told_ends_the_session(tmp_path, wrong, du
 
 
 def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
-    """Once the carts were zeroed at rest their travel is watched in every rest."""
+    """Once the carts are zeroed at rest, their travel is watched in every rest."""
     work = write_work(tmp_path, plan())
     with RunawayBench(resting_again, out=FAR) as bench:
         (partial,), _ = session(work, bench)
@@ -147,7 +147,7 @@ def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
 
 
 def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
-    """Where a cart was when the line was opened is no zero: nobody is stopped for that."""
+    """Where a cart was when the line was opened is not its zero, so nothing is stopped."""
     work = write_work(tmp_path, plan())
     with RunawayBench(lambda bench: bench.resets < 3, out=FAR) as bench:
         assert session(work, bench) == ([], "")
@@ -155,10 +155,10 @@ def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
 
 
 def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
-    """After a run that was stopped for its travel the next one waits for them, and is recorded."""
+    """After a run that was stopped for its travel, the next one waits and is recorded."""
     near = PlanLimits(
         input=0.5, travel=70 * PER_COUNT
-    )  # one count for two of duty: 82 of it at most
+    )  # one count for two of duty: at most 82 counts
 
     def swinging(bench: RunawayBench) -> bool:
         return resting_again(bench) and bench.ms - bench_began.setdefault("at", bench.ms) < 50
@@ -174,7 +174,7 @@ def test_carts_that_a_run_took_too_far_may_swing_back(tmp_path):
 
 
 def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
-    """Once a rest is over the cart must be back, or the motor is not started."""
+    """If the cart is still too far out after a rest, the motor is not started."""
     near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
     first, second = plan()
     work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
@@ -185,7 +185,7 @@ def test_a_cart_that_stays_too_far_out_is_not_driven_again(tmp_path):
 
 
 def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
-    """A bench that goes on after its run was stopped is told again, and not started again."""
+    """If a bench goes on after its stop, the stop is sent again and no run is started."""
     near = PlanLimits(input=0.5, travel=70 * PER_COUNT)
     first, second = plan()
     work = write_work(tmp_path, [first.model_copy(update={"amplitude": 0.03}), second], limits=near)
@@ -202,7 +202,7 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])
 def test_a_bench_of_few_lines_is_stopped_as_soon(period):
-    """What lasts is told in ms, not in lines: two of them do where they are far apart."""
+    """Two lines that are far apart suffice: the limit counts milliseconds, not lines."""
     order = make_order(
         plan()[0],
         limits=PlanLimits(input=0.5, travel=2.5),
@@ -218,14 +218,14 @@ def test_a_bench_of_few_lines_is_stopped_as_soon(period):
 
 
 class Pulling(Notes):
-    """A person who pulls a cart out, and is not done before the bench was told to stop."""
+    """A person who pulls a cart out and is not done before the bench is stopped."""
 
     def __init__(self) -> None:
         super().__init__()
         self.bench: RunawayBench | None = None
 
     def confirm(self, instruction: str) -> None:
-        """Take one's time where the cart is to be pulled out."""
+        """Take a long time to pull the cart out."""
         super().confirm(instruction)
         if instruction.startswith("Pull"):
             bench = self.bench
@@ -233,12 +233,12 @@ class Pulling(Notes):
             until(lambda: bench.told is not None, "a stop")
 
     def is_pulling(self, bench: RunawayBench) -> bool:
-        """Tell whether the cart is being pulled out."""
+        """Return whether the cart is being pulled out."""
         return any(instruction.startswith("Pull") for instruction in self.confirmed)
 
 
 def test_a_motor_that_comes_on_while_a_person_is_awaited_is_stopped(tmp_path):
-    """However long somebody holds the cart: the stop does not wait for the Enter key."""
+    """However long somebody holds the cart, the stop does not wait for the Enter key."""
     work, notes = write_work(tmp_path, [decay("decay")]), Pulling()
     with RunawayBench(notes.is_pulling, duty=FULL, commands=BY_HANDS) as notes.bench:
         (partial,), _ = session(work, notes.bench, notes=notes, only=["decay"])
@@ -270,7 +270,7 @@ def test_a_motor_that_comes_on_in_a_decay_by_hand_is_stopped(tmp_path):
 
 
 def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
-    """A line that is opened anew is watched from its first answer on."""
+    """A line that is opened again is watched from its first answer on."""
 
     def mute(bench: RunawayBench) -> bool:
         return bench.resets == 3 and bench.lines > 800  # in the first run
@@ -288,7 +288,7 @@ def test_a_bench_that_misbehaves_after_its_line_was_lost_is_stopped(tmp_path):
 
 @pytest.mark.parametrize("wrong", [resting, running])
 def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
-    """What explores does not choose another experiment for a bench that does as it likes."""
+    """An exploration does not choose another experiment on a bench that misbehaves."""
     with RunawayBench(wrong, duty=FULL) as bench:
         with pytest.raises(HardwareError, match=r"stopped: .*; the exploration ends here"):
             explore_bench(
@@ -304,7 +304,7 @@ def test_an_exploration_ends_where_the_bench_misbehaves(tmp_path, wrong):
 
 @pytest.mark.parametrize("wrong", [tried, resting, running, ended])
 def test_a_stock_bench_that_misbehaves_is_stopped(tmp_path, wrong):
-    """One that answers nothing is watched as well."""
+    """A bench that answers no query is watched as well."""
     scales = f'input = {{ unit = "V", per_count = {0.5 / FULL} }}\n'
     work = write_work(tmp_path, plan(), scales=scales)
     text = (work / "submission.toml").read_text(encoding="utf-8")

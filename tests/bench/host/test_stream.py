@@ -1,4 +1,4 @@
-"""Lines out of lumps: what is kept, what is counted."""
+"""From chunks of bytes to lines: which are kept and which are counted as lost."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from pipeline.bench.protocol.stamps import fit_stamps
 
 
 def clock(n: int, *, period: float, phase: float = 0.3) -> np.ndarray:
-    """Return the stamps (n,) of an odd clock, whole ms."""
+    """Return the stamps (n,) of an uneven clock, in whole ms."""
     return np.floor(period * np.arange(n) + phase).astype(np.int64)
 
 
@@ -32,7 +32,7 @@ def lines(n: int, *, period: float = 1.0024, duty: int = 300) -> list[Reading]:
 
 
 def read(raw: bytes, *, lump: int = 97, **options) -> tuple[list[Reading], Stream]:
-    """Feed bytes in lumps, each as it would come at 115200 baud."""
+    """Feed bytes in chunks, each as it would arrive at 115200 baud."""
     stream = Stream(encoders=2, free=(1, 2), **options)
     got = []
     for start in range(0, len(raw), lump):
@@ -47,7 +47,7 @@ def join(readings) -> bytes:
 
 @given(lump=st.integers(1, 400))
 def test_lumps_of_any_size_give_the_same_lines(lump):
-    """However the bytes are cut into lumps, every line comes out once, in order."""
+    """However the bytes are cut into chunks, every line comes out once, in order."""
     sent = lines(60)
     got, stream = read(join(sent), lump=lump)
     assert got == sent
@@ -56,7 +56,7 @@ def test_lumps_of_any_size_give_the_same_lines(lump):
 
 @given(raw=st.binary(max_size=400), lump=st.integers(1, 50))
 def test_noise_is_never_an_error(raw, lump):
-    """Any bytes whatever are read without an exception, and what comes out has rising stamps."""
+    """Any bytes at all are read without an exception, and the lines have rising stamps."""
     got, stream = read(raw, lump=lump)
     stamps = [reading.ms for reading in got]
     assert stamps == sorted(stamps)
@@ -65,17 +65,17 @@ def test_noise_is_never_an_error(raw, lump):
 
 @pytest.mark.parametrize("period", [1.0, 1.0024, 1.0007, 2.08])
 def test_a_clock_without_losses_is_told_exactly(period):
-    """A whole run lacks no line however odd its clock, and the period comes back."""
+    """However uneven the clock, a whole run lacks no line, and its period is found."""
     fit = fit_stamps(clock(5000, period=period), period=1.0)
     assert fit.missing == 0
-    # A slope through n stamps rounded to 1 ms is good to far better than 1 ms over the run.
+    # A slope through n stamps rounded to 1 ms is accurate to far less than 1 ms over the run.
     assert fit.period == pytest.approx(period, abs=1.0 / 5000)
 
 
 @pytest.mark.parametrize("share", [0.002, 0.01, 0.04])
 @pytest.mark.parametrize("period", [1.0, 1.0024, 2.08])
 def test_lost_lines_are_told_from_the_skips_of_an_odd_clock(period, share):
-    """Of 20 000 lines some are lost at random; as many are missing, though the clock skips too."""
+    """Some of 20 000 lines are lost at random; the count is right although the clock skips too."""
     rng = np.random.default_rng(7)
     stamps = clock(20_000, period=period)
     kept = rng.random(stamps.size) > share
@@ -87,20 +87,20 @@ def test_lost_lines_are_told_from_the_skips_of_an_odd_clock(period, share):
 
 
 def test_a_short_run_counts_by_the_expected_period():
-    """Where 300 stamps cannot tell 1.0024 ms from 1 ms, the period of earlier runs decides."""
+    """300 stamps cannot distinguish 1.0024 ms from 1 ms, so the period of earlier runs decides."""
     stamps = np.delete(clock(300, period=1.0024, phase=0.0), [50, 51, 200])
-    # In 300 lines the clock skips 0.7 times on average: one is taken for its own.
+    # In 300 lines the clock skips 0.7 times on average; one loss may be taken for a skip.
     assert fit_stamps(stamps, period=1.0024).missing == 2
     assert fit_stamps(stamps, period=1.0).missing == 3
 
 
 def test_every_fault_is_counted_and_every_valid_line_kept():
-    """Drops, noise and mergers at once: no line that came whole is lost, each fault counts."""
+    """With drops, noise and merged lines together, whole lines are kept and faults counted."""
     rng = np.random.default_rng(3)
     sent = lines(20_000)
     kind = rng.choice(["whole", "drop", "garble", "merge"], size=20_000, p=[0.97] + 3 * [0.01])
     kind[[0, 1, -2, -1]] = "whole"
-    kind[1:][kind[:-1] == "merge"] = "whole"  # the line behind a merger is hurt enough
+    kind[1:][kind[:-1] == "merge"] = "whole"  # the line behind a merger is damaged enough
     raw, whole = bytearray(), []
     for reading, what, before in zip(sent, kind, ["", *kind[:-1]], strict=True):
         line = format_reading(reading)
@@ -113,7 +113,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
     got, stream = read(bytes(raw), lump=300)
     assert got == whole
     anomalies = stream.anomalies(stream.fit())
-    so_far = stream.anomalies().lost  # told while the run goes on, good to a few a second
+    so_far = stream.anomalies().lost  # reported during the run, accurate to a few a second
     assert abs(so_far - anomalies.lost) <= 3 * 20
     assert anomalies.garbled == np.count_nonzero((kind == "garble") | (kind == "merge"))
     assert abs(anomalies.lost - np.count_nonzero(kind == "drop")) <= 2
@@ -122,7 +122,7 @@ def test_every_fault_is_counted_and_every_valid_line_kept():
 
 @pytest.mark.parametrize("period", [1.0, 1.0004, 1.0024, 1.017, 5.003])
 def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
-    """While a run goes on, the skips of an odd clock are not taken for losses."""
+    """During a run the skips of an uneven clock are not taken for losses."""
     stream = Stream(encoders=2, period=round(period))
     for i in range(10_000):
         reading = Reading(counts=(0, 0), target=0, duty=0, ms=round(i * period))
@@ -136,7 +136,7 @@ def test_no_line_is_said_to_be_lost_of_a_stream_that_is_whole(period):
     ids=["stamp ahead", "stamp behind", "count"],
 )
 def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
-    """A digit too many or too few still parses; between its neighbours it stands out."""
+    """A digit too many or too few can still be parsed, but differs from its neighbours."""
     sent = lines(200)
     texts = [format_reading(reading) for reading in sent]
     struck = texts[120]
@@ -151,7 +151,7 @@ def test_a_line_that_can_be_read_but_cannot_be_is_garbled(field, wrong):
 
 
 def test_a_hard_hit_on_a_stop_is_no_fault():
-    """A cart that bounces off an end stop within one line turns at once; its lines stay."""
+    """A cart that bounces off an end stop turns within one line; its lines are kept."""
     out = [*range(0, 600, 12), *range(600, 0, -12)]
     sent = [Reading(counts=(x, 0), target=0, duty=0, ms=i) for i, x in enumerate(out)]
     got, stream = read(join(sent))
@@ -169,7 +169,7 @@ def test_a_bench_that_begins_again_ends_the_run():
 
 
 def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
-    """A last line of the run before, and a half one, do not count as this run's first."""
+    """A last line, or half a line, of the run before does not count as this run's first."""
     sent = lines(100)
     got, _ = read(b"5:0:0\n" + format_reading(lines(9000)[-1]) + join(sent))
     assert got == sent
@@ -177,7 +177,10 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
-    """A controller at rest kicks for one line as an encoder flickers; in open loop none does."""
+    """At rest a controller kicks for one line when an encoder flickers;
+
+    in open loop nothing does.
+    """
     sent = lines(100, period=1.0)
     sent[50] = Reading(counts=sent[50].counts, target=0, duty=120, ms=sent[50].ms)
     sent[49:52:2] = [
@@ -188,7 +191,7 @@ def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
 
 
 def test_late_lines_are_counted_and_kept():
-    """Lines held back for 60 ms and sent in a lump are late as long as 20 ms of it are left."""
+    """Lines held back for 60 ms and sent together are late while 20 ms of the delay are left."""
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)
     got = []
@@ -199,11 +202,14 @@ def test_late_lines_are_counted_and_kept():
     assert stream.anomalies().late in (
         40,
         41,
-    )  # stamps 500 … 539; the next is 20 ms late, but for rounding
+    )  # stamps 500 … 539; the next is 20 ms late, except for rounding
 
 
 def test_a_host_that_was_busy_makes_no_line_late():
-    """Lines that waited because nobody looked are not late: the port was last seen empty before."""
+    """Lines that waited because the host was busy are not late:
+
+    its last look found the port empty.
+    """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)
     for start in range(0, 1000, 100):  # a look every 100 ms
@@ -213,7 +219,7 @@ def test_a_host_that_was_busy_makes_no_line_late():
 
 @pytest.mark.parametrize("since", [0, 2500])
 def test_an_encoder_that_stands_still_is_noticed(since):
-    """Encoder 2 stands still from a time on, or from the start, while the motor drives on."""
+    """An encoder that stops, or never moves, while the motor drives is noticed."""
     sent = [
         Reading(counts=(r.counts[0], r.counts[1] if r.ms < since else 77), target=r.target,
                 duty=r.duty, ms=r.ms)
@@ -224,7 +230,7 @@ def test_an_encoder_that_stands_still_is_noticed(since):
 
 
 def test_a_cart_that_rests_after_a_step_is_not_stuck():
-    """Under a constant input a cart comes to rest: that is no fault of its encoder."""
+    """Under a constant input a cart comes to rest; its encoder is not faulty."""
     sent = [
         Reading(counts=(min(i, 300), 0), target=200, duty=200, ms=i) for i in range(4000)
     ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Stop, Skip, Keep and Repeat: a person presses, the acquiring process decides."""
+"""Stop, Skip, Keep and Repeat: a person presses; the acquiring process decides."""
 
 import threading
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ NEAR = PlanLimits(input=0.5, travel=0.1)  # cm: a dwell of 0.01 V passes it with
 
 
 class Finger(Notes):
-    """Presses buttons once half a second of a recording has come, or once its run has ended."""
+    """Presses buttons half a second into a recording, or when its run has ended."""
 
     def __init__(self, *wishes: Wish, at_end: bool = False) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ def record(work: Path, port: str, finger: Finger, *only: str) -> list[RunOutcome
 
 @pytest.mark.parametrize("before", [(), ("skip",), ("keep",), ("repeat",)])
 def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real):
-    """The bench is told to stop; what came is partial; nothing more is recorded."""
+    """The bench is stopped; the data so far are partial; nothing more is recorded."""
     work = write_work(tmp_path, [sine("long", seconds=30), sine("next", seconds=1)])
     finger = Finger(*before, "stop")
     with pytest.raises(Stopped):
@@ -79,11 +79,11 @@ def test_stop_ends_the_session_whatever_else_was_pressed(tmp_path, before, real)
 
 
 def test_skip_goes_on_with_the_next(tmp_path, fast):
-    """The run ends and is kept beside the data; nobody is asked about it again."""
+    """The run ends, its data are kept apart, and nobody is asked about it again."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     finger = Finger("skip", "repeat")
     outcomes = record(work, fast.address, finger, "long", "next")
-    assert finger.heeded == [True, False]  # one decision a turn
+    assert finger.heeded == [True, False]  # one decision for each request
     assert (outcomes[0].recording.id, outcomes[0].partial) == ("long", "skipped by hand")
     assert [e.id for e in load_submission(work).experiments] == ["next"]
     assert (work / "data" / "long.partial.txt").exists()
@@ -91,7 +91,7 @@ def test_skip_goes_on_with_the_next(tmp_path, fast):
 
 
 def test_keep_takes_what_came_and_says_so(tmp_path, fast):
-    """The record holds every line up to then, and its table says how it ended."""
+    """The record holds every line so far, and its table says how it ended."""
     work = write_work(tmp_path, [sine("long", seconds=300), sine("next", seconds=1)])
     outcomes = record(work, fast.address, Finger("keep"), "long", "next")
     assert [(o.recording.id, bool(o.partial)) for o in outcomes[:2]] == [
@@ -107,7 +107,7 @@ def test_keep_takes_what_came_and_says_so(tmp_path, fast):
 
 
 def test_repeat_begins_the_run_again(tmp_path, fast):
-    """The first try counts for nothing, the second is the record; nobody is asked."""
+    """The first try does not count; the second is the record; nobody is asked."""
     work = write_work(tmp_path, [sine("dwell", seconds=20)])
     finger = Finger("repeat")
     outcomes = record(work, fast.address, finger, "dwell")
@@ -118,7 +118,7 @@ def test_repeat_begins_the_run_again(tmp_path, fast):
 
 
 def test_what_passed_a_limit_is_neither_repeated_nor_kept(tmp_path, real):
-    """The limit decides, whatever is pressed."""
+    """A limit decides, whatever is pressed."""
     for wish in ("repeat", "keep"):
         work = write_work(tmp_path / wish, [sine("dwell", seconds=4)], limits=NEAR)
         finger = Finger(wish, at_end=True)
@@ -162,7 +162,7 @@ def test_what_broke_off_is_kept_when_asked_about(tmp_path):
 
 @pytest.mark.parametrize("wish", ["stop", "skip"])
 def test_a_run_that_waits_for_hands_need_not_begin(tmp_path, wish):
-    """Asked to free the carts, a person presses a button instead: nothing is sent to the motor."""
+    """A person who should free the carts presses a button instead; the motor gets no command."""
     scale = 'input = { unit = "V", per_count = 0.001220703125 }\n'
     work = write_work(tmp_path, [sine("dwell", seconds=2, settle=0.3)], scales=scale)
     text = (work / "submission.toml").read_text(encoding="utf-8")

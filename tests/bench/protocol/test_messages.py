@@ -1,4 +1,4 @@
-"""What host and bench say to each other comes across, and noise on the line stays noise."""
+"""Messages between host and bench arrive unchanged, and noise is never taken for a message."""
 
 import pytest
 from hypothesis import example, given
@@ -61,7 +61,7 @@ def read(data: bytes, **options) -> list[Command]:
 
 @given(st.lists(commands, max_size=6), st.integers(1, 7))
 def test_commands_come_across(sent, chunk):
-    """Whatever is encoded is read again, in order, however the bytes are cut into pieces."""
+    """Every encoded command is read back, in order, however the bytes are cut into pieces."""
     data = b"".join(map(encode, sent))
     reader = CommandReader(encoders=ENCODERS)
     got = []
@@ -73,7 +73,7 @@ def test_commands_come_across(sent, chunk):
 
 @given(st.binary(max_size=80), st.integers(1, 9))
 def test_the_pieces_do_not_matter_for_noise_either(data, chunk):
-    """Noise gives the same commands and the same count of rejects in any pieces."""
+    """Noise gives the same commands and the same number of rejects in any pieces."""
     whole, pieces = CommandReader(encoders=ENCODERS), CommandReader(encoders=ENCODERS)
     expected = whole.feed(data)
     got = [c for at in range(0, len(data), chunk) for c in pieces.feed(data[at : at + chunk])]
@@ -96,10 +96,10 @@ def garbled(draw):
 @example(b"d;q")
 @example(b"0" * 40)
 def test_nothing_swallows_a_stop_or_a_reset(data):
-    """After any noise the last thing a bench hears of a stop or a reset is it."""
+    """After any noise, the last stop or reset sent is the last thing a bench hears."""
     assert read(data + b"z;")[-1] is Signal.RESET
     assert read(data + encode(Signal.STOP))[-1] is Signal.STOP
-    # A bare stop may look like the wave of a start cut short, until the next heartbeat.
+    # A lone stop may look like the wave of a truncated start, until the next heartbeat.
     heard = read(data + b"s;k;")
     last_start = max((i for i, c in enumerate(heard) if isinstance(c, Start)), default=-1)
     assert Signal.STOP in heard[last_start + 1 :]
@@ -107,7 +107,7 @@ def test_nothing_swallows_a_stop_or_a_reset(data):
 
 @given(garbled())
 def test_a_bench_without_extensions_is_reset_all_the_same(data):
-    """A stock bench hears what stops it, whatever came before."""
+    """A stock bench obeys a stop, whatever came before."""
     stock = read(data + b"".join(map(encode, STOCK_STOP)), extensions=())
     assert stock[-1] is Signal.RESET
 
@@ -127,18 +127,18 @@ def test_a_bench_without_extensions_is_reset_all_the_same(data):
         b"g;1;2;1e10;",
         b"h;4;0;",  # there are two carts
         b"h;1;3;",
-        b"f;1;2;3;4;",  # one short, and no more comes
+        b"f;1;2;3;4;",  # one too few, and no more comes
         b"x;;0;",
         b"d;q;o;o;0.00000000000000000000000000000001;100;1;",  # too long
     ],
 )
 def test_what_is_no_command_does_nothing(data):
-    """Fields that are missing, out of range or of another kind start nothing."""
+    """Fields that are missing, out of range or of the wrong kind start nothing."""
     assert read(data) == []
 
 
 def test_a_stock_bench_knows_three_commands():
-    """The letters and fields of the extensions are dropped, and the chirp is no wave."""
+    """A stock bench drops the letters and fields of the extensions, and has no chirp."""
     data = b"?;s;k;f;1;2;3;4;5;c;20;h;1;0;d;c;o;o;1;100;1;"
     assert read(data, extensions=()) == []
     known = [Start(wave=Wave.SINE, frequency=1.0, amplitude=5), PidGains(kp=1, ki=0, kd=0)]
@@ -157,14 +157,14 @@ readings = st.builds(
 
 @given(readings)
 def test_lines_come_across(reading):
-    """A line is read as it was meant, and with its end or without."""
+    """A line is read as it was meant, with or without its end."""
     line = format_reading(reading)
     assert parse_reading(line) == parse_reading(line.rstrip()) == reading
 
 
 @given(readings, readings, st.integers(0, 255), st.data())
 def test_spoiled_lines_are_no_readings(first, second, byte, data):
-    """Two lines in one, or a byte that no line has, are told from a reading."""
+    """Two lines in one, or a byte that no line has, are not taken for a reading."""
     merged = format_reading(first)[:-1] + format_reading(second)
     assert parse_reading(merged) is None
     line = format_reading(first)
@@ -191,7 +191,10 @@ descriptions = st.builds(
 
 @given(descriptions)
 def test_descriptions_come_across(bench):
-    """What a bench answers to a query is read as it was meant, entries added later passed over."""
+    """The answer to a query is read as it was meant;
+
+    entries added in later versions are ignored.
+    """
     line = format_description(bench)
     assert parse_description(line) == bench
     assert parse_description(line.rstrip() + b" colour=red\n") == bench
@@ -211,6 +214,6 @@ def test_descriptions_come_across(bench):
     ],
 )
 def test_another_answer_is_refused(line, message):
-    """What is no description, or one that lacks something, is one clear message."""
+    """Text that is not a description, or one that lacks a field, gives one clear message."""
     with pytest.raises(DataError, match=message):
         parse_description(line)
