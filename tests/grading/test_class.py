@@ -1,4 +1,4 @@
-"""Teams and classes that once were judged wrongly, on benches all over what a lab may have."""
+"""Teams and classes that were once judged wrongly, on benches of every kind."""
 
 import tempfile
 from dataclasses import replace
@@ -21,7 +21,7 @@ from pipeline.submission import load_submission
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import SLIPS, scaled
 
-# Of those that once went wrong one of each kind runs by default, the others with the sample.
+# One of each kind of case that once went wrong runs by default, the others with the sample.
 LONG = [pytest.mark.slow, pytest.mark.sample]
 TIED = Chain(
     m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
@@ -36,14 +36,14 @@ def flags(team: Team) -> list[str]:
     "seed", [30, *(pytest.param(seed, marks=LONG) for seed in (5, 90, 60023, 60066))]
 )
 def test_little_damping_accuses_nobody(seed):
-    """Where dwells put a damping at zero, or dry friction has a share in it, nobody is wrong."""
+    """If dwells put a damping at zero, or dry friction is part of it, nobody is wrong."""
     team = make_team(seed)
     assert team.bench.chain.zeta_carts.max() < 0.02
     assert flags(team) == []
 
 
 def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
-    """A fit that ends at its bound has measured nothing; a damping ten times too large is."""
+    """A fit at its bound has measured nothing; a damping ten times too large is found by decays."""
     team = make_team(30)
     assert team.analysis.chain is not None
     wrong = team.reporting(final={"zeta": Decimal("0.031")}).grade()
@@ -53,7 +53,7 @@ def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
 
 @pytest.mark.parametrize("seed", [18, *(pytest.param(seed, marks=LONG) for seed in (34, 38))])
 def test_coarse_encoders_cost_no_points(seed):
-    """Steps of a few counts, and dwells whose points miss the carts that their records follow."""
+    """Steps of a few counts, and dwells off the carts that the records follow."""
     team = make_team(seed, count=0.2, travel=1.0, friction=0.0)
     grade = team.grade()
     assert [flag.code for flag in grade.flags] == []
@@ -63,7 +63,7 @@ def test_coarse_encoders_cost_no_points(seed):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
-    """What is left of a table once a negative gain is out implies no carts."""
+    """Without its negative gain the table does not determine any carts."""
     team = make_team(2)
     table = {x: float(v) for x, v in team.reported.final.items()}
     assert own_chain(table, n=3) is not None
@@ -75,7 +75,7 @@ def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
 
 @pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
 def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
-    """Couplings are differences of large numbers: rounding alone moves them by a third."""
+    """Couplings are differences of large numbers: rounding alone changes them by a third."""
     team = make_team(seed, digits=digits)
     assert [f for f in flags(team) if f.startswith("wrong_state_space")] == []
 
@@ -97,7 +97,7 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
     ],
 )
 def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
-    """Two mistakes in one number, a vague one beside sharp ones, a chance meeting of one."""
+    """Two mistakes in one number, a vague number beside sharp ones, one that fits by chance."""
     team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
     for slip in slips:
         team = SLIPS[slip](team)
@@ -112,7 +112,7 @@ def test_a_gain_that_two_mistakes_make_is_told_with_both():
 
 
 def tied(seed: int) -> tuple[Team, Grade]:
-    """Return a team of two carts tied to both walls, graded by a rubric without the near spring."""
+    """Return a team of two carts with both wall springs; its rubric lacks the near spring."""
     with tempfile.TemporaryDirectory() as folder:
         team = make_team(seed, folder=Path(folder), digits=3, chain=TIED)
         rubric = load_rubric(Path("throne-2dof"))
@@ -125,7 +125,7 @@ def tied(seed: int) -> tuple[Team, Grade]:
 
 
 def test_springs_that_the_rubric_does_not_have_accuse_nobody():
-    """What the rubric's springs leave unexplained and others explain is judged with those."""
+    """If the rubric's springs leave an error that others remove, those are used to judge."""
     team, grade = tied(1)
     assert grade.springs == ("wall-1",)
     assert [flag.code for flag in grade.flags] == []
@@ -137,7 +137,7 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
 
 
 def test_a_decay_with_friction_is_no_wrong_logarithm(tmp_path):
-    """Any ratio fits a reference so wide; the team's own final value says that it is not that."""
+    """Any ratio fits a reference so wide; the team's own final value contradicts it."""
     bench = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:cart=1,force=0.003",))
     write_submission(tmp_path / "team", bench, seed=3, reported=True)
     submission = load_submission(tmp_path / "team")

@@ -1,4 +1,4 @@
-"""The commands for what comes after grading, as they are typed."""
+"""The commands that follow grading, as they are typed."""
 
 import csv
 import io
@@ -46,7 +46,7 @@ def points_of(folder: Path, team: str) -> float:
 
 
 def test_an_override_reaches_the_pages_at_once(run, tmp_path):
-    """And is taken back by `auto`; history tells both."""
+    """`auto` takes it back; history lists both."""
     grades = write_class(tmp_path)
     before = points_of(grades, "team-03")
 
@@ -70,7 +70,7 @@ def test_an_override_reaches_the_pages_at_once(run, tmp_path):
 
 
 def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
-    """Who grades without names need not look one up, and is not told one."""
+    """A TA who grades without names need not look one up, and sees none."""
     grades = write_class(tmp_path, anonymous=True)
     with (grades / "anonymous-key.csv").open(newline="", encoding="utf-8") as file:
         names = {row["submission"]: row["anonymous"] for row in csv.DictReader(file)}
@@ -88,7 +88,7 @@ def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
 
 
 def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
-    """Who removes a submission reads whose points by hand go with it."""
+    """A message lists the points by hand that go with a removed submission."""
     grades = write_class(tmp_path)
     status, _, err = run("remove", grades, "team-02", "s2")
     assert status == 0
@@ -100,7 +100,7 @@ def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
 
 
 def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
-    """Control characters of an author's id are blanks on the terminal."""
+    """Control characters of an author's id become blanks on the terminal."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("eve\r\x1b[2Kbob",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -109,13 +109,13 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
         book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
     status, _, err = run("export", tmp_path, "--lms", "canvas")
     assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
-    assert status == 1  # who has points has none in the table
+    assert status == 1  # an author with points has none in the table
 
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("listed", [False, True])
 def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms, listed):
-    """Left out of the platform's own table or of ours: the exit status is 1, and why is said."""
+    """A table of the platform or of ours leaves them out: exit status 1, with the reason."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("s1",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -137,7 +137,7 @@ def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms,
 
 
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
-    """What it has no letter for is shown by its number; the JSON stays valid."""
+    """A letter it cannot show is written as its number; the JSON stays valid."""
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="cp1252"))
     monkeypatch.setattr(
@@ -152,7 +152,7 @@ def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
-    """Or where it is told to; what a person must know is said."""
+    """Or in the folder given; messages go to the terminal."""
     status, out, err = run("export", grades, "--lms", lms)
     assert (status, out) == (0, "")
     assert f"wrote {grades / lms}.csv" in err
@@ -163,7 +163,7 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
-    """`--out gs.csv` is the table, and nothing else; another file's name is refused."""
+    """`--out gs.csv` is the table and nothing else; another file's ending is refused."""
     folder = tmp_path / "exported"
     status, _, err = run("export", grades, "--lms", lms, "--out", folder / "gs.csv")
     assert status == 0
@@ -177,7 +177,7 @@ def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
 
 
 def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
-    """Where the platform's table has no row for a team that has points: exit status 1."""
+    """If the platform's table lacks a row for a team with points: exit status 1."""
     roster = tmp_path / "roster.csv"
     roster.write_text("Student,ID,SIS User ID,Section\nDoe,7,nobody-here,A\n", encoding="utf-8")
     status, _, err = run("export", grades, "--lms", "canvas", "--roster", roster)
@@ -186,7 +186,7 @@ def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
 
 
 def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
-    """The rubric may be another lab's, and is asked about; lateness is known all the same."""
+    """The message asks whether the rubric is another lab's; lateness is known all the same."""
     for name in ("team-1", "team-2"):
         (tmp_path / "c" / name).mkdir(parents=True)
         (tmp_path / "c" / name / "submission.toml").write_text(
@@ -216,7 +216,7 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
 
 
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
-    """Neither while it works, nor in reasons, remarks or changes since the class list before."""
+    """Neither while it works, nor in reasons, warnings or changes of the class list."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)
     names = ["doe-jane", "roe-richard", "poe-anna", "moe-max"]
     toml = 'version = 1\n[[authors]]\nid = "{name}"\n[system]\ncarts = {carts}\n'
@@ -250,7 +250,7 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
-    """Whatever the umask: the folder, the gradebook with its journal, the key; an older one too."""
+    """Whatever the umask: the folder, the gradebook with its journal, the key; old ones too."""
     (tmp_path / "c" / "team-1").mkdir(parents=True)
     (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
     out = tmp_path / "new" / "out"
@@ -283,7 +283,7 @@ def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
 
 
 def test_a_survey_is_told_on_stdout(run, tmp_path):
-    """As Markdown or JSON; columns that are left out on stderr."""
+    """As Markdown or JSON; columns that are left out are named on stderr."""
     file = write_paper(tmp_path / "answers.csv")
     status, out, err = run("survey", file)
     assert status == 0

@@ -1,4 +1,4 @@
-"""What makes a hand-in be graded, or compared, again: all that its outcome depends on."""
+"""Reasons to grade or compare a submission again: everything that its outcome depends on."""
 
 import shutil
 import sys
@@ -25,7 +25,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory):
-    """Two teams, one of which has the other's step."""
+    """Two teams, one of them with the other's step."""
     folder = tmp_path_factory.mktemp("class")
     for number in (0, 2):
         write_submission(
@@ -47,7 +47,7 @@ def task(school):
 
 
 def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
-    """A mended grader, or library, is to have its try; the traceback is kept for who mends it."""
+    """A corrected grader or library gets another try; the traceback is kept for the developer."""
     broken = RUBRIC.model_copy(update={"system": None})  # as no rubric can be
     outcome = grade_task(task, rubric=broken, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
@@ -61,7 +61,7 @@ def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
      ("version = 1", "version = 1,0"), ('id = "s0"', "id = s0  # me"), ('"s0"', "“s0”")],
 )  # fmt: skip
 def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
-    """Points given by hand are to reach who handed it in."""
+    """Points given by hand still reach the authors."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     file = own / "submission.toml"
     text = file.read_text(encoding="utf-8")
@@ -73,7 +73,7 @@ def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
 
 
 def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
-    """A file that is written between the hash and the copy ends in another try, not in a grade."""
+    """A file written between the hash and the copy leads to a retry, not to a grade."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     if sys.platform == "linux":  # elsewhere no file is called so
         (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")
@@ -89,7 +89,7 @@ def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, 
 
 
 def test_the_version_covers_what_it_computes_with(monkeypatch):
-    """Another numpy or scipy is another version, and so grades anew."""
+    """With another numpy or scipy the version differs, so everything is graded again."""
     before = code_version()
     assert code_version() == before
     for name in ("numpy", "scipy"):
@@ -102,7 +102,7 @@ def test_the_version_covers_what_it_computes_with(monkeypatch):
 
 
 def test_what_was_handed_out_is_no_copy(school, tmp_path):
-    """A recording that everybody was given may stand in two submissions."""
+    """A recording that everybody was given may be in two submissions."""
     given = fingerprint(read_data(load_submission(school / "team-0")).records)
     shared = []
     for examples in ((), (given,)):

@@ -1,4 +1,4 @@
-"""Honest students of a real bench: an ECP 210 with dry friction whose motor pulls backwards."""
+"""Honest students on a real bench: an ECP 210 with dry friction and a reversed motor sign."""
 
 import math
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Bench:
     def flags(
         self, *, initial: dict, final: dict, space: ReportedStateSpace | None = None
     ) -> list[str]:
-        """Grade what is reported; return the flags but for what was not handed in."""
+        """Grade a report; return the flags except for missing parts."""
         reported = Reported(initial=initial, final=final, state_space=space)
         submission = self.submission.model_copy(update={"reported": reported})
         rubric = load_rubric(Path("ucsd-mae171a"))
@@ -46,7 +46,7 @@ def bench(real_data, tmp_path_factory):
 
 
 def viscous_fit() -> Chain:
-    """Return what a simulation matched to the two-cart steps gives, friction left out."""
+    """Return the parameters of a simulation matched to the two-cart steps, without friction."""
     m, k = np.array([5.5e-6, 3.7e-6]), np.array([1.79e-3, 1.03e-3, 0.0])
     return Chain(m=m, c=2 * np.array([0.15 * 22.6, 0.074 * 16.6]) * m, k=k)
 
@@ -58,7 +58,7 @@ def first_estimates(bench: Bench) -> dict[str, Decimal]:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("digits", [2, 3])
 def test_textbook_numbers_get_no_flag(bench, sign, digits):
-    """Levels, periods, decrements and a viscous fit, in either sign, to two or three digits."""
+    """Levels, periods, decrements and a viscous fit, with either sign, to two or three digits."""
 
     def written(name: str, value: float) -> Decimal:
         value = sign * float(value) if name.startswith("K") else float(value)
@@ -76,7 +76,7 @@ def test_textbook_numbers_get_no_flag(bench, sign, digits):
 
 
 def test_a_student_of_every_single_repeat_is_honest(bench):
-    """Who quotes one run for the damping of a cart, whichever it is, is not accused."""
+    """A student may take any single run for the damping of a cart."""
     first = first_estimates(bench)
     for record in bench.analysis.records:
         if record.kind in ("decay", "step") and len(record.free) == 1:

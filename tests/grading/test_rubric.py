@@ -1,4 +1,4 @@
-"""Rubrics: those shipped are valid; every mistake in one is named with its line."""
+"""The shipped rubrics are valid; every mistake in a rubric is named with its line."""
 
 import json
 from pathlib import Path
@@ -124,7 +124,7 @@ def test_a_pattern_is_written_out(tmp_path):
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
-    """An author is told file, line, key, and what was expected or is near."""
+    """The message has file, line, key, and the expected value or the nearest key."""
     assert old in GOOD
     path = write(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(ConfigError, match=rf"lab\.toml line {line}: .*{what}"):
@@ -142,7 +142,7 @@ def test_every_mistake_has_its_own_line(tmp_path):
 
 
 def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
-    """No TOML, a check, a value, a key, and what tables say of one another: all at once."""
+    """A line that is not TOML, a check, a value, a key, two tables that disagree: all at once."""
     text = GOOD.replace("version = 1", "vresion = 1").replace("points = 2", "points = two")
     text = text.replace('kind = "step"', "kind = stpe").replace('unit = "V"', 'unti = "V"')
     text = text.replace('check = "state_space"', 'chek = "state_spaec"\nfull_percent = 30')
@@ -155,7 +155,7 @@ def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
 
 
 def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
-    """What stands under a heading that is none is not missing, and a criterion is still one."""
+    """Keys under a broken heading are not missing, and a criterion stays a criterion."""
     text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
     with pytest.raises(ConfigError) as caught:
         load_rubric(write(tmp_path, text))
@@ -177,12 +177,12 @@ def test_a_rubric_that_is_not_there_names_the_shipped_ones():
 
 
 def test_every_remark_has_its_cost():
-    """Each code may be given a cost, but for the one that a person decides."""
+    """Each code may have a cost, except the one that a person decides."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
     assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
 
 
 def test_toml_that_is_none_says_where(tmp_path):
-    """A syntax error keeps the line that the parser gives."""
+    """A syntax error keeps the line given by the parser."""
     with pytest.raises(ConfigError, match=r"line 2: nothing stands after the =; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

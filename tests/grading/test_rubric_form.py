@@ -1,4 +1,4 @@
-"""A rubric's numbers as a form: what is written back changes nothing else."""
+"""A rubric's numbers as a form: saving them changes nothing else."""
 
 import re
 import tomllib
@@ -38,7 +38,7 @@ def _comments(text: str) -> list[str]:
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_a_form_keeps_comments_and_order(data):
-    """Any fields changed: the file says the new values, and every other line is as it was."""
+    """The file has the new values, and every other line is as it was."""
     text = SHIPPED[data.draw(st.sampled_from(sorted(SHIPPED)))]
     form = rubric_form(parse_rubric(text, where=""))
     fields = data.draw(st.lists(st.sampled_from(list(form.fields())), min_size=1, max_size=6))
@@ -71,7 +71,7 @@ def _without_numbers(text: str) -> list[str]:
 
 
 def test_nothing_changed_is_the_same_text():
-    """Values sent back as they were shown, or with zeros that say nothing, change no byte."""
+    """Values sent back as shown, or with extra zeros, change no byte."""
     for text in SHIPPED.values():
         form = rubric_form(parse_rubric(text, where=""))
         shown = {field.name: field.value for field in form.fields()}
@@ -83,7 +83,7 @@ def test_nothing_changed_is_the_same_text():
 
 
 def test_late_work_at_half_and_a_point_for_hertz():
-    """One digit in a line with its comment; one line more in a table that is there."""
+    """One digit in a line with its comment; one new line in an existing table."""
     text = SHIPPED["throne-1dof"]
     late = typed_into(text, late__percent_per_day="50")
     assert late == text.replace("percent_per_day = 10", "percent_per_day = 50")
@@ -95,7 +95,7 @@ def test_late_work_at_half_and_a_point_for_hertz():
 
 
 def test_a_table_that_is_not_there_is_made_before_the_criteria():
-    """And not within a criterion, nor between one and the comment above it."""
+    """Not within a criterion, nor between one and the comment above it."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
     bare = f"{text[:start]}# what is judged\n{text[end:]}"
@@ -106,7 +106,7 @@ def test_a_table_that_is_not_there_is_made_before_the_criteria():
 
 
 def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
-    """An inline table is not taken apart."""
+    """An inline table is not changed by the form."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
     inline = "late = { percent_per_day = 10 }\n" + text[:start] + text[end:]

@@ -1,4 +1,4 @@
-"""The same batch on a real Dask cluster on this machine, one worker of which is killed."""
+"""The same batch on a real Dask cluster on this machine, with one worker killed."""
 
 import os
 import socket
@@ -21,7 +21,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 
 def _dask(*arguments):
-    """Start a part of a cluster, without a page of its own and its own supervisor."""
+    """Start a part of a cluster without its dashboard and supervisor."""
     return subprocess.Popen(
         [sys.executable, "-m", *map(str, arguments), "--no-dashboard"],
         stdout=subprocess.DEVNULL,
@@ -72,7 +72,7 @@ def grade(folder, out, execute, progress=lambda *_: None):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp_path):
-    """Hand-ins travel to two workers; one is killed in the middle, and no row is another."""
+    """Submissions travel to two workers; one worker is killed midway, and no row differs."""
     address, workers = cluster
     for number in range(5):
         write_submission(
@@ -100,7 +100,7 @@ def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp
 
 
 def test_an_address_that_is_no_schedulers_is_refused():
-    """Only a scheduler's address will do, and only an encrypted one beyond this machine."""
+    """Only a scheduler's address is accepted, and beyond this machine only an encrypted one."""
     with pytest.raises(ConfigError, match="expected a scheduler's address"):
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):
@@ -110,10 +110,10 @@ def test_an_address_that_is_no_schedulers_is_refused():
 
 
 def test_nobody_there_is_said(monkeypatch):
-    """Where no scheduler listens the batch does not begin."""
+    """If no scheduler listens, the batch does not begin."""
     monkeypatch.setattr("pipeline.grading.batch.cluster._CONNECT_LIMIT", 1)
     setup = Setup(rubric=RUBRIC, scratch=Path())
-    with socket.socket() as bound:  # a port that answers nobody
+    with socket.socket() as bound:  # a port that nobody answers
         bound.bind(("127.0.0.1", 0))
         execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
         with pytest.raises(ConfigError, match="no scheduler answers"):

@@ -1,4 +1,4 @@
-"""What this computer fails at costs nobody a grade: the next run tries again."""
+"""A fault of the computer costs nobody a grade: the next run tries again."""
 
 import io
 import json
@@ -21,12 +21,12 @@ from tests.helpers.places import ROOT
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
-_MEMBER = 3_000_000  # bytes of a file that packs to a tenth
+_MEMBER = 3_000_000  # bytes of a file that compresses to a tenth
 
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """Two teams with a step in common, of which each zip is small and what is in it is not."""
+    """Return two teams with a step in common; each zip is small, its content large."""
     folder = tmp_path_factory.mktemp("teams")
     for number in (0, 2):
         write_submission(
@@ -55,7 +55,7 @@ def zips(teams, tmp_path_factory) -> Path:
 
 @contextmanager
 def small_disk(at: Path, *, size: str) -> Iterator[None]:
-    """Have a disk of that size at a folder; skip where nobody may make one."""
+    """Mount a disk of that size at a folder; skip where that is not permitted."""
     at.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(at)]
     if shutil.which("mount") is None or subprocess.run(words, check=False).returncode:
@@ -75,7 +75,7 @@ def grade(zips: Path, out: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a small disk is made of memory")
 def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
-    """The run says that there is no room, not that the rubric is wrong; the next one grades all."""
+    """The message names the lack of space, not the rubric; the next run grades everybody."""
     disk = tmp_path / "disk"
     with small_disk(disk, size="1200k"):
         full = grade(zips, disk / "out")
@@ -95,7 +95,7 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
 
 
 def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
-    """A file where a folder should be, and a name too long, are refused: trying again is no use."""
+    """A file in place of a folder, or a name too long, is refused for good: a retry cannot help."""
     archive = tmp_path / "odd.zip"
     with zipfile.ZipFile(archive, "w") as packed:
         packed.writestr("a", "a file")
@@ -131,7 +131,10 @@ print(json.dumps(told))
 
 
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
-    """Grade without a limit, then with each: settled, without room, why not, the grade."""
+    """Grade without a limit, then with each;
+
+    return whether settled, short of space, reason and grade.
+    """
     scratch.mkdir()
     words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]
     done = subprocess.run(
@@ -142,7 +145,7 @@ def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
 
 @POSIX
 def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
-    """A limit on the size of files is met while a zip is unpacked, or a folder is copied."""
+    """The limit on file size is met while a zip is unpacked or a folder is copied."""
     for number, source in enumerate((zips / "team-0.zip", teams / "team-0")):
         size = range(_MEMBER // 2, _MEMBER // 2 + 1)
         _, (settled, no_room, why, _) = starved(
@@ -155,16 +158,16 @@ def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
 def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
-    """However early files run out: the grade is the same, or there is none yet."""
+    """However early the files run out: the grade is the same, or there is none yet."""
     source = zips / "team-0.zip" if packed else teams / "team-0"
-    few = range(3, 12)  # open as it begins are three, and a few of the libraries'
+    few = range(3, 12)  # open at the start are three, and a few of the libraries'
     (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
     assert any(not settled for settled, *_ in others)
     assert {grade for settled, _, _, grade in others if settled} <= {whole}
 
 
 def test_the_faults_of_a_decoder_are_the_archives(tmp_path):
-    """An error without a number comes from what is read, so the archive is refused for good."""
+    """An error without a number comes from the content, so the archive is refused for good."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_BZIP2) as packed:
         packed.writestr("submission.toml", "version = 1\n" * 1000)

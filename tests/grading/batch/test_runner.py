@@ -1,4 +1,4 @@
-"""The batch: one row each whatever happens, the same in any order, nothing done twice."""
+"""The batch: one row for every submission, in any order, and nothing done twice."""
 
 import json
 import random
@@ -31,7 +31,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory):
-    """A small class: three teams, one of which has another's step, and a broken hand-in."""
+    """A small class: three teams, one of them with another's step, and a broken submission."""
     folder = tmp_path_factory.mktemp("class")
     for number in range(3):
         write_submission(
@@ -50,7 +50,7 @@ def school(tmp_path_factory):
 
 
 def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambda *_: None):
-    """Grade into a gradebook of our own; return the batch, and outcomes and grades by id."""
+    """Grade into a new gradebook; return the batch, and outcomes and grades by id."""
     scratch = out / "scratch"
     scratch.mkdir(parents=True, exist_ok=True)
     with Gradebook(out, create=True) as book:
@@ -73,14 +73,14 @@ def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambd
 
 @pytest.fixture(scope="module")
 def graded(school, tmp_path_factory):
-    """The class graded by two processes: the folder, the batch, the rows, and what was said."""
+    """The class graded by two processes: folder, batch, rows and messages."""
     out, seen = tmp_path_factory.mktemp("graded"), []
     batch, rows = run([school], out, jobs=2, progress=lambda *what: seen.append(what[0]))
     return out, batch, rows, seen
 
 
 def test_a_class_is_graded_and_sharing_is_flagged(graded):
-    """Every hand-in has a row in the order of ids; the copied step is flagged on both sides."""
+    """Every submission has a row in the order of ids; the copied step is flagged on both sides."""
     _, batch, rows, seen = graded
     assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
     assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
@@ -93,14 +93,17 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
 
 
 def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
-    """In one process, one after another, come the rows that two at once gave, in any order."""
+    """One process gives the same rows as two, in any order."""
     _, _, rows, _ = graded
     _, alone = run([school], tmp_path, execute=in_this_process)
     assert alone == rows
 
 
 def test_only_what_changed_is_graded_again(school, graded, tmp_path):
-    """A second run starts no process; a changed file costs its own submission only."""
+    """A second run starts no process;
+
+    a changed file causes only its own submission to be graded.
+    """
 
     def nobody(tasks, setup):
         raise AssertionError([task.id for task in tasks])
@@ -127,7 +130,7 @@ def setup(tmp_path):
 
 @pytest.fixture
 def kill_next(monkeypatch):
-    """Return what has the next process that is sent a line killed as it gets it."""
+    """Return a function that kills the next process when it gets a task."""
     send, doomed = LineProcess.send, []
 
     def send_and_kill(process, line):
@@ -141,7 +144,7 @@ def kill_next(monkeypatch):
 
 
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
-    """A worker that dies in the middle of a task is that task's reason; the next one is graded."""
+    """If a worker dies during a task, that row says so; the next task is graded."""
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
         kill_next()
@@ -152,7 +155,7 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next
 
 
 def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
-    """It costs nothing: the hand-in that it was started for is graded."""
+    """The submission that it was started for is graded all the same."""
     kill_next()
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
@@ -176,7 +179,7 @@ def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
 
 
 def test_what_this_machine_fails_at_is_tried_again(task, tmp_path):
-    """Where the scratch is full or gone the row says so, and does not stand for good."""
+    """If the scratch folder is full or gone, the row says so and the next run tries again."""
     (tmp_path / "scratch").touch()  # no folder can be made in it
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
@@ -184,7 +187,7 @@ def test_what_this_machine_fails_at_is_tried_again(task, tmp_path):
 
 
 def test_memory_is_limited(school, setup, tmp_path):
-    """A hand-in that needs more than the limit is a row that says so; the next one is graded."""
+    """A submission that needs more than the limit gets a row that says so; the next is graded."""
     large = shutil.copytree(school / "team-0", tmp_path / "large")
     rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(1_500_000))
     (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
@@ -198,7 +201,7 @@ def test_memory_is_limited(school, setup, tmp_path):
 
 
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
-    """Past the time limit there is a row that says so; a run that gives it more time grades it."""
+    """Past the time limit a row says so; a run with more time grades the submission."""
     _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
     assert hung["team-0"][0].reason == "stopped after 0.01 s"
     _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
@@ -206,9 +209,9 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
 
 
 def killed_within(rng, book, command):
-    """Run a command and kill it, and what it started, at some moment of its way.
+    """Run a command and kill it, with its children, at some point of its work.
 
-    That is by how much it has done: what takes a moment on one machine takes long on another.
+    The point is measured in work done, since a machine's speed varies.
     """
     enough = n_graded(book) + rng.randrange(3)
     with started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
@@ -219,7 +222,7 @@ def killed_within(rng, book, command):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
-    """Killed again and again at random times, a run ends as one that was left alone."""
+    """A run killed at random times, again and again, ends like an undisturbed one."""
     killed = tmp_path / "killed"
     command = [sys.executable, "-m", "pipeline", "grade", school, "--rubric", "throne-1dof",
                "--no-figures", "--out", killed]  # fmt: skip
@@ -260,7 +263,7 @@ HOSTILE = {
 
 
 def test_hostile_submissions_are_rows(tmp_path):
-    """Whatever is handed in has a row with printable reasons, a line each; nothing gets out."""
+    """Every submission has a row with printable reasons, one line each; nothing gets out."""
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")
         folder.mkdir(parents=True)

@@ -10,7 +10,7 @@ from tests.helpers import postgres
 
 @pytest.fixture(scope="session")
 def server():
-    """A PostgreSQL server of our own."""
+    """A PostgreSQL server for the tests."""
     if why := postgres.missing():
         (pytest.fail if os.environ.get(postgres.NEEDED) else pytest.skip)(why)
     with postgres.running() as url:
@@ -19,7 +19,7 @@ def server():
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def place(request, tmp_path):
-    """Where a gradebook can be made, empty."""
+    """An empty place where a gradebook can be made."""
     if request.param == "sqlite":
         yield str(tmp_path)
         return

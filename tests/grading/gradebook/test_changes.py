@@ -1,4 +1,4 @@
-"""What is said of a regrade: what is another in the rubric, and whose points."""
+"""The summary after a regrade: what changed in the rubric, and whose points changed."""
 
 import os
 import signal
@@ -20,7 +20,10 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_rubric_is_compared_by_its_criteria():
-    """New, gone, another number in one, another order; the rest of it by its keys."""
+    """New and removed criteria, changed numbers, changed order;
+
+    the rest of the rubric by its keys.
+    """
     first, second, *rest = RUBRIC.criteria
     dearer = first.model_copy(update={"points": first.points + 1})
     late = RUBRIC.late.model_copy(update={"percent_per_day": 50.0})
@@ -42,21 +45,21 @@ def test_a_rubric_is_compared_by_its_criteria():
 
 
 def test_a_rubric_of_another_version_is_said_to_be_one():
-    """Nothing is guessed about what cannot be read."""
+    """A rubric that cannot be read is not compared."""
     assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
         "the rubric before is of another version of cartlab"
     ]
 
 
 def test_points_are_compared_by_name():
-    """Who has others, who is new, who is gone."""
+    """Teams with other points, new teams and teams that left."""
     assert points_changes({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.5, "b": 2.0, "d": 0.0}) == [
         "a: 1 → 1.5", "d is new", "c is gone",
     ]  # fmt: skip
 
 
 def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
-    """The first class list is no change; a second run of the same says nothing."""
+    """The first class list is not a change, nor is a second run with the same result."""
     outcome = make_outcome(make_grade("a", share=0.5))
     batch = Batch(keys=(outcome.key,), shared={})
     late = RUBRIC.model_copy(update={"anonymous": True})
@@ -73,13 +76,13 @@ def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
     assert events[-1].text == "rubric: anonymous False → True"
 
 
-# Hand-ins that are still to be graded when the first is: whoever presses Ctrl-C may be late.
+# Submissions still to be graded when the first is done, in case Ctrl-C comes late.
 _LEFT = 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal on POSIX")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
-    """One line, the status of an interrupt, no worker left; the same command goes on."""
+    """One line, the exit status of an interrupt, no worker left; the same command goes on."""
     for number in range(_LEFT + 1):
         write_submission(tmp_path / "c" / f"t{number}", "throne-1dof", seed=number,
                          compact=True, students=Students(authors=(f"s{number}",)))  # fmt: skip
@@ -92,7 +95,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate()
     assert process.returncode == 130, said
-    *progress, last = said.splitlines()  # progress where that took more than two seconds
+    *progress, last = said.splitlines()  # progress, if that took more than two seconds
     assert all(f" of {_LEFT + 1}" in line for line in progress)
     assert last == (
         f"stopped; what is graded is kept in {tmp_path / 'out'}, and the same command goes on "

@@ -26,7 +26,7 @@ def book(place):
 
 
 def grade(book, *, share):
-    """Grade the team, as after a change of the rubric or of the submission."""
+    """Grade the team again, as after a change of the rubric or of the submission."""
     outcome = make_outcome(make_grade("team-1", share=share), key=f"{share}")
     book.put(outcome)
     book.finish(Batch(keys=(outcome.key,), shared={}), rubric=RUBRIC)
@@ -45,13 +45,13 @@ def comment_all(book, why="Mind the unit."):
 
 
 def pieces(book):
-    """Return the criterion as it counts."""
+    """Return the criterion as it counts now."""
     return next(c for c in book.entry("team-1").grade.criteria if c.id == "pieces")
 
 
 @pytest.mark.parametrize("say", [lambda book: change(book, 0.5), comment_all])
 def test_a_comment_does_not_freeze_points(book, say):
-    """Graded again, the team has the new points, and still the comment."""
+    """When graded again the team gets the new points and keeps the comment."""
     assert pieces(book).points == 0.5
     say(book)
     assert pieces(book).message == "omega_1 is off. Mind the unit."
@@ -65,7 +65,7 @@ def test_a_comment_does_not_freeze_points(book, say):
 
 @pytest.mark.parametrize("say", [lambda book: change(book, 0.0), comment_all])
 def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
-    """What was given by hand survives, with the new reason."""
+    """Points given by hand stay, with the new reason."""
     change(book, 0.0, why="copied")
     say(book)
     assert "to 0 of 1: Mind the unit." in pieces(book).message
@@ -74,7 +74,7 @@ def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
 
 
 def test_a_comment_is_undone_and_given_back(book):
-    """Undo takes it away, or gives back the comment that was there before."""
+    """Undo removes a comment, or restores the earlier one."""
 
     def undo():
         book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
@@ -94,7 +94,7 @@ def test_a_comment_is_undone_and_given_back(book):
 
 
 def test_what_a_comment_would_change_is_shown_first(book):
-    """Nothing but the message."""
+    """Only the message changes."""
     wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why="x", comment=True)
     (tried,) = book.try_all([wish])
     assert tried.after.points == tried.now.points
@@ -102,7 +102,7 @@ def test_what_a_comment_would_change_is_shown_first(book):
 
 
 def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
-    """Whoever looked again and found the points right gave none."""
+    """An answer that confirms the points does not fix them."""
     with RequestBook(place) as shared:
         shared.release(True, by="prof")
         shared.ask("team-1", "pieces", why="please", by="s1")
@@ -113,7 +113,7 @@ def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
 
 
 def test_a_gradebook_without_comments_gets_them(book, place):
-    """One of an earlier cartlab: its overrides stay as they are, and comments can be added."""
+    """Overrides of an earlier version stay as they are, and comments can be added."""
     book.override("team-1", "laws", 0.0, why="no", by="Ada")
     book.close()
     if "://" in place:

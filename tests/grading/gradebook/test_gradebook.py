@@ -39,7 +39,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture
 def open_book(place):
-    """Open the gradebook; a clock of its own ticks once a call."""
+    """Open the gradebook with a clock that ticks once a call."""
     opened, tick = [], count()
 
     def opener(assignment="lab", create=True):
@@ -59,7 +59,7 @@ def open_book(place):
 
 
 def finish(book, *outcomes, shared=None):
-    """Put outcomes in and make them the class list."""
+    """Store outcomes and make them the class list."""
     for outcome in outcomes:
         if book.known(outcome.key) is None:
             book.put(outcome)
@@ -68,7 +68,7 @@ def finish(book, *outcomes, shared=None):
 
 
 def test_what_is_put_in_comes_back(open_book):
-    """An outcome is the same after the gradebook was closed and opened, Unicode and all."""
+    """An outcome is the same after the gradebook was closed and reopened, Unicode included."""
     grade = make_grade("tëam 学 '\"; DROP TABLE gradings; --", share=0.5, flags=(hertz_flag(),))
     outcome = make_outcome(
         grade,
@@ -88,7 +88,7 @@ def test_what_is_put_in_comes_back(open_book):
 
 
 def test_runs_that_begin_at_once_make_one_gradebook(place):
-    """On a database without tables, each finds or makes all of them."""
+    """On a database without tables, each run finds or makes all of them."""
     with ThreadPoolExecutor(8) as runs:
         books = list(runs.map(lambda n: Gradebook(place, assignment=f"{n}", create=True), range(8)))
     for book in books:
@@ -98,7 +98,7 @@ def test_runs_that_begin_at_once_make_one_gradebook(place):
 
 
 def test_a_folder_may_be_called_like_a_database(tmp_path):
-    """What is there decides, not what it is called."""
+    """The content decides, not the name."""
     (tmp_path / "lab.db").mkdir()
     Gradebook(tmp_path / "lab.db", create=True).close()
     assert (tmp_path / "lab.db" / FILE).is_file()
@@ -107,7 +107,7 @@ def test_a_folder_may_be_called_like_a_database(tmp_path):
 
 
 def test_the_newest_of_a_key_counts(open_book):
-    """A submission that ran out of time and was tried again is known by its second outcome."""
+    """A submission that ran out of time and was tried again has its second outcome."""
     book = open_book()
     book.put(make_outcome(failed_grade("team-1", "too slow"), key="k", settled=False))
     second = make_outcome(make_grade("team-1"), key="k")
@@ -118,7 +118,7 @@ def test_the_newest_of_a_key_counts(open_book):
 
 
 def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
-    """One for every submission and its authors, those of other assignments too."""
+    """One for every submission with its authors, also those of other assignments."""
     earlier = open_book("lab of last year")
     earlier.put(make_outcome(make_grade("team-1", authors=("old",)), key="1", fingerprints=b"o"))
     book = open_book()
@@ -131,7 +131,7 @@ def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
 
 
 def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypatch):
-    """In the midst of reading them, outcomes can be put in."""
+    """Outcomes can be stored while fingerprints are being read."""
     monkeypatch.setattr(rows, "_PAGE", 10)
     book = open_book()
     for n in range(15):  # more than a page
@@ -145,7 +145,7 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
 
 
 def test_the_class_list_is_the_last_batch_that_ended(open_book):
-    """Outcomes put in by a run that was killed count only once a batch has ended with them."""
+    """Outcomes of a run that was killed count only when a later batch ends with them."""
     book = open_book()
     with pytest.raises(ConfigError, match="no grading of 'lab' ran to its end"):
         list(book.entries())
@@ -159,7 +159,7 @@ def test_the_class_list_is_the_last_batch_that_ended(open_book):
 
 
 def test_shared_data_is_flagged_in_the_class_list(open_book):
-    """The flag comes with the batch, in the order of codes, and is gone with the next batch."""
+    """The flag comes with the batch, in the order of codes, and goes with the next batch."""
     book = open_book()
     outcomes = [make_outcome(make_grade(name, flags=(hertz_flag(),))) for name in "ab"]
     finish(book, *outcomes, shared={"a": shared_flag("b"), "b": shared_flag("a")})
@@ -172,9 +172,9 @@ def test_shared_data_is_flagged_in_the_class_list(open_book):
 
 
 def test_points_given_by_hand_survive_regrading(open_book):
-    """They count in place of the automatic ones, lateness comes off anew, and they can go again."""
+    """They replace the automatic points, lateness is computed again, and they can be removed."""
     book = open_book()
-    # 10 % of it is lost, to the rubric's quarter of a point: 1.1 is 1, and 0.65 is 0.75.
+    # A tenth is lost, to the rubric's quarter of a point: 1.1 is 1, and 0.65 is 0.75.
     first = make_grade("team-1", share=0.5, days_late=1.0)
     finish(book, make_outcome(first, key="1"))
 
@@ -197,7 +197,7 @@ def test_points_given_by_hand_survive_regrading(open_book):
 
 
 def test_a_broken_submission_can_be_graded_by_hand(open_book):
-    """Its criteria are those given points; it stays marked as not graded automatically."""
+    """Its criteria get those points; it stays marked as not graded automatically."""
     book = open_book()
     finish(book, make_outcome(failed_grade("team-1", "no submission.toml")))
 
@@ -208,7 +208,7 @@ def test_a_broken_submission_can_be_graded_by_hand(open_book):
 
 
 def test_an_override_goes_with_the_people(open_book):
-    """Another year's team of the same name does not inherit it; a team that grows keeps it."""
+    """Another year's team of the same name does not get it; a team that grows keeps it."""
     book = open_book()
     finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("ann",)), key="1"))
     book.override("team-1", "pieces", 1.0, why="seen", by="Ada")
@@ -220,7 +220,7 @@ def test_an_override_goes_with_the_people(open_book):
 
 
 def test_assignments_in_one_database_stay_apart(open_book):
-    """An override of one lab does nothing in another; unnamed, the lab graded last is meant."""
+    """An override of one lab has no effect in another; without a name, the latest lab is meant."""
     one, two = open_book("lab 1"), open_book("lab 2")
     finish(one, make_outcome(make_grade("team-1", share=0.0), key="1"))
     finish(two, make_outcome(make_grade("team-1", share=0.0), key="2"))
@@ -233,7 +233,7 @@ def test_assignments_in_one_database_stay_apart(open_book):
 
 
 def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
-    """A rubric copied to another name gives the same key; its gradings are another's still."""
+    """Under a copy of the rubric the key is the same, but each assignment grades for itself."""
     one, two = open_book("lab 1"), open_book("lab 2")
     for book in (one, two):
         finish(book, make_outcome(make_grade("team-1"), key="same"))
@@ -246,7 +246,7 @@ def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
 
 
 def test_no_override_is_above_what_the_rubric_has_now(open_book):
-    """A rubric that gives a criterion fewer points later gives an override of it no more."""
+    """If a rubric later gives a criterion fewer points, an override gives no more than that."""
     book = open_book()
     outcome = make_outcome(make_grade("team-1", share=0.0))
     finish(book, outcome)
@@ -274,7 +274,7 @@ def test_no_override_is_above_what_the_rubric_has_now(open_book):
     ],
 )
 def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, message):
-    """With what there is instead; nothing is stored."""
+    """The message says what is allowed; nothing is stored."""
     book = open_book()
     finish(book, make_outcome(make_grade("team-1")))
 
@@ -285,7 +285,7 @@ def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, m
 
 
 def test_a_team_is_found_by_its_members(open_book):
-    """An author who is in two submissions does not say which one is meant."""
+    """An author of two submissions does not identify a team."""
     book = open_book()
     finish(
         book,
@@ -329,7 +329,7 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
 
 
 def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
-    """A folder that is called otherwise in the next run: the old name says so, and the new one."""
+    """If a folder has a new name in the next run, the old and the new history say so."""
     book = open_book()
     finish(
         book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
@@ -347,7 +347,7 @@ def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
 
 
 def test_rows_are_only_added(open_book, place):
-    """The database itself refuses to change or delete what is in any of its tables."""
+    """The database itself refuses to change or delete rows of any table."""
     book = open_book()
     figures = (("a.svg", "<svg/>"),)
     graded = make_grade("team-1", flags=(hertz_flag(),))
@@ -380,7 +380,7 @@ def test_rows_are_only_added(open_book, place):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
-    """Killed while it writes, a process leaves every outcome whole or not there at all."""
+    """If a process is killed while it writes, every outcome is whole or not there at all."""
     assert_nothing_lost(str(tmp_path), kills=8)
 
 
@@ -388,14 +388,14 @@ def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
 @pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_dozen_kills_lose_nothing(place):
-    """The same, on a server too."""
+    """The same with a dozen kills, on a server too."""
     assert_nothing_lost(place, kills=12)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_three_hundred_kills_lose_nothing(place):
-    """The same, three hundred times."""
+    """The same with three hundred kills."""
     assert_nothing_lost(place, kills=300)
 
 
@@ -429,7 +429,7 @@ def test_a_place_without_a_gradebook_is_an_error(tmp_path):
     ],
 )
 def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, message):
-    """Drivers that are not there, servers that do not answer, text that is no URL."""
+    """Missing drivers, servers that do not answer, text that is not a URL."""
     with pytest.raises(ConfigError, match=message) as error:
         Gradebook(url, create=True)
     assert "secret" not in str(error.value)

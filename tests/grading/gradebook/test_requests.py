@@ -59,7 +59,7 @@ def answer(book, points, text="looked", by="Ada"):
 
 
 def test_an_answer_and_its_points_count_at_once(book):
-    """The students read both; the history tells each step, and grading again keeps them."""
+    """The students read both; the history lists each step, and a regrade keeps them."""
     book.ask("team-1", "laws", why="  see\npage 3 ", by="s1")
     assert book.n_waiting() == 1
     (asked,) = book.queue().waiting
@@ -86,7 +86,7 @@ def test_an_answer_and_its_points_count_at_once(book):
 
 
 def test_points_stay_where_the_answer_gives_none(book):
-    """There is an answer, and no change by hand."""
+    """There is an answer but no change by hand."""
     book.ask("team-1", "laws", why="see page 3", by="s1")
     answer(book, None, text="page 3 is about cart 2")
     own = book.own_feedback("team-1")
@@ -95,7 +95,7 @@ def test_points_stay_where_the_answer_gives_none(book):
 
 
 def test_a_criterion_is_asked_for_once_unless_reopened(book):
-    """Whoever of the team asks; other criteria and other teams are free."""
+    """Nobody else in the team can ask either; other criteria and teams are free."""
     book.ask("team-1", "laws", why="one", by="s1")
     for state in ("asked", "answered"):
         with pytest.raises(RequestRefused, match="asked for already"):
@@ -132,7 +132,7 @@ def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message)
 
 
 def test_whole_points_are_not_asked_about(book):
-    """A criterion never judged can be: its points are lost too."""
+    """A criterion that was never judged can be asked about: its points are lost too."""
     finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new ")
     with pytest.raises(RequestRefused, match="lost points"):
         book.ask("team-1", "laws", why="more", by="s1")
@@ -153,7 +153,7 @@ def test_few_requests_wait_at_once(book):
 
 
 def test_students_read_and_ask_nothing_before_the_release(place):
-    """Nor after it was taken back, nor of another class in the same database."""
+    """Nor after it was withdrawn, nor about another class in the same database."""
     with RequestBook(place, assignment="lab", create=True) as book:
         assert book.own_feedback("team-1") is None
         finish(book, make_grade("team-1", share=0.5))
@@ -177,7 +177,7 @@ def test_students_read_and_ask_nothing_before_the_release(place):
 
 
 def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
-    """Answered by another, changed by hand, graded again: nothing of it is written."""
+    """Another TA's answer, a change by hand or a regrade came first: nothing is written."""
     for criterion in ("laws", "pieces"):
         book.ask("team-1", criterion, why="x", by="s1")
     laws, pieces = book.queue().waiting
@@ -210,7 +210,7 @@ def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
 
 
 def test_of_two_answers_at_one_moment_one_counts(book, place):
-    """Ten rounds of two that saw the same queue: one is taken, one gets a conflict."""
+    """In ten rounds of two TAs with the same queue, one is accepted and one gets a conflict."""
     with RequestBook(place) as other:
         for number in range(10):
             book.ask("team-1", "laws", why=f"round {number}", by="s1")
@@ -236,7 +236,7 @@ def test_of_two_answers_at_one_moment_one_counts(book, place):
 
 
 def test_of_two_who_ask_at_one_moment_one_asks(book, place):
-    """The second of a team is told."""
+    """The second team member gets a message."""
     with RequestBook(place) as other:
         ready = Barrier(2)
 
@@ -254,7 +254,7 @@ def test_of_two_who_ask_at_one_moment_one_asks(book, place):
 
 
 def test_a_request_goes_with_the_people(book):
-    """Under another name it goes on; another team of the same name does not inherit it."""
+    """Under a new name it stays; another team of the same name does not get it."""
     book.ask("team-1", "laws", why="see page 3", by="s1")
     moved = {"team-1": "group-1"}
     finish(book, make_grade("group-1", share=0.5, authors=("s-team-1",)), moved=moved, key="b ")
@@ -266,7 +266,7 @@ def test_a_request_goes_with_the_people(book):
 
 
 def test_a_criterion_that_is_gone_can_still_be_answered(book):
-    """In words; points for it would mean nothing."""
+    """In words only; points for it would mean nothing."""
     book.ask("team-1", "laws", why="x", by="s1")
     less = tuple(c for c in RUBRIC.criteria if c.id != "laws")
     finish(
@@ -279,7 +279,7 @@ def test_a_criterion_that_is_gone_can_still_be_answered(book):
 
 
 def test_an_anonymous_history_does_not_say_who_asked(book):
-    """Neither by name nor in the words, as far as the names are known."""
+    """Neither by name nor in the text, if the names are known."""
     anonymous = RUBRIC.model_copy(update={"anonymous": True})
     finish(book, make_grade("team-1", share=0.5), rubric=anonymous)
     book.ask("team-1", "laws", why="I, u42 of team-1 (S-team-1), see page 3", by="u42")
@@ -291,7 +291,7 @@ def test_an_anonymous_history_does_not_say_who_asked(book):
 
 
 def test_a_gradebook_made_before_opens(tmp_path):
-    """It gets the tables that it lacks; what is in it stays."""
+    """It gets the missing tables; its content stays."""
     with OpenBook(tmp_path, assignment="lab", create=True) as book:
         finish(book, make_grade("team-1", share=0.5))
     with closing(sqlite3.connect(tmp_path / FILE)) as old:
@@ -308,14 +308,14 @@ def test_a_gradebook_made_before_opens(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_kill_leaves_an_answer_with_its_points_or_neither(place):
-    """Whenever the process that answers is killed."""
+    """Whenever the answering process is killed."""
     assert_whole(place, kills=8)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_hundred_kills_leave_no_half_of_an_answer(place):
-    """The same, a hundred times."""
+    """The same with a hundred kills."""
     assert_whole(place, kills=100)
 
 

@@ -1,4 +1,4 @@
-"""Hand-ins as teachers have them: folders, trees, and what learning platforms pack."""
+"""Submissions as teachers have them: folders, trees, and downloads of learning platforms."""
 
 import os
 import sys
@@ -46,7 +46,7 @@ def hand_ins(tmp_path, *paths):
 
 
 def opened(tmp_path, hand_in):
-    """Return the files of a hand-in's submission, relative to it."""
+    """Return the files of the submission found, relative to it."""
     folder = open_submission(hand_in.sources, tmp_path / "opened" / hand_in.id)
     return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
 
@@ -74,7 +74,7 @@ def test_a_tree_gives_a_row_for_every_team(tmp_path):
 
 
 def test_two_of_one_name_have_the_parents_before_it(tmp_path):
-    """An id is the folder's name, and the parent's before it where two are the same."""
+    """An id is the folder's name; duplicates get the parent folder's name as a prefix."""
     tree(tmp_path, {f"c/{s}/lab/submission.toml": TOML for s in ("ann", "bob")})
     tree(tmp_path, {"c/carl/submission.toml": TOML})
     assert [h.id for h in hand_ins(tmp_path, tmp_path / "c")] == ["ann-lab", "bob-lab", "carl"]
@@ -118,7 +118,7 @@ def test_a_canvas_download(tmp_path):
 
 
 def test_a_moodle_download(tmp_path):
-    """A folder a student, with a zip file or the files themselves in it."""
+    """One folder for each student, with a zip file or the files themselves in it."""
     inner = zip_bytes(tmp_path, {"submission.toml": TOML})
     download = archive(
         tmp_path / "Lab 3.zip",
@@ -138,7 +138,7 @@ def test_a_moodle_download(tmp_path):
 
 
 def test_a_gradescope_download(tmp_path):
-    """Names come from the metadata; a folder it does not know keeps its own."""
+    """Names come from the metadata; a folder that is not listed keeps its own name."""
     metadata = (
         "submission_77:\n  :submitters:\n  - :name: Jane Doe\n    :sid: A1\n"
         "  - :name: Ric Roe\n  :created_at: 2026-11-20 10:00:00.123456000 -08:00\n"
@@ -159,7 +159,7 @@ def test_a_gradescope_download(tmp_path):
 
 
 def test_metadata_that_explode_are_only_text(tmp_path):
-    """Lists of lists of lists by name are no names: nothing is written out a billion times."""
+    """Nested YAML aliases are not names: nothing is expanded a billion times."""
     laughs = "".join(f"  - &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 30))
     metadata = f"x:\n  - &l0 [ha]\n{laughs}submission_77:\n  :submitters:\n  - :name: *l29\n"
     tree(tmp_path / "c", {"submission_metadata.yml": metadata + "  :created_at: *l29\n",
@@ -169,13 +169,13 @@ def test_metadata_that_explode_are_only_text(tmp_path):
 
 
 def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
-    """Folders called like Canvas' files, by chance or unpacked, are a row each."""
+    """Folders named like Canvas' files, by chance or unpacked, get one row each."""
     tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})
     assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
 
 
 def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
-    """Teams named like Canvas' files are so many rows, each by its own name."""
+    """Teams named like Canvas' files get one row each, under their own names."""
     names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")
     tree(tmp_path / "c", {f"{name}/submission.toml": TOML for name in names})
     found = hand_ins(tmp_path, tmp_path / "c")
@@ -184,7 +184,7 @@ def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
 
 @pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
 def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
-    """However deep the class lies: no row more, and one for a hand-in of which nothing is left."""
+    """However deep the class lies, there is no extra row, and one for an emptied submission."""
     members = {f"{wrapped}team-{n}/submission.toml": TOML for n in range(3)}
     class_ = archive(tmp_path / "all.zip", members)
     with zipfile.ZipFile(class_, "a") as opened_:
@@ -199,7 +199,7 @@ def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
 
 
 def test_metadata_of_a_students_own_are_not_read(tmp_path):
-    """Names come from the top of a download, where no student writes."""
+    """Names come from the top of a download, where no student can write."""
     own = "submission_1:\n  :submitters:\n  - :name: Nobody\n"
     tree(tmp_path / "c", {"a/submission_1/submission.toml": TOML,
                           "a/submission_metadata.yml": own,
@@ -210,7 +210,7 @@ def test_metadata_of_a_students_own_are_not_read(tmp_path):
 
 
 def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
-    """By neither of them, which may have a row of their own: nobody knows which is meant."""
+    """It gets neither team's name: both may have rows, and nobody knows which is meant."""
     twice = {f"{team}/submission.toml": TOML for team in ("team-01", "team-02")}
     (tmp_path / "class").mkdir()
     archive(tmp_path / "class" / "two.zip", twice)
@@ -222,7 +222,7 @@ def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
 
 
 def test_one_students_zip_is_one_hand_in(tmp_path):
-    """A zip file that is no class is itself the hand-in, and a broken one has its row."""
+    """A zip that is not a class is one submission, and a broken zip has a row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
     bad = tmp_path / "team-08.zip"
     bad.write_bytes(b"PK\x03\x04 no more")
@@ -230,14 +230,14 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
     assert (first.id, second.id) == ("team-07", "team-08")
     with pytest.raises(SubmissionError, match=r"'team-08\.zip': not a whole zip archive: send"):
         opened(tmp_path, second)
-    bad.write_bytes(b"")  # an upload that was broken off
+    bad.write_bytes(b"")  # an upload that was interrupted
     with pytest.raises(SubmissionError, match=r"'team-08\.zip': is empty"):
         opened(tmp_path, *hand_ins(tmp_path, bad))
 
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
-    """Nobody is marked by half a download, whatever is named beside it; one hand-in has a row."""
+    """Nobody is graded from half a download, whatever comes with it; one submission has a row."""
     teams = {f"team-{n}": {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99} for n in range(4)}
     files = {f"{team}/{name}": text for team, own in teams.items() for name, text in own.items()}
     if packed:
@@ -255,7 +255,7 @@ def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
-    """One packed hand-in is all that is seen of it, and that is no row."""
+    """Only one packed submission can be seen in it, and that does not become a row."""
     own = zip_bytes(tmp_path, {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99})
     download = tmp_path / "class.zip"
     with zipfile.ZipFile(download, "w", how) as packing:
@@ -267,17 +267,17 @@ def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
 
 
 def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
-    """Taken out in place, a first member leaves its bytes; the table of contents is its own."""
+    """Deleting the first member in place leaves its bytes, but the table of contents is valid."""
     taken = archive(tmp_path / "team-1.zip", {"draft.txt": "x", "submission.toml": TOML})
     with zipfile.ZipFile(taken, "a") as opened_again:
         del opened_again.filelist[0]
-        opened_again.comment = b"tidied"  # the contents are written anew
+        opened_again.comment = b"tidied"  # the contents are written again
     (found,) = hand_ins(tmp_path, taken)
     assert opened(tmp_path, found) == ["submission.toml"]
 
 
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
-    """Paths that lead out, depth, a password, broken bytes: the others of the class are there."""
+    """Paths that lead out, depth, a password, broken bytes: all other submissions are graded."""
     download = archive(
         tmp_path / "class.zip",
         {
@@ -293,7 +293,7 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     for signature, name_at, flags_at in ((b"PK\x03\x04", 30, 6), (b"PK\x01\x02", 46, 8)):
         at = raw.find(b"evil-3/", raw.find(signature)) if signature == b"PK\x03\x04" else 0
         at = at or raw.find(b"evil-3/", raw.find(b"PK\x01\x02"))
-        raw[at - name_at + flags_at] |= 1  # encrypted
+        raw[at - name_at + flags_at] |= 1  # encrypted, so its checksum is wrong
     raw[raw.find(b"0" * 500) + 7] ^= 1  # its checksum is wrong now
     download.write_bytes(raw)
     found = {h.id: h.problem for h in hand_ins(tmp_path, download)}
@@ -307,7 +307,7 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
 
 
 def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
-    """`.git` is nobody's; a team that calls itself `...` is there, and `~$x` is a folder's name."""
+    """`.git` is ignored; a team named `...` is graded, and `~$x` can be a folder's name."""
     tree(
         tmp_path / "c",
         {name + "/submission.toml": TOML for name in ("...", ".lab", "~$x", "a")}
@@ -317,7 +317,7 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
 
 
 def test_results_of_a_grading_are_no_hand_ins(tmp_path):
-    """Whether written beside the hand-ins or among them, and told of; a team may be so called."""
+    """Whether beside or among the submissions, with a message; a team may have such a name."""
     made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
     tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
     tree(tmp_path / "c" / "grades", dict.fromkeys(made, ""))
@@ -331,7 +331,7 @@ def test_results_of_a_grading_are_no_hand_ins(tmp_path):
 
 @pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
 def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
-    """Beside folders and zip files; in a team's own folder it is a backup of theirs."""
+    """Beside folders and zip files it is a row; in a team's own folder it is the team's backup."""
     tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
     tree(tmp_path / "c" / "b", {name: "packed"})
     found = {h.id: h for h in hand_ins(tmp_path, tmp_path / "c")}
@@ -342,7 +342,7 @@ def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
 
 @pytest.mark.parametrize("beside", [(), ("figures/bode.png",), ("notes.md",)])
 def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
-    """The folder of the recordings names nobody: not in a class, not alone, not under a section."""
+    """The folder of the recordings names no team, in a class, alone or under a section."""
     for where in ("c/team-7", "alone", "section/only/team-7"):
         tree(tmp_path / where, dict.fromkeys(("data/step.csv", *beside), "1,2"))
     tree(tmp_path / "c", {"a/submission.toml": TOML})
@@ -352,16 +352,16 @@ def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
 
 
 def test_a_name_of_many_numbers_is_read_at_once():
-    """No form of name is tried from each of its letters: of so many that would take hours.
+    """A name is matched once, not from each of its letters: that would take hours.
 
-    A member's name has 65,535 at most.
+    A member's name has at most 65,535 letters.
     """
     for part in ("_1", "_LATE_1", "_assignsubmission_", "anon_", "-1.a"):
         parse_name(part * (1_000_000 // len(part)) + "\n")
 
 
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
-    """A zip in a zip is opened; the tenth in the ninth is not."""
+    """A zip in a zip is opened; the tenth level is not."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})
     nested = zip_bytes(tmp_path, {"inner.zip": content})
     (found,) = hand_ins(tmp_path, archive(tmp_path / "a.zip", {"b.zip": nested}))
@@ -374,7 +374,7 @@ def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
 
 
 def test_many_nested_archives_share_one_limit(tmp_path):
-    """Ten archives in one may not hold ten times what one may."""
+    """Ten archives in one share the limit of one."""
     part = zip_bytes(tmp_path, {str(i): "" for i in range(HAND_IN.members // 5)})
     whole = archive(tmp_path / "a.zip", {f"{i}.zip": part for i in range(10)})
     with pytest.raises(SubmissionError, match="files"):
@@ -382,7 +382,7 @@ def test_many_nested_archives_share_one_limit(tmp_path):
 
 
 def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
-    """Which of two is meant is not guessed; one that lies higher is meant."""
+    """With two at the same depth nothing is guessed; one at a higher level wins."""
     files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
     folder = tree(tmp_path / "t", files)
     with pytest.raises(SubmissionError, match=r"which one.*'a/submission\.toml' and 'b/"):
@@ -393,7 +393,7 @@ def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links and pipes need rights on Windows")
 def test_links_and_pipes_are_not_followed(tmp_path):
-    """A link to a file of ours is not copied, a pipe is not waited for, a linked folder a row."""
+    """A link to one of our files is not copied, a pipe is not read, a linked folder is a row."""
     secret = tree(tmp_path / "ours", {"secret.csv": "secret"})
     folder = tree(tmp_path / "c/team/", {"submission.toml": TOML})
     (folder / "data").symlink_to(secret)
@@ -407,7 +407,7 @@ def test_links_and_pipes_are_not_followed(tmp_path):
 
 
 def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
-    """Who handed in a file that is larger than may be is told so, not that there is none."""
+    """The reason says that the file is too large, not that it is missing."""
     team = tree(tmp_path / "team-01", {"submission.toml": TOML, "data/long.csv": ""})
     os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
     folder = open_submission([team], tmp_path / "opened")
@@ -415,7 +415,7 @@ def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
 
 
 def test_too_many_files_are_said_to_be_too_many(tmp_path):
-    """Small files beside a submission do not hide it; on another machine it is told the same."""
+    """Many small files beside a submission give the same clear reason on every machine."""
     team = tree(
         tmp_path / "team", {NAME: TOML, **{f"junk/{i}": "" for i in range(HAND_IN.members)}}
     )
@@ -431,7 +431,7 @@ def test_too_many_files_are_said_to_be_too_many(tmp_path):
 
 
 def test_a_hand_in_travels_whole(tmp_path):
-    """What is packed for another machine is what would be graded here, and the hash knows it."""
+    """A submission packed for another machine holds what would be graded here, and its hash."""
     folder = tree(tmp_path / "t", {"submission.toml": TOML, "data/ü.csv": "1", ".DS_Store": "x"})
     unpacked(packed([folder]), tmp_path / "there")
     assert digest([tmp_path / "there"]) == digest([folder])
@@ -441,7 +441,7 @@ def test_a_hand_in_travels_whole(tmp_path):
 
 
 def test_nothing_to_grade_is_said(tmp_path):
-    """A folder without anything, or no folder at all, cannot be graded."""
+    """An empty or missing folder cannot be graded."""
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="nothing to grade"):
         hand_ins(tmp_path, tmp_path / "empty")
@@ -451,7 +451,7 @@ def test_nothing_to_grade_is_said(tmp_path):
 
 @given(st.lists(st.text(min_size=1, max_size=30), min_size=1, max_size=6))
 def test_any_name_becomes_a_folders(tmp_path_factory, names):
-    """Ids are different, printable, not too long, and lie where they should."""
+    """Ids are unique, printable, not too long, and stay inside their folder."""
     from pipeline.grading.intake.hand_ins import HandIn, _with_ids
 
     found = [HandIn(id=name, parent="p") for name in names]

@@ -1,4 +1,4 @@
-"""Who was late: by the deadline, or by a table."""
+"""Lateness, by the deadline or by a table."""
 
 from datetime import datetime
 
@@ -18,7 +18,7 @@ def hand_in(name: str, **fields) -> HandIn:
 
 
 def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime | None = None):
-    """Return the days by id, and the remarks."""
+    """Return the days by id, and the warnings."""
     table = {}
     if text is not None:
         path = tmp_path / "late.csv"
@@ -29,7 +29,7 @@ def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime |
 
 
 def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
-    """In whatever zone; early is not late; where nothing is said, the platform's mark holds."""
+    """In any time zone; early is not late; without a time the platform's mark counts."""
     days, _ = settle(
         tmp_path,
         hand_in("late", handed_in="2026-11-21T19:59:00+00:00"),
@@ -41,7 +41,7 @@ def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_p
 
 
 def test_a_table_of_ones_own_goes_first(tmp_path):
-    """An extension is a zero in it; a name that nobody has is said."""
+    """A zero in it is an extension; an unknown name gives a warning."""
     days, remarks = settle(
         tmp_path,
         hand_in("Team-01", days_late=1.0),
@@ -65,14 +65,14 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
     ],
 )
 def test_what_cannot_be_understood_is_said(tmp_path, text, message):
-    """With its line: nobody is on time because a table was not understood."""
+    """An error names the line, so that a misread table makes nobody punctual."""
     with pytest.raises(ConfigError) as error:
         settle(tmp_path, hand_in("x"), text=text)
     assert message in str(error.value)
 
 
 def test_a_deadline_needs_its_zone(tmp_path):
-    """A clock without one is an error with its line; with one, the rubric has it."""
+    """A time without a zone is an error with its line, unless the rubric gives the zone."""
     path = tmp_path / "lab.toml"
     shipped = load_rubric_text()
     path.write_text(

@@ -17,7 +17,7 @@ BRIEF = UnpackLimits(total=1_000_000, directory=10_000)
 
 
 def zipped(path, members, *, mode=None):
-    """Write an archive of names and texts; `mode` is put into every member's Unix attributes."""
+    """Write an archive of names and texts; `mode` is the Unix mode of every member."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, text in members.items():
             info = zipfile.ZipInfo(name)
@@ -32,7 +32,7 @@ def files_below(folder):
 
 
 def test_what_was_packed_comes_out_without_debris(tmp_path):
-    """Files come out as packed; what macOS and Windows leave behind does not."""
+    """Files come out as packed, without the extra files of macOS and Windows."""
     members = {
         "team/submission.toml": "x",
         "team/data/step.csv": "1,2",
@@ -57,7 +57,7 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["data/run:1.csv", "x.csv.", "a /x", "nul.csv", "COM1", "a?b"])
 def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name):
-    """There it would be another file, a stream or a device; elsewhere it is a name."""
+    """On Windows such a name is another file, a stream or a device; elsewhere it is a name."""
     packed = zipped(tmp_path / "a.zip", {name: "x", "good.txt": "good"})
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
     monkeypatch.setattr("pipeline.grading.intake.unpack.sys.platform", "win32")
@@ -86,7 +86,7 @@ def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
     ],
 )
 def test_bombs_do_not_go_off(tmp_path, members, reason):
-    """Size, ratio and number are all limited, by what truly comes out."""
+    """Size, ratio and number are limited, as measured while unpacking."""
     archive = zipped(tmp_path / "bomb.zip", members)
     with pytest.raises(SubmissionError, match=reason):
         unpack(archive, tmp_path / "out", limits=SMALL)
@@ -94,7 +94,7 @@ def test_bombs_do_not_go_off(tmp_path, members, reason):
 
 
 def test_the_contents_that_count_are_those_that_are_read(tmp_path):
-    """A 64-bit record says how long they are, whatever the old one beside it says."""
+    """A 64-bit record states their length, whatever the older record says."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)
@@ -113,7 +113,7 @@ def test_the_contents_that_count_are_those_that_are_read(tmp_path):
 
 
 def test_the_ratio_counts_where_the_size_would_still_do(tmp_path):
-    """A file that unpacks to hundreds of times its size is refused below the limit of size."""
+    """A file that unpacks to hundreds of times its size is refused, even below the size limit."""
     archive = zipped(tmp_path / "bomb.zip", {"zeros": "0" * 20_000_000})
     with pytest.raises(SubmissionError, match="200 times its size"):
         unpack(archive, tmp_path / "out", limits=HAND_IN)
@@ -129,7 +129,7 @@ def test_a_header_that_lies_about_the_size_does_not_help(tmp_path):
 
 
 def test_an_encrypted_archive_says_so(tmp_path):
-    """A password is named as the reason."""
+    """The reason names the password."""
     archive = zipped(tmp_path / "a.zip", {"x": "secret"})
     raw = bytearray(archive.read_bytes())
     raw[6] |= 1  # the local header's flags, and those of the table of contents
@@ -140,7 +140,7 @@ def test_an_encrypted_archive_says_so(tmp_path):
 
 
 def test_names_are_read_as_they_were_meant(tmp_path):
-    """UTF-8 that does not say so is read as such, and letters with accents are one character."""
+    """Unmarked UTF-8 is read as UTF-8, and letters with accents become one character."""
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mu\u0308ller/x.txt", "1")  # u and a combining diaeresis
@@ -156,7 +156,7 @@ def test_names_are_read_as_they_were_meant(tmp_path):
 
 @given(st.binary(max_size=400), st.integers(0, 300), st.binary(max_size=8))
 def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
-    """Broken archives end in the error that is said to the student, never in another."""
+    """A broken archive ends in the error meant for the student, never in another."""
     folder = tmp_path_factory.mktemp("zip")
     good = zipped(folder / "good.zip", {"a/b.txt": "hello" * 20, "c.txt": "x"}).read_bytes()
     for number, raw in enumerate((junk, good[:at] + patch + good[at + len(patch) :], good[:-at])):
@@ -168,7 +168,7 @@ def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
 
 
 def test_debris_is_told_from_work():
-    """Hidden halves of macOS files are debris, a file that merely looks odd is not."""
+    """Hidden halves of macOS files are ignored; a file with an odd name is kept."""
     assert is_debris(PurePosixPath("a/._step.csv"))
     assert is_debris(PurePosixPath("__MACOSX/a"))
     assert not is_debris(PurePosixPath("a/_step.csv"))

@@ -1,4 +1,4 @@
-"""Points follow consequences: harmful models, what remarks cost at least, and the rubric's step."""
+"""Points follow consequences: harmful models, the least cost of a flag, the rubric's step."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -77,7 +77,7 @@ def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
     ],
 )
 def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
-    """One sign makes a model that blows up or moves the other way: its other entries are no use."""
+    """One sign makes a model unstable or reversed, so its right entries are of no use."""
     one = student(2)
     A, B = model(one)
     slip(A, B)
@@ -89,7 +89,7 @@ def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("first", ["positions", "last cart"])
 def test_another_order_of_the_states_is_no_harm(carts, first):
-    """It is the same motion under other names: wrong, and it costs what the remark does."""
+    """It is the same motion under other names: wrong, but it costs only what the flag costs."""
     one = student(carts)
     A, B = model(one)
     both = [[*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)]]
@@ -102,7 +102,7 @@ def test_another_order_of_the_states_is_no_harm(carts, first):
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_an_honest_model_does_no_harm(preset):
-    """Entries up to a tenth off, either way: three carts would then grow, and it is no mistake."""
+    """Entries up to a tenth off: three carts may then be unstable, but that is no mistake."""
     chain, rng = PRESETS[preset], np.random.default_rng(5)
     A, B, _, _ = chain.state_space()
     right = np.hstack([A, B])
@@ -120,7 +120,7 @@ def test_an_honest_model_does_no_harm(preset):
 
 
 def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
-    """Gains for carts ten times as heavy as those on the bench are stable on the table alone."""
+    """Gains for carts ten times too heavy are stable only on paper."""
     one = student(2)
     feedback, times = one.reported.feedback, 30
     assert feedback is not None
@@ -136,7 +136,7 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
 
 
 def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
-    """A single coupling too weak is one entry of many, and another model of the carts."""
+    """A coupling that is too weak is one entry of many, but makes another model."""
     one = student(2)
     A, B = model(one)
     A[1, 2] *= 0.5
@@ -149,7 +149,7 @@ def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
 
 
 def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
-    """Hz in the final frequencies: those criteria pay, the gains and the first estimates do not."""
+    """Hz in the final frequencies costs those criteria; gains and initial estimates keep theirs."""
     one = student(2)
     hertz = {
         name: one.value("final", name) / (2 * np.pi)
@@ -165,7 +165,7 @@ def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
 
 
 def test_of_two_remarks_on_one_criterion_the_dearer_counts():
-    """A slip in one number and another number off: the costs are not added."""
+    """A slip in one number and an error in another: the larger cost counts, not the sum."""
     one = student(2)
     off = {"omega_1": one.value("final", "omega_1") / (2 * np.pi)}
     off |= {"omega_b": one.value("final", "omega_b") * 1.35}
@@ -181,7 +181,7 @@ def test_of_two_remarks_on_one_criterion_the_dearer_counts():
 
 @pytest.mark.parametrize("step", [0.01, 0.1, 0.25, 0.5, 1.0])
 def test_points_are_multiples_of_the_step(step):
-    """Whatever a student got wrong, points and total are such as a person would give."""
+    """Whatever a student got wrong, points and total are multiples a person would give."""
     one = under(student(2), step=step)
     off = {name: one.value("final", name) * 1.11 for name in one.reported.final}
     grade = one.reporting(final=off).grade(days_late=1.5)

@@ -1,4 +1,4 @@
-"""Named mistakes: each gets its code and no other; an honest student gets none."""
+"""Named mistakes: each gets its own code and no other; an honest student gets none."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -76,7 +76,7 @@ def test_a_student_with_a_textbook_is_honest(carts, hide):
 
 @pytest.mark.parametrize("digits", [2, 3])
 def test_a_right_first_estimate_may_be_found_again(digits):
-    """Of one cart on a quiet bench both estimates of a careful student are the same."""
+    """For one cart on a quiet bench both estimates of a careful student may be equal."""
     one = student(1)
     right = {row.name: row.final.value for row in one.analysis.rows if row.final}
     table = {name: Decimal(f"{value:.{digits - 1}e}") for name, value in right.items()}
@@ -85,7 +85,7 @@ def test_a_right_first_estimate_may_be_found_again(digits):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
-    """Who writes the last cart first has the same table."""
+    """A student who lists the last cart first has the same table."""
     one = student(carts)
     reported = one.reported.model_copy(
         update={
@@ -102,7 +102,7 @@ def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
 
 
 def test_a_student_who_reports_first_estimates_only_misses_the_rest():
-    """What is not there is missing; nothing else is held against them."""
+    """Numbers that were not reported are missing; nothing else is flagged."""
     one = student(2)
     reported = Reported(initial=one.reported.initial)
     submission = one.submission.model_copy(update={"reported": reported})
@@ -112,7 +112,7 @@ def test_a_student_who_reports_first_estimates_only_misses_the_rest():
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_frequencies_in_hz(carts, table):
-    """All frequencies of a table divided by 2π are Hz; the sentence says how it is seen."""
+    """All frequencies of a table divided by 2π are in Hz; the message gives the evidence."""
     one = student(carts)
     names = [n for n in getattr(one.reported, table) if n.startswith("omega")]
     flag = only_flag(scaled(one, table, names, 1 / TURN))
@@ -124,7 +124,7 @@ def test_frequencies_in_hz(carts, table):
 
 
 def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
-    """Hz in both tables: one flag that says of which number it speaks, and no talk of peaks."""
+    """Hz in both tables gives one flag that names the numbers, and no talk of peaks."""
     one = student(2)
     names = [n for n in one.reported.final if n.startswith("omega")]
     hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
@@ -139,7 +139,7 @@ def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
-    """Gains in counts, one of them 7 % off as first estimates are: one number, one flag."""
+    """One flag for gains in counts, although one is 7 % off, as initial estimates may be."""
     one, names = student(carts), own("K", carts)
     counted = {n: one.value("initial", n) / 0.00227 for n in names}
     counted[names[-1]] *= 1.07
@@ -149,7 +149,7 @@ def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
-    """One damping that is 2.3 times too small beside right ones tells of no logarithm."""
+    """One damping that is 2.3 times too small, beside right ones, is not a logarithm slip."""
     one = student(carts)
     flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
     assert (flag.code, flag.parameters) == ("initial_off", ("zeta_1",))
@@ -158,7 +158,7 @@ def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_one_period_counted_too_many(carts, k):
-    """ω is (k + 1)/k of what it should be, and ζ less by as much."""
+    """ω is (k + 1)/k of its true value, and ζ is smaller in proportion."""
     one = student(carts)
     omegas, zetas = own("omega", carts), own("zeta", carts)
     wrong = scaled(one, "initial", omegas, (k + 1) / k)
@@ -179,7 +179,10 @@ def test_a_decrement_with_log10(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts(carts, table):
-    """Twice the gain is peak to peak, over the encoder step it is in counts; both are both."""
+    """Twice the gain is peak to peak;
+
+    divided by the encoder step it is in counts; both can meet.
+    """
     one, names = student(carts), own("K", carts)
     count = 0.00227  # cm, of the simulated encoder
     assert codes(scaled(one, table, names, 2.0)) == ["peak_to_peak"]
@@ -228,7 +231,7 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
 
 @pytest.mark.parametrize("hide", [(), FRICTION])
 def test_the_peak_of_one_edge_of_both_carts(hide):
-    """Where friction blurs the gains, the peaks of one edge are still those of one edge."""
+    """If friction blurs the gains, peaks of one edge are still recognised."""
     one = student(2, hide=hide)
     record = next(r for r in one.analysis.records if r.kind == "step")
     assert record.u is not None
@@ -241,7 +244,7 @@ def test_the_peak_of_one_edge_of_both_carts(hide):
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_carts_swapped(carts, table):
-    """The numbers of cart 1 stand in the last cart's place and the other way round."""
+    """The numbers of cart 1 are in the last cart's place, and the other way round."""
     one = student(carts)
     swapped = {}
     for symbol in ("K", "omega", "zeta"):
@@ -253,7 +256,7 @@ def test_carts_swapped(carts, table):
 
 
 def test_two_mistakes_in_one_number():
-    """Swapped frequencies in Hz are both: one reason alone reproduces neither."""
+    """Swapped frequencies in Hz are both mistakes: neither alone explains the numbers."""
     one = student(2)
     wrong = {
         "omega_1": one.value("initial", "omega_2") / TURN,
@@ -266,7 +269,7 @@ def test_two_mistakes_in_one_number():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_final_table_copied_from_the_first(carts):
-    """Digit for digit the same: no fit was made; that is the one remark."""
+    """Equal in every digit means that no fit was made; this is the only flag."""
     one = student(carts)
     flag = only_flag(one.reporting(final=one.reported.initial))
     assert flag.code == "no_fit_done"
@@ -275,7 +278,7 @@ def test_a_final_table_copied_from_the_first(carts):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_tables_of_single_digits_agree_anyway(carts):
-    """Whoever types one digit finds it again in the fit."""
+    """A student who types one digit gets the same digit from the fit."""
     one = student(carts)
     coarse = {n: Decimal(f"{float(v):.0e}") for n, v in one.reported.final.items()}
     assert "no_fit_done" not in codes(one.reporting(initial=coarse, final=coarse))
@@ -283,7 +286,7 @@ def test_tables_of_single_digits_agree_anyway(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_number_that_no_mistake_explains_is_only_off(carts):
-    """A frequency 33 % too high in the final table, a gain 19 % too low in the first."""
+    """A frequency 33 % too high in the final table, a gain 19 % too low in the initial one."""
     one = student(carts)
     omega, gain = own("omega", carts)[0], own("K", carts)[-1]
     flag = only_flag(scaled(one, "final", [omega], 1.33))
@@ -293,7 +296,10 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
 
 
 def test_a_frequency_out_of_order_is_told_by_the_recordings():
-    """One wrong number that also breaks the order of the nulls: what it should be helps more."""
+    """One wrong number also breaks the order of the nulls;
+
+    the message gives the recordings' value.
+    """
     one = student(3)
     flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
     assert (flag.code, flag.parameters) == ("final_off", ("omega_2",))
@@ -352,7 +358,7 @@ def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said
 
 
 def test_a_state_model_that_follows_from_a_wrong_table_is_right():
-    """Who has ω in Hz and builds A from it is told of the Hz, not of A too."""
+    """A student with ω in Hz who builds A from it gets a flag for Hz, not one for A too."""
     one = student(1)
     hertz = one.value("final", "omega_n") / TURN
     space = one.reported.state_space
@@ -365,7 +371,10 @@ def test_a_state_model_that_follows_from_a_wrong_table_is_right():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
-    """Gains of reversed sign are wrong gains; a prefilter that is the static gain is its own."""
+    """Gains of reversed sign are wrong gains;
+
+    a prefilter equal to the static gain is its own mistake.
+    """
     one = student(carts)
     feedback = one.reported.feedback
     assert feedback is not None
@@ -381,7 +390,7 @@ def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
 
 
 def test_claims_of_other_gains_are_not_these_gains():
-    """Two and a half times the gains settle later than was reported of them."""
+    """Gains that are 2.5 times too large settle later than the student reported."""
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None
@@ -395,14 +404,14 @@ def test_claims_of_other_gains_are_not_these_gains():
 
 
 def test_what_is_missing_is_named():
-    """A parameter that is not reported, and a state model that is not there."""
+    """A parameter that was not reported, and a state model that was not reported."""
     one = student(2).without("final", "zeta_b")
     flag = only_flag(one)
     assert (flag.code, flag.parameters) == ("missing", ("final.zeta_b",))
 
 
 def test_gains_that_cancel_all_stiffness_are_judged():
-    """Where they leave no spring at all to the typed table no prefilter follows from it."""
+    """If they leave no stiffness, the typed table gives no prefilter to compare."""
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None

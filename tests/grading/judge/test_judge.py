@@ -1,4 +1,4 @@
-"""Grading a submission from its folder: points, parents, lateness, and nothing believed unseen."""
+"""Grading one submission from its folder: points, dependencies, lateness, no blind trust."""
 
 import json
 import shutil
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def honest(folder) -> Grade:
-    """Its grade as it was handed in."""
+    """Its grade without any change."""
     return grade(folder)
 
 
@@ -49,7 +49,7 @@ def grade(path: Path) -> Grade:
 
 
 def test_the_same_submission_gives_the_same_bytes(folder, honest):
-    """`grade.json` holds what the contract says, byte for byte the same each time."""
+    """`grade.json` follows the contract and has the same bytes each time."""
     text = grade_text(grade(folder))
     assert text == grade_text(honest)
     document = json.loads(text)
@@ -62,7 +62,7 @@ def test_the_same_submission_gives_the_same_bytes(folder, honest):
 
 
 def test_grading_loads_neither_pandas_nor_control(folder):
-    """They cost half a second a worker; a reference design and the figures need neither."""
+    """They would cost half a second a worker; reference design and figures do without them."""
     code = f"""
 import sys
 from pathlib import Path
@@ -85,7 +85,7 @@ print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
 
 
 def test_results_that_a_submission_brings_along_are_not_believed(folder, honest, tmp_path):
-    """A planted results.json and gap.json change nothing."""
+    """A planted results.json or gap.json changes nothing."""
     planted = tmp_path / "team-07"
     shutil.copytree(folder, planted)
     for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
@@ -95,7 +95,7 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, honest,
 
 
 def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
-    """Only under feedback, where benches log other signals, it stands; a sign of its own does."""
+    """A scale of a record counts only under feedback, where benches log other signals."""
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
     system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
     own = InputOverride(sign=-1, per_count=0.5)
@@ -119,7 +119,7 @@ def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
 def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
     folder, honest, tmp_path, turned
 ):
-    """Steps said to be logged the other way are used as they are: turned, or not."""
+    """Steps said to be logged the other way are used as the data show: reversed or not."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     for path in (other / "data").glob("step-*.csv") if turned else ():
@@ -143,7 +143,7 @@ def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
 
 
 def test_rounding_is_no_error():
-    """What MATLAB leaves in an A of noughts and ones is right."""
+    """The rounding errors that MATLAB leaves in an A of zeros and ones cost nothing."""
     model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
     exactly = StateMatrices(right=model, slack=np.zeros_like(model))
     noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
@@ -154,7 +154,7 @@ def test_rounding_is_no_error():
 
 
 def test_the_rubric_s_system_wins(folder, honest, tmp_path):
-    """A submission that says no spring is there, and another sign, is read as the rubric says."""
+    """A submission that denies a spring and reverses the sign is read as the rubric says."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     toml = other / "submission.toml"
@@ -166,13 +166,13 @@ def test_the_rubric_s_system_wins(folder, honest, tmp_path):
     found = grade(other)
     assert found.points == honest.points
     assert found.flags == ()
-    assert found.notes == ()  # one cart has one stiffness, whichever spring it stands for
+    assert found.notes == ()  # one cart has one stiffness, whichever spring it comes from
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_delay_is_not_read_as_a_spring(tmp_path):
-    """A spring that the fit puts at none is not asked for, however well it then explains."""
+    """A spring that the fit puts at zero is not assumed, however much better it then fits."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
     write_submission(tmp_path, bench, seed=304)
     rubric = load_rubric(Path("throne-2dof"))
@@ -182,13 +182,13 @@ def test_a_delay_is_not_read_as_a_spring(tmp_path):
 
 
 def test_two_first_and_final_numbers_of_one_sign_agree(folder):
-    """A sign that both tables have is no difference between them; two signs are one."""
+    """If both tables have the reversed sign they agree; two different signs do not."""
     assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
     assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
 
 
 def test_a_submission_for_another_bench_fails_with_its_reason(folder):
-    """One cart under the rubric for two: no grade, and why."""
+    """One cart under the rubric for two: no grade, with the reason."""
     rubric = load_rubric(Path("throne-2dof"))
     failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
     assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
@@ -196,7 +196,7 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
 
 
 def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
-    """The rest is graded; the run is named with the line at which its file breaks off."""
+    """The rest is graded; the message names the line at which the file breaks off."""
     cut = tmp_path / "team-07"
     shutil.copytree(folder, cut)
     path = cut / "data" / "sine-05.csv"
@@ -211,7 +211,7 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
 
 
 def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
-    """One of two decays: its run is flagged. The only control run: the piece is missing, too."""
+    """One of two decays: its run is flagged. The only control run: its criterion is missing too."""
     less = tmp_path / "team-07"
     shutil.copytree(folder, less)
     (less / "data" / "decay-1a.csv").unlink()
@@ -228,7 +228,7 @@ def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
 
 
 def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
-    """A decay in the place of a step: the copy and the missing step are one remark."""
+    """A decay in place of a step: the copy and the missing step give one flag."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
@@ -238,7 +238,7 @@ def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
 
 
 def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
-    """Unstable gains fail; the claims about them are skipped, and the parent is named."""
+    """Unstable gains fail; claims about them are skipped, and the reason names the gains."""
     one = student(2)
     feedback = one.reported.feedback
     assert feedback is not None
@@ -254,7 +254,7 @@ def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
 @pytest.mark.parametrize("table", ["initial", "final"])
 @pytest.mark.parametrize("side", [1, -1])
 def test_points_never_rise_with_the_error(table, side):
-    """A gain further and further off never earns more; far off it earns nothing of its share."""
+    """A gain further off never earns more, and far off it earns nothing."""
     one = student(1)
     right = one.value(table, "K")
     errors = (0.0, 0.02, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5)
@@ -272,7 +272,7 @@ def test_points_never_rise_with_the_error(table, side):
 
 
 def test_a_broken_law_is_told_in_words():
-    """What does not hold, and why it should; the laws' own ids are in the data only."""
+    """The message says what fails and why it should hold; ids are only in the data."""
     honest = student(2)
     final = honest.reported.final
     swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
@@ -295,7 +295,7 @@ def test_lateness_takes_its_share_for_every_day_begun():
 
 
 def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
-    """Without [reported] everything reported is missing, and the recordings still earn theirs."""
+    """Without [reported] everything reported is missing; the recordings still earn points."""
     one = student(2)
     silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
     graded = silent.grade()
@@ -305,7 +305,7 @@ def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
 
 
 def test_further_flags_keep_the_order_of_the_codes():
-    """What the batch adds stands where its code does."""
+    """Flags added by the batch are sorted in by their codes."""
     graded = student(2).without("final", "zeta_b").grade()
     flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
     data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
@@ -315,7 +315,7 @@ def test_further_flags_keep_the_order_of_the_codes():
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
 def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
-    """No linear carts move like the recordings: the grader does not vouch for what it lets pass."""
+    """If no linear carts fit the recordings, the grader does not vouch for numbers that pass."""
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message

@@ -38,13 +38,13 @@ def test_table_2_of_the_paper_passes_but_for_its_first_cart():
 
 
 def test_table_3_of_the_paper_fails_where_it_is_known_to():
-    """R4 and R5 do not hold, the wall spring comes out negative, ω_2 is off."""
+    """R4 and R5 fail, the wall spring is negative, ω_2 is off."""
     failed = {"redundancy.R4", "redundancy.R5", "sign.k_1", "recomputed.omega_2"}
     assert failed < broken(TABLE_3, n=3)
 
 
 def test_one_digit_excuses_no_more_than_two():
-    """A table typed as 1e1 and 0e2 has no box so wide that every law holds in it."""
+    """The rounding box of a table typed as 1e1 and 0e2 is not wide enough for every law."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}
     assert broken(vague, n=2) == {"recomputed.omega_1", "recomputed.zeta_1"}
     assert "positive.K_1" in broken({**TABLE_2, "K_1": "0e2"}, n=2)
@@ -54,7 +54,7 @@ def test_one_digit_excuses_no_more_than_two():
 @settings(max_examples=20)  # a box of three carts has 2^15 corners
 @given(data=st.data())
 def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
-    """However few digits a real chain's table is typed with, the box of its rounding holds it."""
+    """A real chain's table lies in its rounding box, however few digits are typed."""
     sizes = st.floats(0.5, 2.0)
     digits = data.draw(st.integers(2, 5))
     chain = Chain(
@@ -67,7 +67,7 @@ def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
 
 
 def test_an_incomplete_table_is_not_judged():
-    """Without one of the parameters there is nothing to propagate."""
+    """If a parameter is missing, there is nothing to propagate."""
     typed = {name: Decimal(value) for name, value in TABLE_2.items() if name != "K_1"}
     assert judge_laws(typed, n=2, frequency_percent=3.0, damping_percent=30.0) is None
 
@@ -76,7 +76,7 @@ def test_an_incomplete_table_is_not_judged():
     ("n", "name"), [*((2, x) for x in ("K_1", "omega_a", "omega_2", "zeta_2")), (3, "omega_2")]
 )
 def test_the_worse_a_number_the_less_its_table_earns(n, name):
-    """Widening until all laws hold grows with the error of any one number, up and down."""
+    """The widening until all laws hold grows with the error of any one number, up and down."""
     table = PRESETS[f"throne-{n}dof"].parameters()
 
     def needed(factor: float) -> Fraction:

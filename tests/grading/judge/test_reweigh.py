@@ -1,4 +1,4 @@
-"""Points under another rubric from what was found before: the same as grading again."""
+"""Points under another rubric from stored findings equal those of grading again."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -64,7 +64,7 @@ def _changes(draw, rubric: Rubric) -> Rubric:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(data=st.data())
 def test_points_are_those_of_grading_again(carts, data):
-    """Whatever points, tolerances, costs, lateness and step: every criterion, and the total."""
+    """For any points, tolerances, costs, lateness and step: every criterion, and the total."""
     team = _erring(carts)
     now = data.draw(_changes(team.rubric))
     before = team.graded(days_late=1.3)
@@ -85,7 +85,7 @@ def test_points_are_those_of_grading_again(carts, data):
 
 
 def test_the_same_rubric_gives_the_same_points():
-    """The test's team loses points in several ways, so equal points mean something."""
+    """The test's team loses points in several ways, so equality means something."""
     team = _erring(2)
     before = team.graded(days_late=1.3)
     weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
@@ -94,7 +94,7 @@ def test_the_same_rubric_gives_the_same_points():
 
 
 def test_what_needs_the_recordings_is_named():
-    """Keys that decide what is compared with what."""
+    """Keys that decide what is compared with what need the recordings."""
     rubric = student(2).rubric
     plain = rubric.model_dump(mode="json")
     plain["required"]["final"] = ["K_*"]

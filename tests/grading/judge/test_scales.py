@@ -1,4 +1,4 @@
-"""Recordings in counts or millivolts that are said to be in centimetres or volts."""
+"""Recordings in counts or millivolts that claim to be in centimetres or volts."""
 
 import csv
 from pathlib import Path
@@ -45,14 +45,14 @@ def in_counts(tmp_path_factory):
 
 
 def test_counts_said_to_be_centimetres_fail_a_check(in_counts):
-    """Every gain is hundreds of times too large, and all else agrees."""
+    """Every gain is hundreds of times too large, and everything else agrees."""
     failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
               if c.outcome == "fail"]  # fmt: skip
     assert failed == ["position_scale", "hardware"]  # no stated gains are in counts
 
 
 def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_counts):
-    """The recordings are flagged; the student's gain is not, nor the loop that ran."""
+    """The recordings are flagged, but neither the student's gain nor the loop that ran."""
     graded = grade(in_counts)
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
@@ -62,7 +62,7 @@ def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_cou
 
 
 def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
-    """The gain is held against the recordings times the count; a wrong one shows."""
+    """The gain is compared with the scaled recordings, so a wrong gain is found."""
     outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
     assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
     off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}
@@ -70,7 +70,7 @@ def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
 
 
 def test_millivolts_said_to_be_volts_fail_a_check(tmp_path):
-    """No amplifier at a bench gives hundreds of volts, and no gain is judged by them."""
+    """No amplifier gives hundreds of volts, so no gain is judged by these recordings."""
     graded = grade(scaled(tmp_path / "team", "input", 1e4))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"

@@ -1,4 +1,4 @@
-"""Recordings that do not hold what happened are named and left out; honest ones are not."""
+"""Recordings of something else than they claim are named and left out; honest ones stay."""
 
 import csv
 import re
@@ -32,7 +32,7 @@ Spoil = Callable[[Columns], Columns]
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory) -> Path:
-    """A whole session: two decays a cart, four steps, dwells, a sweep, a closed loop."""
+    """A whole session: two decays for each cart, four steps, dwells, a sweep, a closed loop."""
     folder = tmp_path_factory.mktemp("bench")
     write_submission(folder, PRESET, seed=3, compact=True, reported=True)
     return folder
@@ -43,7 +43,7 @@ def files(folder: Path, start: str) -> list[Path]:
 
 
 def spoil(path: Path, how: Spoil) -> None:
-    """Write a data file anew."""
+    """Write a data file again, changed."""
     with path.open(encoding="utf-8", newline="") as text:
         heading, *rows = csv.reader(text)
     values = how(dict(zip(heading, np.array(rows, dtype=np.float64).T, strict=True)))
@@ -75,7 +75,7 @@ def cut(columns: Columns) -> Columns:
 
 
 def frozen(name: str) -> Spoil:
-    """Freeze an encoder where the cart first turns after the input stepped on."""
+    """Freeze an encoder where the cart first turns after the input step."""
 
     def freeze(columns: Columns) -> Columns:
         x = columns[name].copy()
@@ -114,7 +114,7 @@ SPOILT = {
 }
 
 
-# Those that are searched longest, and each for the same reason as a shorter one.
+# Those with the longest search, and whose reason is the same as that of a shorter one.
 SEARCHED = (
     "cart 1 turned in every step",
     "all dwells exchanged",
@@ -127,7 +127,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Every case where no sign of the input is stated; where one is, those that look like one."""
+    """Every case without a stated sign; with a stated sign, those that look like a wrong one."""
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
@@ -137,7 +137,10 @@ def _cases() -> Iterator[Any]:
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
 def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
-    """The spoilt records and no others are out of all estimates; report and grade say why."""
+    """The spoilt records, and no others, are left out of all estimates;
+
+    report and grade say why.
+    """
     kind, which, how, word = SPOILT[case]
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     _change(folder, ", sign = 1", sign)
@@ -170,7 +173,7 @@ def _failed(analysis: Analysis) -> set[str]:
 
 
 def _numbers_are_right(analysis: Analysis) -> None:
-    """No spoilt record is in any estimate."""
+    """Check that no spoilt record is in any estimate."""
     for row in analysis.rows:
         assert row.final is not None
         assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
@@ -179,7 +182,7 @@ def _numbers_are_right(analysis: Analysis) -> None:
 
 
 def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
-    """Sixty rows are no steady state where they hold fewer than one and a half cycles."""
+    """Sixty rows are too few for a steady state if they hold less than 1.5 cycles."""
     folder = shutil.copytree(bench, tmp_path / "cut")
     for path in files(folder, "sine"):
         spoil(path, cut)
@@ -200,7 +203,10 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
 def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     kind, stated, word, bench, tmp_path
 ):
-    """What is flagged where it is graded fails a check of the report, and is in no number."""
+    """A flag in grading corresponds to a failed check in the report;
+
+    no number uses the recording.
+    """
     folder = shutil.copytree(bench, tmp_path / "kind")
     path = files(folder, kind)[1]
     if stated == "cut":
@@ -222,7 +228,7 @@ def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)])
 def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
-    """One or all: a warning names them, and no number is the worse for them."""
+    """One or all: a warning names them, and no number is worse."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     paths = files(folder, "decay")[which]
     for path in paths:
@@ -235,7 +241,7 @@ def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
 
 
 def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
-    """Rad/s where hertz are asked for: no dwell is the file of another experiment."""
+    """If rad/s was typed for hertz, no dwell is blamed as the file of another experiment."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
     path.write_text(
@@ -252,7 +258,7 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
 
 
 def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
-    """Where `carts` is left out all are free: the line that mends it is named."""
+    """If `carts` is left out, all carts are free: the message gives the line that fixes it."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1)
@@ -262,7 +268,7 @@ def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_pa
 
 
 def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
-    """A clock in milliseconds is no run to hold the model against, and the reason is there."""
+    """A loop whose clock is in milliseconds is not compared with the model; the reason is given."""
     folder = shutil.copytree(bench, tmp_path / "loop")
     for path in files(folder, "control"):
         spoil(path, in_milliseconds)
@@ -274,7 +280,7 @@ def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
 
 
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
-    """Three of four exchanged steps are out, the one as it was is not, and no sign is advised."""
+    """Three of four swapped steps are left out, the right one is kept, and no sign is advised."""
     folder = shutil.copytree(bench, tmp_path / "most")
     steps = files(folder, "step")
     for path in steps[:3]:
@@ -302,7 +308,7 @@ def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
 
 
 def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
-    """A repeat that names the file of another is left out, and flagged."""
+    """A repeat that names the file of another is left out and flagged."""
     folder = shutil.copytree(bench, tmp_path / "copied")
     _change(folder, "data/step-2.csv", "data/step-1.csv")
     graded = grade_submission(
@@ -316,7 +322,7 @@ def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
-    """No record follows any carts as it is, all of them do exchanged: nothing is identified."""
+    """All records fit only if exchanged, so nothing is identified."""
     folder = shutil.copytree(bench, tmp_path / "exchanged")
     driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
     for path in driven:
@@ -329,7 +335,7 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
 
 
 def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
-    """The input of all dwells or all steps is ten times off, nobody knows which: both are said."""
+    """Either all dwells or all steps have an input ten times off; both readings are reported."""
     folder = shutil.copytree(bench, tmp_path / "undecided")
     for path in files(folder, "sine"):
         spoil(path, times(10, "input"))
@@ -349,7 +355,7 @@ def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tm
 
 
 def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench, tmp_path):
-    """What moves in a dwell is not what its input moves."""
+    """The cart in the dwell is moved by something other than its input."""
     folder = shutil.copytree(bench, tmp_path / "stray")
     path = files(folder, "sine")[4]
 
@@ -380,7 +386,7 @@ def test_records_of_two_carts_identify_no_third(bench, tmp_path):
 
 @pytest.mark.parametrize("kind", ["step-3", "sine-05"])
 def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
-    """At two counts a sample no reading shows it by itself: the cart moves on, and far."""
+    """At two counts a sample no reading reveals it, but the cart has moved far meanwhile."""
     write_submission(tmp_path, replace(preset_bench(PRESET), count=0.03), seed=5, compact=True)
     (path,) = files(tmp_path, kind)
 
@@ -405,7 +411,7 @@ def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
 
 
 def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
-    """In a microsecond the carts may do anything slow: no such reading makes a record follow."""
+    """In microseconds carts may do anything slow, so such a reading never fits."""
     chain = PRESETS[PRESET]
     dwell = next(
         r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"

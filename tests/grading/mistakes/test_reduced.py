@@ -1,4 +1,4 @@
-"""A table the students reduced themselves is held against their own dwells."""
+"""A table that the students reduced themselves is compared with their own dwells."""
 
 from dataclasses import replace
 
@@ -49,7 +49,7 @@ def changed(analysis: Analysis, *, ratio=lambda x: x, stretch: float = 1.0) -> A
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, ("coulomb_friction",))])
 def test_an_honest_table_gets_no_flag(carts, hide):
-    """Half the swing of the last cycles is not what a fit of a sine gives, and right."""
+    """Half the swing of the last cycles differs from a sine fit, and is right."""
     analysis = student(carts, hide=hide).analysis
     assert diagnose_reduced(changed(analysis)) == []
 
@@ -67,7 +67,7 @@ def test_an_honest_table_gets_no_flag(carts, hide):
     ],
 )
 def test_a_slip_in_the_table_is_named(carts, code, change):
-    """Every row is off the same way; the dwells say which."""
+    """Every row is off in the same way, as the dwells show."""
     (flag,) = diagnose_reduced(changed(student(carts).analysis, **change))
     assert flag.code == code
     assert "reduced table" in flag.message
@@ -76,7 +76,7 @@ def test_a_slip_in_the_table_is_named(carts, code, change):
 
 @pytest.mark.parametrize(("code", "factor"), [("peak_to_peak", 2.0), ("hz_for_rad_s", TURN)])
 def test_without_dwells_steps_and_decays_tell(code, factor):
-    """The fit to the table is off the steps, or the decays, by the same factor for every cart."""
+    """The fit to the table differs from the steps, or decays, by one factor for every cart."""
     analysis = student(2).analysis
     symbol = "K" if code == "peak_to_peak" else "omega"
     rows = tuple(

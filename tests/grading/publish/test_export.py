@@ -1,4 +1,4 @@
-"""Exports as the platforms themselves read them: their importers' rules, written anew."""
+"""Exports as the platforms read them, checked against their importers' rules."""
 
 import csv
 import io
@@ -27,7 +27,7 @@ RUBRIC = two_cart_rubric()
 
 
 def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), **options):
-    """Export a class; return the rows of its table and what was said."""
+    """Export a class; return the rows of its table and the messages."""
     with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
         for outcome in outcomes:
             book.put(outcome)
@@ -44,7 +44,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
 
 
 def test_a_grade_is_better_than_none(tmp_path):
-    """Who stands in a hand-in that could not be graded and in one without points has those."""
+    """An author of two submissions, one ungraded and one without points, gets the points."""
     unread = failed_grade("a", "too slow")
     unread = unread.model_copy(update={"authors": ("bob",)})
     nothing = make_grade("b", share=0.0, authors=("bob",))
@@ -101,7 +101,7 @@ BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (10
 
 
 def test_canvas_takes_the_grades(tmp_path):
-    """A row for every author; who could not be graded is blank, and said."""
+    """A row for every author; an ungraded one is blank, with a message."""
     rows, remarks = write(tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3 (77)")
 
     assert canvas_import(rows) == {
@@ -112,7 +112,7 @@ def test_canvas_takes_the_grades(tmp_path):
 
 
 def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
-    """Then somebody did grade it, even with no points."""
+    """A grade given by hand counts even if it has no points."""
     rows, remarks = write(
         tmp_path, BROKEN, platform="canvas", overrides=[("team-3", "pieces", 0.0)]
     )
@@ -121,7 +121,7 @@ def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
 
 
 def test_a_submission_that_names_nobody_is_said(tmp_path):
-    """A row without a student is no use to a platform; a person has to find out whose it is."""
+    """A platform cannot use a row without a student, so a person must find out whose it is."""
     nobody = make_outcome(failed_grade("team-8", "broken"))
     rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
     assert len(rows) == 4
@@ -130,7 +130,7 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
-    """The same number means another student there: nobody gets somebody else's grade."""
+    """The same number means another student there, so nobody gets another's grade."""
     others = {"canvas", "moodle", "gradescope"} - {platform}
     entries = [
         make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
@@ -146,7 +146,7 @@ def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
 
 
 def test_canvas_own_export_is_filled_in(tmp_path):
-    """By id, login or name; its assignment's column is found by its title; others are left out."""
+    """By id, login or name; the column is found by the assignment's title; other rows stay."""
     roster = (
         "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (77),Final Score\n"
         "    Points Possible,,,,,20,(read only)\n"
@@ -163,7 +163,7 @@ def test_canvas_own_export_is_filled_in(tmp_path):
 
 
 def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
-    """Nobody can say which row is meant: both stay as they were, and that is the reason told."""
+    """If two rows could be meant, both stay as they were, with the reason."""
     roster = (
         "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"
         "    Points Possible,,,,,20\n"
@@ -205,7 +205,7 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
 
 
 def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
-    """Moodle keeps its own maximum, so that every grade would be of the wrong one."""
+    """Moodle keeps its own maximum, so every grade would be wrong."""
     roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
     write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
     with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20 points"):
@@ -213,7 +213,7 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
 
 
 def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
-    """Canvas keeps its own points possible: 20 of 18 would be shown."""
+    """Canvas keeps its own points possible: it would show 20 of 18."""
     roster = (
         "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
         "    Points Possible,,,{},40\n"
@@ -225,7 +225,7 @@ def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
 
 
 def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
-    """Also where they are all of them."""
+    """Also if all points were given by hand."""
     first = RUBRIC.criteria[0]
     given = [("team-b", first.id, first.points)]
     outcome = make_outcome(make_grade("team-b", share=0.0, authors=("bo",)))
@@ -234,7 +234,7 @@ def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
 
 
 def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
-    """Where nobody's participant number is known: by id number."""
+    """If no participant number is known: by id number."""
     rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
     assert rows == [
         ["ID number", "Lab 3 (Real)", "Lab 3 (Feedback)"],
@@ -244,7 +244,7 @@ def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
 
 
 def test_gradescope_gets_a_result_for_each_submission(tmp_path):
-    """With the keys and the values that its specification of autograders allows, and no others."""
+    """It has the keys and values of the autograder specification, and no others."""
     late = make_outcome(make_grade("team-4", share=0.5, days_late=1.25, deducted=1.0, points=9.0))
     rows, _ = write(tmp_path, HALF, FULL, BROKEN, late, platform="gradescope")
 
@@ -275,7 +275,7 @@ def test_gradescope_gets_a_result_for_each_submission(tmp_path):
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
 def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
-    """Not the higher ones, in no table and no comment; a person is told where they stand."""
+    """No table or comment shows the higher points; a message names the submissions."""
     other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
     rows, remarks = write(tmp_path, HALF, other, platform=platform)
     assert not [cell for row in rows for cell in row if re.search(r"^(10|5)$|omega_1", cell)]
@@ -286,14 +286,14 @@ def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path
 
 
 def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
-    """Partners who each hand in what both did."""
+    """Partners may each submit the work that both did."""
     other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
     rows, remarks = write(tmp_path, HALF, other, platform="canvas")
     assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
 
 
 def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
-    """One by an author's id, one by the number of who handed it in: nobody chose either."""
+    """One by an author's id, one by the uploader's number: nobody chose between them."""
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
     by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
     by_number = make_outcome(make_grade("o", authors=("x", "y")), owner="doejane (canvas 1001)")
@@ -308,7 +308,7 @@ def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
 
 
 def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
-    """An author of two submissions handed one of them in: which counts is still open, said once."""
+    """An author of two submissions uploaded one; which counts is still open, reported once."""
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
     one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
     other = make_outcome(make_grade("b", share=0.25, authors=("s1",)))
@@ -321,9 +321,9 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
 
 @pytest.mark.parametrize("own", [False, True])
 def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
-    """The number of who handed it in goes first; the author, with a row of their own, has none.
+    """The uploader's number goes first, so an author with a row of their own has no points.
 
-    With a hand-in of their `own` that could not be graded they are in two submissions.
+    With an ungraded submission of their `own` they are in two submissions.
     """
     roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
     broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})
@@ -347,7 +347,7 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
-    """As who its folder is called, which is said; or as those it named before it broke."""
+    """Under the folder's name, with a message, or under the authors named before it broke."""
     broken = make_outcome(failed_grade("team-8", "no TOML"))
     rows, remarks = write(
         tmp_path, broken, platform=platform, overrides=[("team-8", "pieces", 0.75)]
@@ -368,7 +368,10 @@ def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, pla
 
 
 def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
-    """By the number in the file's name, where no author's id is Canvas'; who is lost is named."""
+    """If no author's id is known to Canvas, the number in the file's name counts;
+
+    others are named.
+    """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section\n"Doe, Jane",1001,S1,doejane,A\n'
     team = make_outcome(make_grade("t", authors=("u1a", "u1b")), owner="doejane (canvas 1001)")
     other = make_outcome(make_grade("o", authors=("x", "y")), owner="roeric (canvas 9)")
@@ -391,7 +394,7 @@ def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
     ],
 )
 def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
-    """Another platform's as well: the columns that it should have are named."""
+    """A table of another platform, too: the message names the columns it should have."""
     with pytest.raises(
         ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
     ):
@@ -399,7 +402,7 @@ def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
 
 
 def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
-    """Nobody says which is to be filled in; columns without a name are no matter."""
+    """It is unclear which one to fill in; columns without a name do not matter."""
     with pytest.raises(ConfigError, match=r"roster\.csv: has two columns 'Lab'"):
         write(tmp_path, HALF, platform="canvas", roster="Student,ID,Lab,Lab\na,1,,\n")
     rows, _ = write(tmp_path, HALF, platform="gradescope", roster="SID,,Name,\ns-team-1,x,y,z\n")
@@ -408,7 +411,7 @@ def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
 
 
 def test_gradescope_must_have_a_score(tmp_path):
-    """Zero where nothing could be graded, and the person who uploads it is told."""
+    """Ungraded submissions get zero, and a message tells the person who uploads."""
     _, remarks = write(tmp_path, BROKEN, platform="gradescope")
     (path,) = (tmp_path / "out" / "gradescope").glob("*/results.json")
     assert json.loads(path.read_text("utf-8"))["score"] == 0
@@ -417,7 +420,7 @@ def test_gradescope_must_have_a_score(tmp_path):
 
 @pytest.mark.parametrize("platform", ["moodle", "gradescope"])
 def test_no_comment_names_the_other_team(tmp_path, platform):
-    """That a recording stands in another submission is said; in whose, the TA may say."""
+    """The comment says that a recording is also in another submission, but not whose."""
     shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
     write(tmp_path, shared, platform=platform)
     texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]

@@ -1,4 +1,4 @@
-"""The figures of the feedback: the curve drawn is that of the numbers reported."""
+"""The figures of the feedback: the curve is drawn from the reported numbers."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_the_curve_is_that_of_the_table(preset):
 
 
 def test_each_cart_has_a_figure_with_the_reported_curve():
-    """Drawn dashed beside the fit; the same bytes each time."""
+    """It is dashed beside the fit, and has the same bytes each time."""
     two = student(2)
     figures = draw_figures(two.analysis, two.reported)
 
@@ -37,7 +37,7 @@ def test_each_cart_has_a_figure_with_the_reported_curve():
 
 @pytest.mark.parametrize("left", ["K_1", "omega_a", "zeta_2"])
 def test_a_table_that_is_not_complete_has_no_curve(left):
-    """The measured response and the fit are shown all the same."""
+    """Measured response and fit are shown all the same."""
     two = student(2).without("final", left)
     figures = draw_figures(two.analysis, two.reported)
     assert len(figures) == 2
@@ -45,7 +45,7 @@ def test_a_table_that_is_not_complete_has_no_curve(left):
 
 
 def test_a_table_without_damping_has_a_curve():
-    """Its peaks and nulls have no end, which does not end the drawing."""
+    """Its peaks and nulls are infinite, and are drawn all the same."""
     zetas = {name: 0.0 for name in ("zeta_a", "zeta_b", "zeta_1", "zeta_2")}
     two = student(2).reporting(final=zetas)
     assert all("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
@@ -59,7 +59,7 @@ def test_numbers_that_stand_for_no_response_have_no_curve(value):
 
 
 def test_a_number_that_lost_points_is_shown_on_its_record():
-    """With the number as reported and as recomputed; what was right is not drawn."""
+    """Reported and recomputed value are drawn; numbers that were right are not."""
     honest = student(2)
     wrong = {"K_1": 1.4 * honest.value("initial", "K_1"), "omega_2": 5.24}
     two = honest.reporting(initial=wrong)
@@ -83,7 +83,7 @@ def test_a_number_that_lost_points_is_shown_on_its_record():
 
 @pytest.mark.parametrize(("omega", "zeta"), [(-3.0, 0.1), (1e9, 0.1), (20.0, 1.5), (20.0, -1.0)])
 def test_numbers_of_no_swing_are_told_and_not_drawn(omega, zeta):
-    """Whatever is reported, the record stands with the numbers beside it."""
+    """Whatever is reported, the record is shown with the numbers beside it."""
     two = student(2)
     criterion = Criterion(
         id="decays", title="", outcome="fail", points=0.0, out_of=1.0, message="",

@@ -1,4 +1,4 @@
-"""What a grading writes: files that are a function of the gradebook, harmless and complete."""
+"""A grading's files: they depend on the gradebook alone, and are harmless and complete."""
 
 import csv
 import io
@@ -43,7 +43,7 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_remark_s_evidence_keeps_its_words():
-    """The table meant, a slip that explains it and yes or no stand beside the numbers."""
+    """The table meant, a slip that explains it, and yes or no are beside the numbers."""
     evidence = {
         "parameter": "A[2,1]", "table": "initial", "reported": 3.0, "stable": False,
         "slip": "rows 1 and 2 are exchanged", "also_in": "final", "ran": [1.0], "gone": "",
@@ -61,7 +61,7 @@ def test_a_remark_s_evidence_keeps_its_words():
 
 @pytest.fixture(scope="module")
 def graded(tmp_path_factory) -> Path:
-    """A class with all sorts of submissions in it."""
+    """A class with all kinds of submissions."""
     return write_class(tmp_path_factory.mktemp("class"))
 
 
@@ -82,7 +82,7 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_submission_has_its_row(graded):
-    """A broken one too, with its reason; points by criterion, lateness, and points by hand."""
+    """Also a broken one, with its reason; points by criterion, lateness, and points by hand."""
     rows = {row["submission"].lstrip("'"): row for row in rows_of(graded / "grades.csv")}
 
     assert len(rows) == 16
@@ -105,7 +105,7 @@ def test_no_cell_is_a_formula(graded):
 
 
 def test_a_criterion_may_be_called_like_a_column():
-    """Its column is told apart."""
+    """Its column has another heading."""
     criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
     rubric = RUBRIC.model_copy(update={"criteria": criteria})
     (head,) = csv.reader([grades_csv([], rubric=rubric).strip()])
@@ -117,7 +117,7 @@ def test_a_criterion_may_be_called_like_a_column():
 
 
 def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
-    """In another folder, and where everything is graded in another order in between."""
+    """In another folder, and if everything is graded in another order in between."""
     again = write_class(tmp_path)
     assert tree(again) == tree(graded)
 
@@ -133,7 +133,7 @@ def test_nothing_of_a_student_is_markup(graded):
 
 
 def test_every_link_of_the_class_leads_to_feedback(graded):
-    """Whatever the names."""
+    """The links work for any name."""
     html = (graded / "class.html").read_text(encoding="utf-8")
     links = set(re.findall(r'href="(feedback/[^"]*)"', html))
     assert len(links) == 16
@@ -141,7 +141,7 @@ def test_every_link_of_the_class_leads_to_feedback(graded):
 
 
 def test_grade_json_says_what_was_given_by_hand(graded):
-    """The reason, but not who: that is in the gradebook."""
+    """The reason, but not the person, who is in the gradebook."""
     text = (graded / "feedback" / "team-02" / "grade.json").read_text(encoding="utf-8")
     grade = json.loads(text)
     assert grade["schema"] == "cartlab-grade/1"
@@ -153,7 +153,7 @@ def test_grade_json_says_what_was_given_by_hand(graded):
 
 
 def test_only_what_changed_is_written_again(tmp_path):
-    """An override writes one feedback; what is missing is made again; what is stale goes."""
+    """An override writes one feedback; missing files are made again; stale ones are removed."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
         for outcome in outcomes:
@@ -179,7 +179,7 @@ def test_only_what_changed_is_written_again(tmp_path):
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
 def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
-    """Should a gradebook hold one, nothing is written outside."""
+    """If a gradebook holds such a name, nothing is written outside."""
     with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
         book.put(make_outcome(make_grade(name), key="k"))
         book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
@@ -193,7 +193,7 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
 
 
 def test_without_names_nothing_tells_who_it_was(tmp_path):
-    """Not the pages, not the table, not its order; the key does."""
+    """Pages, table and order reveal nobody; only the key does."""
     outcomes = [
         make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
         make_outcome(make_grade("ann-lab", authors=("ann",))),
@@ -220,18 +220,18 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
     assert names == sorted(key)
     for name, content in tree(out).items():
         if name != KEY_FILE:
-            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font may spell anything
+            told = re.sub(rb'url\("data:[^"]*"\)', b"", content)  # a font may draw any text
             assert not re.search(rb"zoe|\bann\b|bob", told), name
             assert not re.search(r"zoe|ann-|bob", name)
     (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
     (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
     flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
-    assert flag["evidence"]["submissions"] == [ann]  # handing in again changes no name
+    assert flag["evidence"]["submissions"] == [ann]  # submitting again changes no name
     assert ann in flag["message"]
 
 
 def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
-    """Teams are called 3, or step: numbers and experiments in their feedback stay."""
+    """Teams may be named 3 or step: numbers and experiments in their feedback stay."""
     grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
@@ -248,12 +248,12 @@ def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
     ],
 )
 def test_a_reason_names_nobody(reason, shown):
-    """Neither the folder before a file nor an archive with the student's name stays."""
+    """Neither the folder before a file nor an archive with the student's name is shown."""
     assert anonymise(failed_grade("3", reason), {"3": "anon-a"}).reason == shown
 
 
 def test_names_that_stand_in_are_all_different():
-    """Ten thousand of them, made from what was handed in alone."""
+    """Ten thousand of them, made from the submissions alone."""
     names = pseudonyms({f"team-{n}": f"key {n}" for n in range(10_000)})
     assert len(set(names.values())) == 10_000
     assert names["team-7"].startswith(pseudonyms({"renamed": "key 7"})["renamed"])
@@ -263,7 +263,7 @@ def test_names_that_stand_in_are_all_different():
 
 
 def test_every_flag_has_a_name_and_a_place_to_look():
-    """In words, for all codes there are."""
+    """All codes have a title and a place."""
     for said in ("title", "place"):
         assert [k for k in WORDS.by_key if k.startswith(f"{said}_")] == [
             f"{said}_{c}" for c in CODES
@@ -271,7 +271,7 @@ def test_every_flag_has_a_name_and_a_place_to_look():
 
 
 def test_the_feedback_puts_their_numbers_beside_ours():
-    """Both, the difference, the message, the help, and what lateness took."""
+    """Both numbers, the difference, the message, the help, and the cost of lateness."""
     grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
@@ -283,7 +283,7 @@ def test_the_feedback_puts_their_numbers_beside_ours():
 
 
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
-    """All points or not, the page asks to talk; in whose submission it stands, it leaves open."""
+    """Whatever the points, the page asks for a talk and does not name the other team."""
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
@@ -301,7 +301,7 @@ def test_a_submission_that_could_not_be_graded_hears_why():
 
 
 def test_a_broken_submission_hears_every_reason(tmp_path):
-    """Three mistakes in its file are three lines of the feedback, and one cell of the table."""
+    """Three mistakes in its file are three lines of feedback and one cell of the table."""
     folder = tmp_path / "class" / "team-1"
     (folder / "data").mkdir(parents=True)
     text = 'version = 1\n[system]\ncarts = 2\nspring = [true]\n[design]\ncart = "two"\n[reportd]\n'
@@ -321,7 +321,7 @@ def test_a_broken_submission_hears_every_reason(tmp_path):
 
 
 def test_numbers_of_a_criterion_have_words_and_units():
-    """An overshoot of 0 beside one of 10⁻⁷ % is no difference; points are no share of a share."""
+    """An overshoot of 0 equals one of 10⁻⁷ %; points are not a percentage of a percentage."""
     units = Units(position="cm", input="V")
     claims = Criterion(
         id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
@@ -350,7 +350,7 @@ def test_numbers_of_a_criterion_have_words_and_units():
     ],
 )  # fmt: skip
 def test_a_number_has_its_unit(name, unit):
-    """Parameters, and the entries of A and B whose states are a position and a velocity."""
+    """Parameters, and entries of A and B whose states are positions and velocities."""
     one = make_grade("a").criteria[0].model_copy(update={"expected": {name: 1.0}, "found": {}})
     units = Units(position="cm", input="V")
     shown = numbers_table(one, check="final", units=units, numbers=count(1))
@@ -371,7 +371,7 @@ _VALUES = (
 @settings(max_examples=40)
 @given(st.dictionaries(st.text(max_size=8), _VALUES, max_size=4))
 def test_any_numbers_can_be_shown(values):
-    """Infinite, missing, text or nested: a page comes of it, with its control characters gone."""
+    """Infinite, missing, text or nested: the page is written, without control characters."""
     grade = make_grade("team-1", share=0.5)
     found = dict(reversed(values.items()))
     first = grade.criteria[0].model_copy(update={"expected": values, "found": found})
@@ -389,7 +389,7 @@ def test_only_all_points_are_100_percent(points, percent):
 
 
 def test_the_class_page_counts_what_there_is():
-    """Mean and median of those graded, outcomes by criterion, mistakes by how many made them."""
+    """Mean and median of the graded ones, outcomes by criterion, mistakes by number of teams."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
     lines = [Line.of(grade) for grade in grades]
@@ -413,7 +413,7 @@ def shares(*found: tuple[str, str, str]) -> Flag:
 
 
 def test_the_class_page_groups_who_shares_with_whom(tmp_path):
-    """Clusters, and in each what stands where; a submission of an earlier batch has no page."""
+    """Groups, with the recordings of each; a submission of an earlier batch has no page."""
     shared = {
         "a": shares(("step-1", "b", "step-2"), ("sine-1", "b", "sine-1")),
         "b": shares(("step-2", "a", "step-1"), ("sine-1", "a", "sine-1"), ("d", "c", "d")),
@@ -446,7 +446,7 @@ def test_the_class_page_groups_who_shares_with_whom(tmp_path):
 
 
 def test_the_class_is_a_frame(tmp_path):
-    """A row a submission and criterion; what was never judged is there without points."""
+    """One row for each submission and criterion; a criterion never judged has no points."""
     outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
                 make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
                 make_outcome(failed_grade("c", "broken"))]  # fmt: skip
@@ -480,7 +480,7 @@ def missing_flag() -> Flag:
 
 
 def test_points_by_hand_are_not_asked_for_again():
-    """Who was graded by hand reads so, on the page and in Gradescope, and hands in nothing anew."""
+    """The page and Gradescope say that it was graded by hand; nothing must be submitted again."""
     grade = failed_grade("team-7", "no submission.toml in it")
     given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
     given = {given.criterion: given}
@@ -497,25 +497,25 @@ def test_points_by_hand_are_not_asked_for_again():
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
-    """Nobody handed in, or nothing could be graded."""
+    """Nobody submitted, or nothing could be graded."""
     html = class_page([Line.of(grade) for grade in grades], rubric=RUBRIC)
     assert "Submissions" in html
 
 
 @pytest.mark.parametrize(("text", "points"), [("2", 2.0), ("1,5", 1.5), ("AUTO", None)])
 def test_points_are_read_as_typed(text, points):
-    """With either decimal mark; auto means the automatic ones."""
+    """With either decimal mark; auto means the automatic points."""
     assert read_points(text) == points
 
 
 def test_points_that_are_none_are_refused():
-    """With what they may be."""
+    """The message says what is allowed."""
     with pytest.raises(ConfigError, match="two: points are a number, or auto"):
         read_points("two")
 
 
 def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
-    """Semicolons, tabs, a byte-order mark, blank lines; with the lines its rows end on."""
+    """Semicolons, tabs, a byte-order mark, blank lines; each row keeps its line number."""
     path = tmp_path / "t.csv"
     path.write_text('\ufeffa;b\n\n"x\ny";"1;2"\n', encoding="utf-8")
     table = read_table(path)

@@ -1,4 +1,4 @@
-"""Tables that platforms and people bring, damaged and hostile: a clear error or a result."""
+"""Damaged and hostile tables of platforms and people: a clear error or a result."""
 
 import csv
 import io
@@ -38,7 +38,7 @@ STUDENTS = [
 
 
 def filled(platform) -> Callable[[Path], object]:
-    """Return what fills in a roster of a platform, and looks at what comes of it."""
+    """Return a function that fills in a platform's roster and checks the result."""
 
     def fill(path: Path) -> None:
         roster = Roster.read(path, platform=platform)
@@ -70,7 +70,7 @@ READERS = {
 @settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(table=_TABLE, separator=st.sampled_from(",;\t"), tail=st.binary(max_size=4))
 def test_a_hostile_table_is_read_or_refused(tmp_path, reader, table, separator, tail):
-    """In one clear line, whatever stands in it."""
+    """With one clear line, whatever the content."""
     head, rows = table
     buffer = io.StringIO(newline="")
     csv.writer(buffer, delimiter=separator, escapechar="\\").writerows([head, *rows])
@@ -87,6 +87,6 @@ def test_a_hostile_table_is_read_or_refused(tmp_path, reader, table, separator, 
 
 
 def test_the_first_of_several_columns_may_have_no_name(tmp_path):
-    """A spreadsheet's empty columns are nobody's."""
+    """Columns without a name are ignored."""
     (tmp_path / "t.csv").write_text(",,SID\na,b,s1\n", encoding="utf-8")
     READERS["gradescope"](tmp_path / "t.csv")

@@ -35,7 +35,7 @@ def answers(average: str) -> list[int]:
 
 
 def write_paper(path, *, heading="{level}: {concept}"):
-    """Write the answers of the paper's class: twelve of thirteen students said something."""
+    """Write the answers of the paper's class: twelve of thirteen students answered."""
     columns: dict[str, list[str]] = {"Timestamp": [f"2003-11-{d:02d}" for d in range(1, 14)]}
     for question, counts in COUNTS.items():
         given = [word for word, n in zip(SCALE, counts, strict=True) for _ in range(n)]
@@ -53,7 +53,7 @@ def write_paper(path, *, heading="{level}: {concept}"):
     "heading", ["{level}: {concept}", "{level} [{concept}]", "{level} - {concept}"]
 )
 def test_the_tables_of_the_paper_come_out(tmp_path, heading):
-    """Their percents and averages to the digit; a column of dates is left out."""
+    """Percents and averages agree to the digit; a column of dates is left out."""
     survey = read_survey(write_paper(tmp_path / "answers.csv", heading=heading))
 
     assert {q: tuple(row) for q, *row in survey.percents.itertuples()} == TABLE_4
@@ -91,7 +91,7 @@ def test_the_tables_read_as_markdown(tmp_path):
     ],
 )
 def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
-    """With line, question and answer; never guessed, never dropped."""
+    """The message has line, question and answer; nothing is guessed or dropped."""
     path = tmp_path / "a.csv"
     path.write_text(rows, encoding="utf-8")
     with pytest.raises(ConfigError, match=re.escape(message)):

@@ -1,4 +1,4 @@
-"""Errors and credit: exact at the edge, monotone in the error, rounding taken off."""
+"""Errors and credit: exact at the edge, monotone in the error, rounding subtracted."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -34,7 +34,10 @@ def test_half_a_digit_is_that_of_the_typed_number(typed, half):
 
 @given(full=percents, width=percents)
 def test_the_edges_belong_to_the_tolerance(full, width):
-    """At exactly `full` all points are earned; at exactly `none` none, unless it is `full` too."""
+    """At exactly `full` all points are earned;
+
+    at exactly `none` no points, unless they are equal.
+    """
     none = float(Decimal(str(full)) + Decimal(str(width)))
     assert credit(Fraction(str(full)), full=full, none=none) == 1
     assert credit(Fraction(str(none)), full=full, none=none) == (0 if none > full else 1)
@@ -89,13 +92,13 @@ def test_a_wrong_sign_earns_nothing():
 
 @pytest.mark.parametrize("vague", ["0e2", "0", "0.0", "-0.0"])
 def test_a_zero_is_no_number_that_fits_everything(vague):
-    """What rounding may excuse is a share of the number: of zero it is nothing."""
+    """Rounding may excuse a share of the number, so nothing of zero."""
     assert rounding(Decimal(vague)) == 0
     assert credit(percent_off(Decimal(vague), at(0.1), sigmas=0.0), full=50.0, none=200.0) == 0
 
 
 def test_one_digit_is_excused_as_little_as_two():
-    """3e1 may stand for 28.5 to 31.5, not for 25 to 35."""
+    """3e1 may mean 28.5 to 31.5, not 25 to 35."""
     assert rounding(Decimal("3e1")) == Fraction(3, 2)
     assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)
 

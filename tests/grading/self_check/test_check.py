@@ -1,4 +1,4 @@
-"""The check: which numbers disagree and where to look, and no answer from which a value follows."""
+"""The check names the numbers that disagree and where to look; no answer reveals a value."""
 
 import json
 import re
@@ -22,7 +22,7 @@ team = cache(make_team)
 
 
 def slipped(slip: str, seed: int) -> Team:
-    """Return the team of a seed with a slip, or as it is where one cart cannot have it."""
+    """Return the team of a seed with a slip, or unchanged if one cart cannot have it."""
     one = team(seed)
     alone = one.bench.chain.n == 1 and slip in OF_SEVERAL_CARTS
     return one if alone else SLIPS[slip](one)
@@ -38,7 +38,7 @@ def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
 
 
 def stripped(text: str, one: Team) -> str:
-    """Return a text without what is no number: names of numbers, recordings, carts; the counts."""
+    """Return a text without its names of numbers, recordings and carts, and without the counts."""
     for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
         text = text.replace(run, "")
     text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
@@ -50,7 +50,7 @@ def stripped(text: str, one: Team) -> str:
 @pytest.mark.parametrize("slip", sorted(SLIPS))
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
-    """Neither stage has a digit left once names and counts are taken away, in words or in JSON."""
+    """In neither stage a digit is left once names and counts are removed, in words or in JSON."""
     one = slipped(slip, seed)
     for answer in asked_twice(judge(one)):
         said = stripped("\n".join(answer_lines(answer)), one)
@@ -62,7 +62,7 @@ def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_answer_tells_neither_side_nor_size(seed):
-    """A gain a third too large, half too large and a third too small: one answer, word for word."""
+    """A gain a third too large, half too large or a third too small gives the same answer."""
     one = team(seed)
     name = next(iter(one.reported.final))
     answers = set()
@@ -77,7 +77,7 @@ def test_the_answer_tells_neither_side_nor_size(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_honest_numbers_agree(seed):
-    """Readings and fits of careful students: nothing disagrees beyond what also loses points."""
+    """For readings and fits of careful students nothing disagrees that would not lose points."""
     one = team(seed)
     found = judge(one)
     assert found.agree
@@ -87,7 +87,7 @@ def test_honest_numbers_agree(seed):
 
 @pytest.mark.parametrize("slip", sorted(SLIPS.keys() - NOT_PLACED))
 def test_each_common_mistake_is_placed(slip):
-    """Asked again, the kind of mistake is named for a number that it made wrong, most times."""
+    """In the second stage the kind of mistake is named for most numbers that it made wrong."""
     placed = []
     for seed in SEEDS:
         one = slipped(slip, seed)
@@ -102,7 +102,7 @@ def test_each_common_mistake_is_placed(slip):
 
 
 def test_where_is_told_only_of_what_disagreed_and_was_not_changed():
-    """First which; then where, of what was asked for; after any change which again."""
+    """First which, then where for the same numbers; after any change, which again."""
     one = SLIPS["peak_to_peak"](team(1))
     found = judge(one)
     first, second = asked_twice(found)

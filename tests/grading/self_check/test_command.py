@@ -1,4 +1,4 @@
-"""`cartlab check` as it is typed: its exit status, its file, and folders that were changed."""
+"""`cartlab check` as it is typed: exit status, file, and changed folders."""
 
 import json
 import re
@@ -39,13 +39,13 @@ def honest(tmp_path):
 
 @pytest.fixture
 def in_hertz(honest):
-    """One whose first frequency is in Hz."""
+    """A submission whose first frequency is in Hz."""
     change(honest, "omega_n = 13.1", "omega_n = 2.085")
     return honest
 
 
 def test_right_numbers_are_status_0(honest):
-    """And the one ask is in the folder."""
+    """The one question is recorded in the folder."""
     done = check(honest, "--rubric", RUBRIC)
     assert done.returncode == 0
     assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
@@ -66,7 +66,7 @@ def test_first_which_then_where(in_hertz):
 
 
 def test_a_change_begins_again_with_which(in_hertz):
-    """Also one that is wrong again; every ask is counted."""
+    """Also after a change that is wrong again; every question is counted."""
     check(in_hertz)
     change(in_hertz, "omega_n = 2.085", "omega_n = 9.0")
     again = check(in_hertz)
@@ -93,7 +93,7 @@ def test_a_rubric_of_other_carts_cannot_be_used(honest):
 
 
 def test_nothing_reported_cannot_be_checked(honest):
-    """It says what to write where."""
+    """The message says what to write where."""
     path = honest / "submission.toml"
     text = path.read_text(encoding="utf-8").partition("[reported")[0]
     path.write_text(text, encoding="utf-8")
@@ -106,7 +106,7 @@ def test_nothing_reported_cannot_be_checked(honest):
     "text", ["", "\n", "{}\n", "no json\n", '{"ask": 1}\n', "[" * 100_000, "\x00", "\u2028\n"]
 )
 def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
-    """One line names it; the file stays. An empty one holds nothing, and is gone on from."""
+    """One line names it; the file stays. An empty file is accepted."""
     (honest / FILE).write_text(text, encoding="utf-8")
     done = check(honest)
     if text:
@@ -118,7 +118,7 @@ def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
 
 
 def test_a_line_taken_out_is_refused(in_hertz):
-    """The asks are numbered, so fewer of them show."""
+    """Questions are numbered, so a missing one shows."""
     for _ in range(3):
         check(in_hertz)
     _, *rest = (in_hertz / FILE).read_text(encoding="utf-8").splitlines(keepends=True)
@@ -139,7 +139,7 @@ def test_a_link_is_not_followed(honest, tmp_path):
 
 
 def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
-    """In a note, without points lost for it; also that the file was changed."""
+    """A note in the grade, without lost points; it also says if the file was changed."""
     check(in_hertz)
     check(in_hertz)
 
@@ -155,7 +155,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
 
 
 def test_what_students_see_is_report_or_check(honest, tmp_path):
-    """Anything else is one line that says what was expected, in a rubric and in a submission."""
+    """Any other value is one line with the values allowed, in a rubric and in a submission."""
     rubric = tmp_path / "lab.toml"
     text = RUBRIC.read_text(encoding="utf-8")
     rubric.write_text(text + '\n[students]\nsee = "chekc"\n', encoding="utf-8")

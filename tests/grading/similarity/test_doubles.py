@@ -1,4 +1,4 @@
-"""People in several submissions of a class: told to the TA, accused of nothing."""
+"""People in several submissions of a class: reported to the TA, without an accusation."""
 
 import re
 from dataclasses import replace
@@ -29,7 +29,7 @@ def recordings(tmp_path_factory) -> list[bytes]:
 
 
 def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
-    """Write a class in which Eve hands in Bob's recordings with his id beside hers."""
+    """Write a class in which Eve submits Bob's recordings with his id beside hers."""
     teams = {"team-1": ("bob",), "team-2": ("carl",), "team-9": ("eve", "Bob ")}
     prints = {"team-1": recordings[0], "team-2": recordings[1], "team-9": recordings[0]}
     outcomes = [
@@ -45,7 +45,7 @@ def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
 
 
 def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
-    """Who is in both, and how many recordings both have, on the page and to the caller."""
+    """Page and caller get the person, both submissions, and the number of common recordings."""
     (double,) = told(tmp_path, recordings)
     assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
     assert double.recordings >= 3
@@ -57,7 +57,7 @@ def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
-    """The submissions go by the names that stand in for theirs, the person by none."""
+    """Submissions have their stand-in names; the person has no name at all."""
     (double,) = told(tmp_path, recordings, anonymous=True)
     assert re.fullmatch(
         r"One person is in anon-\w+ and anon-\w+, which have \d+ recordings in common", str(double)
@@ -65,7 +65,7 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
 
 
 def test_recordings_are_counted_not_pairs_of_submissions(recordings):
-    """Four submissions with one set of recordings have that many in common, not six times it."""
+    """Four submissions with one set of recordings share that many, not six times as many."""
     prints = [
         Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
     ]
@@ -77,7 +77,7 @@ def test_recordings_are_counted_not_pairs_of_submissions(recordings):
 
 
 def test_what_could_not_be_read_was_not_compared(recordings):
-    """Without fingerprints nothing is said of what two submissions have in common."""
+    """Without fingerprints the common recordings are not counted."""
     for left, compared in ((b"", False), (recordings[1], True)):
         prints = [
             Member(submission=name, authors=("s1",), fingerprints=kept)
@@ -89,7 +89,7 @@ def test_what_could_not_be_read_was_not_compared(recordings):
 
 
 def test_partners_in_the_same_two_submissions_are_told_of_once():
-    """Their submissions are one pair, with names and without; who is in a third is told apart."""
+    """Their submissions are one pair; an author of a third one is listed apart."""
     teams = {"a": ("x", "y"), "b": ("Y", "x"), "c": ("z",), "d": ("z", "x2")}
     both, alone = find_doubles(teams)
     assert (both.authors, both.submissions) == (("x", "y"), ("a", "b"))
@@ -99,7 +99,7 @@ def test_partners_in_the_same_two_submissions_are_told_of_once():
 
 
 def test_one_submission_each_is_nothing_to_tell():
-    """Two authors of one team, or one id typed twice in it, stand nowhere else."""
+    """Two authors of one team, or one id typed twice, are in no other submission."""
     assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
     (double,) = find_doubles({f"t{i}": ("S\n1",) for i in range(10)})
     assert str(double).startswith("S 1 is in t0, t1, ")

@@ -1,4 +1,4 @@
-"""Shared recordings: found however disguised, and never where two teams only used one bench."""
+"""Shared recordings are found however disguised, and never on one bench that two teams used."""
 
 import json
 import zlib
@@ -31,7 +31,7 @@ def teams(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def others(teams):
-    """Four teams of the class with whom nobody shares anything."""
+    """Four teams of the class that share nothing with anybody."""
     return [prints(f"other-{number}", records) for number, records in enumerate(teams[2:])]
 
 
@@ -42,7 +42,7 @@ def prints(name, records, authors=None):
 
 
 def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
-    """Return a copy: cut, shifted in time, rescaled, renamed and with noise (in counts) added."""
+    """Return a copy: cut, shifted in time, rescaled, renamed, with added noise (in counts)."""
     n = record.t.size
     start = int(rng.integers(0, round((1 - keep) * n) + 1))
     part = slice(start, start + round(keep * n))
@@ -59,7 +59,7 @@ def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
 
 @pytest.fixture(scope="module")
 def quiet_teams(tmp_path_factory):
-    """What three teams would read on one bench, with encoders too fine to tell any noise."""
+    """Return the readings of three teams on one bench whose encoders are too fine to show noise."""
     folder = tmp_path_factory.mktemp("quiet")
     for seed in range(3):
         write_submission(
@@ -72,9 +72,9 @@ def quiet_teams(tmp_path_factory):
 
 
 def rounded(records, *, count, seed):
-    """Return recordings by an encoder of that step, whose zero is anywhere and which has no noise.
+    """Return recordings by an encoder of that step, with any zero and without noise.
 
-    Only what no controller drives: a controller would have read the coarse encoder, too.
+    Only open-loop runs: a controller would have read the coarse encoder too.
     """
     rng = np.random.default_rng(seed)
     zeros = [rng.uniform(-2, 2, size=(record.y.shape[0], 1)) for record in records]
@@ -94,27 +94,27 @@ def of_kind(records, kind):
 
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
-    """The same carts under the same inputs move alike; their noise does not."""
+    """The same carts under the same inputs move in the same way; their noise differs."""
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
 def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
-    """Without noise one motion is rounded alike where the zeros happen to agree: no evidence."""
+    """Without noise, one motion is rounded equally if the zeros happen to agree: not evidence."""
     honest = [
         rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
     ]
     batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
     assert find_shared(batch) == {}
     rng = np.random.default_rng(4)
-    if per_cm >= 100:  # a whole hand-in has too many zeros in common
+    if per_cm >= 100:  # a whole submission has too many zeros in common
         copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
         assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20])
 def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
-    """Also where the carts move by one or two counts, and under feedback the input by as few."""
+    """Also if the carts move by one or two counts, and under feedback the input by as few."""
     for seed in (1, 2, 7):
         write_submission(
             tmp_path / str(seed),
@@ -142,7 +142,7 @@ def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
     ids=str,
 )
 def test_one_copied_recording_is_found_however_disguised(teams, others, kind, disguise):
-    """A single recording among honest ones is found, and named on both sides."""
+    """One copied recording among honest ones is found and named on both sides."""
     rng = np.random.default_rng(7)
     copied = disguised(of_kind(teams[0], kind), rng, **disguise)
     found = find_shared([prints("a", teams[0]), prints("b", [*teams[1], copied]), *others])
@@ -153,7 +153,7 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
 
 
 def test_under_feedback_the_input_gives_a_copy_away(teams, others):
-    """The controller has made the input of the carts' noise: further noise in the carts is no veil.
+    """The controller has turned the carts' noise into input, so more noise cannot hide the copy.
 
     The start, where the reference steps, is cut off as well.
     """
@@ -173,7 +173,7 @@ def test_under_feedback_the_input_gives_a_copy_away(teams, others):
 
 
 def test_a_whole_copy_is_found_under_much_noise(teams, others):
-    """Noise of six times the encoder's own hides single recordings, not all of them."""
+    """Noise of six times the encoder's own hides single recordings, but not all of them."""
     rng = np.random.default_rng(8)
     copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
     found = find_shared([prints("a", teams[0]), prints("b", copied), *others])
@@ -182,7 +182,7 @@ def test_a_whole_copy_is_found_under_much_noise(teams, others):
 
 
 def test_teammates_and_repeats_do_not_count(teams):
-    """Who has an author in common, or hands in one recording twice, shares with nobody."""
+    """Submissions with a common author, or one recording submitted twice, are not copies."""
     twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
     a = prints("a", twice, authors=("ann", "bob"))
     b = prints("b", teams[0], authors=("bob", "carl"))
@@ -190,7 +190,7 @@ def test_teammates_and_repeats_do_not_count(teams):
 
 
 def test_what_was_handed_out_may_be_used_by_all(teams):
-    """Recordings of an example are nobody's; one that is not among them is still found."""
+    """Recordings of an example belong to nobody; a copy of any other is still found."""
     given, own = teams[0][:-1], teams[0][-1]
     example = fingerprint(given)
     batch = [prints("a", teams[0]), prints("b", [*teams[1][:3], *given])]
@@ -204,7 +204,7 @@ def test_what_was_handed_out_may_be_used_by_all(teams):
 
 
 def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
-    """However many hold the same recording, each is held against what was handed out."""
+    """However many teams hold one recording, each is compared with the handout."""
     rng = np.random.default_rng(11)
     copies = [[disguised(r, rng, scale=2.0, later=1.0) for r in teams[0][:2]] for _ in range(40)]
     batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
@@ -213,7 +213,7 @@ def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
 
 
 def test_earlier_batches_count(teams):
-    """A recording of last year is found, and said to be; last year's copies are no news."""
+    """A recording of last year is found and named as such; last year's copies are not repeated."""
     old = [prints("x", teams[0]), prints("y", teams[0])]
     found = find_shared([prints("a", teams[0][:4])], earlier=old)
     assert set(found) == {"a"}
@@ -225,7 +225,7 @@ def test_earlier_batches_count(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Every two recordings that are compared sample by sample, at each shift anew."""
+    """Return every pair of recordings that is compared sample by sample, and each shift."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
@@ -237,7 +237,7 @@ def compared(monkeypatch):
 
 
 def test_a_recording_under_many_names_is_compared_once(teams, compared):
-    """Two hand-ins of a thousand names for one file cost no more than two recordings."""
+    """Two submissions with a thousand names for one file cost no more than two recordings."""
     record = of_kind(teams[0], "decay")
     many = [replace(record, id=f"decay-{number}") for number in range(1_000)]
     a, b = prints("a", many), prints("b", many)
@@ -250,7 +250,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """Two hand-ins made to look alike everywhere take no more than their number asks."""
+    """Two submissions made to look equal everywhere cost no more than their size."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
@@ -265,7 +265,7 @@ def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compa
 
 @pytest.mark.parametrize("kind", ["step", "decay"])
 def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
-    """Real runs of one experiment on one real bench, as if by as many teams, are no copies."""
+    """Runs of one experiment on one real bench, as if by as many teams, are not copies."""
     folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
     teams = [prints(str(i), [record]) for i, record in enumerate(records)]
@@ -277,13 +277,13 @@ def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
 
 @pytest.fixture(scope="module")
 def knocking():
-    """Eight teams on a bench with backlash, whose knocks are as sharp as noise."""
+    """Eight teams on a bench with backlash, whose impacts are as sharp as noise."""
     moved = move_class("throne-1dof", "backlash", seeds=range(8), dwells=4)
     return read_class(moved, seed=3)
 
 
 def test_the_knocks_of_a_bench_are_nobodys(knocking):
-    """Honest runs share them; a recording under noise is told from them as a copy all the same."""
+    """Honest runs share the impacts; a noisy copy is still found."""
     honest = [prints(str(number), records) for number, records in enumerate(knocking)]
     assert find_shared(honest) == {}
     rng = np.random.default_rng(1)
@@ -295,7 +295,7 @@ def test_the_knocks_of_a_bench_are_nobodys(knocking):
 
 @pytest.mark.parametrize("members", [2, 3])
 def test_a_small_class_is_told_of_equal_rows_only(teams, members):
-    """Two or three teams are no reference: the same noise under more of it could be the bench's."""
+    """Two or three teams are no reference: equal noise might be the bench's own."""
     rng = np.random.default_rng(2)
     record = of_kind(teams[0], "step")
     others = [prints(str(number), teams[number]) for number in range(2, members)]
@@ -306,7 +306,7 @@ def test_a_small_class_is_told_of_equal_rows_only(teams, members):
 
 
 def test_three_of_six_may_have_the_same_copy(teams):
-    """Whoever has a copy, too, is no reference for the bench."""
+    """Teams that have the same copy are no reference for the bench either."""
     record = of_kind(teams[0], "step")
     rest = [prints(str(number), teams[number]) for number in range(3, 6)]
     rng = np.random.default_rng(4)
@@ -323,7 +323,7 @@ def test_three_of_six_may_have_the_same_copy(teams):
 
 
 def test_a_flag_names_what_can_be_checked(teams):
-    """Which rows of which times are equal stands in the evidence, and in the sentence."""
+    """The evidence and the sentence say which rows at which times are equal."""
     copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
     (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
     (evidence,) = shared_flag([record]).evidence["recordings"]
@@ -337,7 +337,7 @@ def test_a_flag_names_what_can_be_checked(teams):
 
 
 def test_fingerprints_of_an_older_version_are_not_compared(teams):
-    """They lack what is compared; that they are there harms nobody."""
+    """They lack what is compared now, and do no harm."""
     head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
     old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
     assert unpack(old) == ()
@@ -347,7 +347,7 @@ def test_fingerprints_of_an_older_version_are_not_compared(teams):
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
-    """Where nothing moves there is nothing to compare; packing keeps what there is."""
+    """Without motion there is nothing to compare; packing keeps the rest."""
     record = of_kind(teams[0], "step")
     still = replace(record, y=np.zeros_like(record.y))
     short = replace(record, t=record.t[:50], u=record.u[:50], y=record.y[:, :50])
