@@ -1,4 +1,4 @@
-"""The bench's room, over plain forms: a plan, a session, its buttons, its end."""
+"""The bench's pages through plain forms: a plan, a session, its buttons, its end."""
 
 import http.client
 import json
@@ -29,7 +29,7 @@ SWEEP = sine("sweep", seconds=300).model_copy(update={"kind": "sweep", "wave": "
 
 
 def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fields: str) -> None:
-    """Have a session begin, and wait until it has written a second of a run."""
+    """Begin a session, and wait until a second of a run is recorded."""
     answer = visitor.post(f"/bench/0/{room}", **fields)
     assert answer.status == 303, answer.text
     raw = work / "raw" / f"{name}-1.raw"
@@ -37,7 +37,7 @@ def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fiel
 
 
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
-    """Ticked recordings are made; the news come through; a Stop without scripts ends it."""
+    """Ticked recordings are made; the news arrives; a Stop without scripts ends the session."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -55,14 +55,14 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         assert visitor.post("/bench/0/press", wish="stop", number="0", plain="1").status == 303
         listener.join()
         states = re.findall(rb"event: state\ndata: (.*)\n", heard[0])
-        # How far the stop is when the first news are sent is not ours to say.
+        # The test cannot know how far the stop is when the first news is sent.
         assert json.loads(states[0])["waits"] in ("Recording long.", "Stopping.")
         assert json.loads(states[-1])["waits"] == "The session is over."
-        # Who comes late has the points from before.
+        # A late viewer gets the earlier points.
         first, *_ = map(json.loads, re.findall(rb"event: points\ndata: (.*)\n", heard[0]))
         assert (first["run"], first["start"]) == (1, 0)
         assert first["points"][0][0] < 0.1 < 0.5 < first["points"][-1][0]
-        # Told when the room shows the plan again: a page drawn just before hears it and reloads.
+        # The room gives notice when it shows the plan again: a page drawn just before then reloads.
         assert heard[0].endswith(b"event: ended\ndata:\n\n")
         assert "Stopped. Begin again" in visitor.get("/bench/0/").text
         assert visitor.get("/bench/0/events").body == b"event: ended\ndata:\n\n"
@@ -75,7 +75,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
 
 
 def test_many_viewers_stop_nobody(tmp_path, real):
-    """Of sixty who watch, eight see the session and the others are told at once; pages open."""
+    """Of sixty viewers eight see the session and the others get an answer at once; pages open."""
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server, ExitStack() as streams:
         visitor = Visitor.of(server.url)
@@ -133,7 +133,7 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
 
 
 def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
-    """The plan is what `cartlab plan` writes; a bench that is not there is named."""
+    """The plan equals that of `cartlab plan`; a missing bench is named."""
     work = tmp_path / "team"
     work.mkdir()
     text = 'version = 1\n[system]\ncarts = 1\nposition = { unit = "cm" }\n'
@@ -157,7 +157,10 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
 
 
 def test_exploring_has_a_form_of_its_own(tmp_path):
-    """Enter in its fields explores, at its own port; numbers as everywhere, wrong ones by name."""
+    """Enter in its fields explores, at its own port;
+
+    numbers work as elsewhere, errors name a field.
+    """
     work = a_recorded_cart(tmp_path / "team")
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -168,7 +171,7 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
             re.findall(r'action="/bench/0/(\w+)"', form)[0]: set(re.findall(r'name="(\w+)"', form))
             for form in forms
         }
-        ports = {"port", "other"} & fields["acquire"]  # to be typed where none is listed
+        ports = {"port", "other"} & fields["acquire"]  # to type in if the list is empty
         assert fields["explore"] == {*ports, "what", "error", "minutes"}
         assert fields["acquire"] == ports
         sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
@@ -186,7 +189,7 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
 
 
 def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
-    """± now, ± after yours, then what the program would have chosen; what is none is said."""
+    """± now, ± after your experiment, then the program's own choice; bad input gets a message."""
     work = a_recorded_cart(tmp_path / "team")
     mine = {"kind": "sweep", "amplitude": "0,01", "frequency": "0.5", "frequency_end": "5",
             "seconds": "20", "goal": "zeta"}  # fmt: skip
@@ -222,7 +225,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
 
 
 def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
-    """A virtual bench that runs here is in the list; a port that is gone stays, and says so."""
+    """The list has a virtual bench that runs here; a port that is gone stays, marked as gone."""
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -241,7 +244,7 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
 
 
 def test_what_is_new_in_the_plan_is_marked(tmp_path):
-    """The plan of a folder has rows for what is recorded, what is next, and what was added last."""
+    """The plan shows what is recorded, what is next, and what was added last."""
     work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)

@@ -1,4 +1,4 @@
-"""The check at the desk: what students see who find the numbers themselves, and hand in."""
+"""The check at the desk, for students who find the numbers themselves and then submit."""
 
 import io
 import re
@@ -21,7 +21,7 @@ from tests.helpers.waiting import until
 
 HERE = "/student/0/"
 pytestmark = pytest.mark.usefixtures("work_here")
-OPEN = {  # what of the room shows no computed number
+OPEN = {  # pages that show no computed number
     "", "files", "fill", "aside", "save", "experiments", "check", "hand-in", "hand-in.zip",
     "events", "stop",
 }  # fmt: skip
@@ -51,7 +51,7 @@ def retype(folder, old, new):
 
 @pytest.fixture
 def root(tmp_path):
-    """A lab server's folders; of the first team one number is in Hz, and a report was made."""
+    """The folders of a lab server; one number of the first team is in Hz, and there is a report."""
     for name in ("team", "other"):
         retype(a_submission(tmp_path / name), "omega_n = 13.1", "omega_n = 2.085")
         (tmp_path / name / "report").mkdir()
@@ -64,7 +64,7 @@ def root(tmp_path):
 
 @pytest.fixture
 def lab(root):
-    """A desk for them, who come through a proxy; who asks, by name."""
+    """A desk behind a proxy that serves them; the visitors, by name."""
     with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
         yield lambda name: through_proxy(port, name)
@@ -85,7 +85,7 @@ def words_of(page: Answer) -> str:
 
 
 def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
-    """Every page, file and task of the room that may show a number: 403, which names the check."""
+    """Every page, file and task that may show a number gives 403 with a link to the check."""
     student, other, instructor = lab("s1"), lab("s2"), lab("i")
     for path in ("report/report.html", "report/results.json", "report/report.pdf", "gap/gap.json"):
         refused = student.get(HERE + path)
@@ -103,7 +103,7 @@ def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
 
 
 def test_their_room_offers_the_check_in_place_of_the_report(lab):
-    """And says nothing that a report said."""
+    """The page shows nothing from a report."""
     page = lab("s1").get(HERE).text
     assert f'href="{HERE}check"' in page
     assert f"{HERE}report" not in page
@@ -113,7 +113,7 @@ def test_their_room_offers_the_check_in_place_of_the_report(lab):
 
 
 def test_nobody_elses_work_tells_them_a_number(lab):
-    """An instructor makes a report in their folder: they learn that work is under way, no more."""
+    """An instructor makes a report in their folder: they only see that work is going on."""
     student, instructor = lab("s1"), lab("i")
     assert instructor.post(f"{HERE}make-report").status == 303
     assert "The report" not in words_of(student.get(f"{HERE}hand-in"))
@@ -124,7 +124,7 @@ def test_nobody_elses_work_tells_them_a_number(lab):
 
 
 def test_first_which_then_where_and_the_count_is_shown(lab, root):
-    """Names with a mark, a hint for the number asked about; no digit of the value anywhere."""
+    """Names with a mark, then a hint for the number asked about; no digit of the value anywhere."""
     student = lab("s1")
     assert "not checked yet" in words_of(student.get(f"{HERE}check"))
     which = ask_check(student)
@@ -148,7 +148,7 @@ def test_first_which_then_where_and_the_count_is_shown(lab, root):
 
 
 def test_the_zip_has_the_asks_and_no_report(lab, root):
-    """Though a report lies in the folder; of a class that sees reports it has both."""
+    """The folder's report is left out; in a class that sees reports the zip has both."""
     student = lab("s1")
     ask_check(student)
     assert student.post(f"{HERE}hand-in").status == 303
@@ -162,7 +162,7 @@ def test_the_zip_has_the_asks_and_no_report(lab, root):
 
 
 def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
-    """A submission that names the results as its data is not handed in, and the zip lacks them."""
+    """A submission that names results as its data is refused, and the zip lacks them."""
     team = root / "team"
     first = load_submission(team).experiments[0].file
     retype(team, f'"{first}"', '"report/results.json"')
@@ -171,7 +171,7 @@ def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
 
 
 def test_no_upload_replaces_the_asks(lab, root):
-    """The file is no recording: an upload of one is refused, also in a zip."""
+    """The file of questions is not a recording, so an upload of one is refused, also in a zip."""
     student = lab("s1")
     ask_check(student)
     before = (root / "team" / FILE).read_bytes()
@@ -184,7 +184,7 @@ def test_no_upload_replaces_the_asks(lab, root):
 
 
 def test_on_ones_own_computer_the_submission_says_it(tmp_path):
-    """It is an agreement: whoever has the folder may take the line away."""
+    """It rests on trust: anyone with the folder can remove the line."""
     folder = a_submission(tmp_path / "team")
     retype(folder, "[system]", '[students]\nsee = "check"\n\n[system]')
     with DeskServer(folder=folder) as server:
@@ -203,13 +203,13 @@ def test_on_ones_own_computer_the_submission_says_it(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
-    """Nothing is served."""
+    """Then no desk is started."""
     with pytest.raises(ConfigError, match=said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 
 
 def test_the_ta_reads_the_count_beside_the_grade(root):
-    """On the team's page, of a class that is graded with the file in it."""
+    """It is on the team's page if the graded folder holds the file."""
     for _ in range(2):
         cartlab_here("check", root / "other")
     cartlab_here("grade", root / "other", "--rubric", RUBRICS / "throne-1dof.toml",

@@ -1,4 +1,4 @@
-"""What `cartlab desk` cannot do is one line; what it opens by itself."""
+"""Errors of `cartlab desk` take one line; what it opens without being told."""
 
 from urllib.parse import urlsplit
 
@@ -36,7 +36,7 @@ def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
 
 
 def test_what_is_opened_is_known_by_what_lies_in_it(tmp_path):
-    """A grading's output by its gradebook, by the folder or the file; all else is a submission."""
+    """A gradebook marks a grading's output, as folder or file; everything else is a submission."""
     grades = tmp_path / "grades"
     grades.mkdir()
     (grades / "gradebook.sqlite").write_bytes(b"")
@@ -64,7 +64,7 @@ ADDRESSES = (
 
 
 def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
-    """One that makes no sense is refused with what to write, and leaves nothing behind."""
+    """A bad address is refused with the right form, and leaves no file behind."""
     monkeypatch.chdir(tmp_path)
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -77,7 +77,7 @@ def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
 
 
 def test_a_listed_address_that_makes_no_sense_shows_the_other_rooms(tmp_path):
-    """A TA sees the home page whatever their list says; the bad gradebook says what is wrong."""
+    """A TA sees the home page whatever their list says; the bad gradebook explains itself."""
     (tmp_path / "grades").mkdir()
     books = '["postgresql://[::1", "grades"]'
     users = f'[[users]]\nname = "ta"\nrole = "ta"\ngradebooks = {books}\n'

@@ -1,4 +1,4 @@
-"""Who gets in: by the secret that opens once, or through the proxy, and nobody else."""
+"""Access to the desk: by a secret that opens once, or through the proxy, and no other way."""
 
 import re
 import socket
@@ -36,12 +36,15 @@ def server(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def visitor(server):
-    """Who opened the printed address."""
+    """A visitor who opened the printed address."""
     return Visitor.of(server.url)
 
 
 def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
-    """Then a cookie does that no script reads and no other site sends; the address is used up."""
+    """Then a cookie is used that no script reads and no other site sends;
+
+    the address is used up.
+    """
     assert visitor.get("/").status == 200
     assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
     again = visitor.get(urlsplit(server.url).path)
@@ -57,7 +60,7 @@ def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_nobody_gets_in_without_the_cookie(visitor, path):
-    """No address answers a stranger; a cookie of one's own is none."""
+    """No address answers a stranger, and an invented cookie does not help."""
     for cookie in ("", f"cartlab-{visitor.port}=guess", "cartlab=x"):
         stranger = Visitor(port=visitor.port, headers={"Cookie": cookie})
         assert stranger.get(path).status == 403
@@ -65,7 +68,7 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
 
 
 def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
-    """Any page of this computer may set one: before or behind the real one, it is let in."""
+    """Any page on this computer may set one; before or behind the real one, it does no harm."""
     real = visitor.headers["Cookie"]
     other = f"cartlab-{visitor.port}=guess"
     for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
@@ -75,7 +78,7 @@ def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
 
 
 def test_other_pages_cannot_ask(visitor):
-    """A foreign name, an origin that is none of ours, a browser's word that it is another page."""
+    """Another host name, a foreign origin, a browser that reports a cross-site request."""
     port = visitor.port
     for wrong in (
         {"Host": f"evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"},
@@ -105,7 +108,7 @@ def test_every_answer_has_its_policy(visitor, path):
     "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
 )
 def test_nobody_sends_more_than_is_read(visitor, length):
-    """By what a request says of itself, or by what comes; the desk goes on."""
+    """By the stated length or by the bytes received; the desk goes on."""
     host = f"127.0.0.1:{visitor.port}"
     head = (
         f"POST /open HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n{length}\r\n"
@@ -122,7 +125,7 @@ def test_nobody_sends_more_than_is_read(visitor, length):
 
 
 def test_strangers_are_few_and_leave(visitor, monkeypatch):
-    """Of 300 idle connections some are held, and not for long; who has the cookie is served."""
+    """Of 300 idle connections some are held for a while; a visitor with the cookie is served."""
 
     def held() -> int:
         mine = psutil.Process().net_connections("tcp")
@@ -184,7 +187,7 @@ def root(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def lab(root):
-    """A desk for four, who come through a proxy; who asks, by name."""
+    """A desk for four people behind a proxy; the visitors, by name."""
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
     write_class(root / "grades")
@@ -197,7 +200,7 @@ def lab(root):
 
 @pytest.mark.parametrize("name", ["José Müller", "学生七"])
 def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
-    """As the proxy writes it; a name that is not listed is let in by neither."""
+    """As the proxy writes it; a name that is not on the list is refused in both."""
     a_submission(tmp_path / "one")
     users = f'[[users]]\nname = "{name}"\nrole = "student"\nfolders = ["one"]\n'
     with DeskServer(users=write_users(tmp_path, users)) as server:
@@ -210,7 +213,7 @@ def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
 
 
 def test_everybody_sees_their_own(lab):
-    """A student's address of the same form is another folder; beyond their own there is none."""
+    """The same address for another student is another folder; other folders have no address."""
     assert "one" in lab("s1").get("/student/0/").text
     assert "two" in lab("s2").get("/student/0/").text
     assert lab("s1").get("/student/1/").status == 404
@@ -224,7 +227,7 @@ def test_everybody_sees_their_own(lab):
 
 
 def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
-    """Only what was typed in it is shown as typed, however many states others saw since."""
+    """It shows only what was typed into it, however many states others have seen since."""
     page = lab("s1").get("/student/0/")
     shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")
     saved = lab("s1").post("/student/0/save", seen=seen, **shown | {"section": "07"})
@@ -240,7 +243,7 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
 
 
 def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
-    """On no page, in no refusal and in no news of their work; an instructor is told."""
+    """Not on pages, in refusals or in news of work; an instructor sees folders."""
     plain = (root / "three" / "submission.toml").read_bytes()
     (root / "three" / "report").symlink_to(root)  # a report there is refused
     try:
@@ -277,18 +280,18 @@ ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_each_role_has_its_rooms(lab, path):
-    """Every address: none of a room that is not one's own, whatever is sent there."""
+    """Every address of a room that is not theirs refuses them, whatever is sent."""
     for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
         if not let_in:
             answers = {lab(name).get(path).status, lab(name).post(path).status}
             assert 403 in answers <= {403, 405}, name
-        elif path.endswith("/") and path != "/feedback/0/":  # of these none has a grade
+        elif path.endswith("/") and path != "/feedback/0/":  # none of these has a grade
             assert lab(name).get(path).status in (200, 303, 405), name
 
 
 def test_people_come_from_the_page_of_a_login(lab):
-    """A whole page may be asked for from elsewhere, and no part of one, and no form."""
+    """A link from another site may open a whole page, but no part of a page and no form."""
     led = {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Mode": "navigate"}
     page = led | {"Sec_Fetch_Dest": "document"}
     assert lab("s1").get("/student/0/", **page).status == 200
@@ -299,7 +302,7 @@ def test_people_come_from_the_page_of_a_login(lab):
 
 
 def test_a_page_that_is_asked_for_writes_nothing(lab, root):
-    """Whoever may ask for it, from wherever: every file is afterwards as it was."""
+    """A request for any page, from anywhere, leaves every file as it was."""
 
     def files() -> dict:
         return {
@@ -322,7 +325,7 @@ def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
 
 
 def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
-    """Exercises and rubrics, whatever is typed; and acquires at the ports of the list."""
+    """Exercises and rubrics stay in the workshop, whatever is typed; ports come from the list."""
     who = lab("w")
     bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     made = who.post("/exercises/make", out="first", **bench)
@@ -348,7 +351,7 @@ def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
 
 
 def test_forged_names_are_refused(lab):
-    """None, one that is not listed, two at once, and one from another address than the proxy's."""
+    """No name, an unknown one, two at once, and one from another address than the proxy's."""
     assert lab("").get("/").status == 403
     assert lab("root").get("/").status == 403
     assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
@@ -394,7 +397,7 @@ def test_forged_names_are_refused(lab):
     ],
 )
 def test_a_wrong_list_is_one_line(text, why, tmp_path):
-    """What is wrong with the file of users is said, and nothing is served."""
+    """The message names the mistake in the file of users, and nothing is served."""
     for name in ("one", "two", "three", "grades", "shop"):
         (tmp_path / name).mkdir()
     (tmp_path / "users.toml").write_text(text, encoding="utf-8")
@@ -405,7 +408,7 @@ def test_a_wrong_list_is_one_line(text, why, tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_secret_that_everybody_may_read_is_none(tmp_path):
-    """The file of users is for the desk alone; one that is so is read."""
+    """Only the desk may read the file of users; a file like that is accepted."""
     path = write_users(tmp_path, '[[users]]\nname = "s1"\nrole = "student"\n')
     assert read_users(path)[0].site == "https://lab.example.edu"
     path.chmod(0o644)
@@ -415,7 +418,7 @@ def test_a_secret_that_everybody_may_read_is_none(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_list_that_everybody_may_change_is_none(tmp_path):
-    """Neither the file nor the folder in which another could be put in its place."""
+    """Neither the file nor its folder may be writable by others."""
     folder = tmp_path / "desk"
     folder.mkdir()
     path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
@@ -431,7 +434,7 @@ def test_a_list_that_everybody_may_change_is_none(tmp_path):
 
 
 def test_a_stranger_s_clock_runs(server):
-    """A connection that shows nothing ends by itself."""
+    """A connection that sends no secret ends by itself."""
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", urlsplit(server.url).port or 0)) as line:
         line.settimeout(PATIENCE)

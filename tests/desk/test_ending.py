@@ -1,4 +1,4 @@
-"""Whatever ends a desk, it says so on stderr and the log keeps it; what it left goes later."""
+"""A desk reports what ended it, on stderr and in the log; leftovers are removed later."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ from tests.helpers.waiting import PATIENCE, started
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
-# A desk whose threads are interrupted as its stdin says: by an exception that comes at any moment.
+# A desk whose threads are interrupted on request: by an exception at any moment.
 DESK = """
 import ctypes, os, sys, threading
 from pipeline.cli import main
@@ -41,7 +41,10 @@ main()
 
 @contextmanager
 def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
-    """Run a desk; yield it, its address, and what tells its other lines and the log at its end."""
+    """Run a desk;
+
+    yield it, its address, and a function that returns its other lines and the log.
+    """
     log = tmp_path / "state" / "cartlab" / "desk.log"
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
     command = [sys.executable, "-c", DESK, *options]
@@ -61,7 +64,7 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
 def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
-    """On stderr and in the log, which tells when it began; nothing there holds the secret."""
+    """On stderr and in the log, which also says when it began; neither holds the secret."""
     with a_desk(tmp_path) as (desk, url, ended):
         desk.send_signal(getattr(signal, name))
         status, said, kept = ended()
@@ -81,7 +84,10 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
     ],
 )
 def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
-    """By the process that watches; where a library crashed, with the lines that were running."""
+    """A watching process reports it;
+
+    after a crash in a library, with the lines that were running.
+    """
     with a_desk(tmp_path) as (desk, _, ended):
         desk.send_signal(number)
         status, said, kept = ended()
@@ -102,7 +108,7 @@ def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
     ],
 )
 def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
-    """In the thread that serves or in the one that waits; with its traceback in the log."""
+    """In the serving thread or the waiting one; the traceback is in the log."""
     with a_desk(tmp_path) as (desk, _, ended):
         assert desk.stdin is not None
         desk.stdin.write(f"{sent}\n")
@@ -117,7 +123,7 @@ def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
 
 
 def test_an_exception_in_another_thread_is_told_and_the_desk_goes_on(tmp_path):
-    """Its traceback is in the log; pages are answered as before."""
+    """Its traceback is in the log, and pages are answered as before."""
     with a_desk(tmp_path) as (desk, url, ended):
         visitor = Visitor.of(url)
         assert desk.stdin is not None
@@ -133,7 +139,7 @@ def test_an_exception_in_another_thread_is_told_and_the_desk_goes_on(tmp_path):
 
 
 def test_a_closed_session_is_no_end_where_nohup_says_so(tmp_path):
-    """A desk that was started to outlive its terminal does."""
+    """A desk started with nohup outlives its terminal."""
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which a child inherits
     try:
         with a_desk(tmp_path) as (desk, url, ended):
@@ -146,7 +152,7 @@ def test_a_closed_session_is_no_end_where_nohup_says_so(tmp_path):
 
 
 def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch):
-    """The folders of those that run stay, and what is not a desk's."""
+    """Folders of running desks stay, and so do folders that no desk made."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
         "import sys, tempfile; tempfile.tempdir = sys.argv[1]\n"

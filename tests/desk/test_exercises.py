@@ -1,4 +1,4 @@
-"""The instructor's room over plain forms: exercises, their pictures, solutions, rubrics."""
+"""The instructor's pages through plain forms: exercises, their pictures, solutions, rubrics."""
 
 import json
 import re
@@ -23,7 +23,7 @@ FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
 
 @pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
-    """Somebody at a desk, which starts a process for all that is drawn and made there."""
+    """A visitor at a desk that draws and makes everything in another process."""
     with DeskServer() as server:
         yield Visitor.of(server.url)
 
@@ -36,7 +36,7 @@ def shown(visitor: Visitor, **sent: str) -> str:
 
 
 def wait_for(visitor: Visitor, address: str) -> str:
-    """Return the page of long work once that is over."""
+    """Return the page once the long work is over."""
     until(lambda: 'http-equiv="refresh"' not in visitor.get(address).text)
     return visitor.get(address).text
 
@@ -45,7 +45,7 @@ def wait_for(visitor: Visitor, address: str) -> str:
 
 
 def test_every_effect_has_its_sizes_and_slides_about_them():
-    """On each preset: what the form says is a `--hide` that `simulate` takes."""
+    """On each preset the form's values make a valid `--hide` for `simulate`."""
     for preset, chain in PRESETS.items():
         for effect in CATALOGUE:
             if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
@@ -60,7 +60,7 @@ def test_every_effect_has_its_sizes_and_slides_about_them():
 
 
 def test_a_slider_counts_when_moved_and_a_number_when_typed():
-    """A tenth of the usual by the slider; a typed one moves the slider; else the bench's usual."""
+    """The slider gives a tenth of the usual size; a typed number moves it; else the usual size."""
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
@@ -80,7 +80,10 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
 
 
 def test_a_class_is_what_simulate_writes(visitor, tmp_path):
-    """Two folders, seeds counting up: the bytes of the command; what is hidden is in none."""
+    """Two folders, with seeds counting up, have the bytes of the command;
+
+    the hidden effect is in none.
+    """
     page = shown(visitor, preset="throne-1dof", effect="coulomb_friction")
     (told,) = re.findall(r"<li>(coulomb_friction on cart 1.*?)</li>", page)
     force = re.search(r'name="coulomb_friction.force.value"[^>]* value="([^"]+)"', page)
@@ -118,7 +121,7 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
 
 
 def test_an_own_chain_and_what_is_wrong_with_it(visitor):
-    """Its numbers make a bench; what is wrong is said in their words, and nothing is drawn."""
+    """Its numbers make a bench; mistakes are named in the program's words, and nothing is drawn."""
     chain = {"preset": "", "m": "2e-4 3e-4", "c": "5e-4, 5e-4", "k": "0 0.1 0.05"}
     page = shown(visitor, **chain, effect="input_delay")
     assert "input_delay: delay" in page
@@ -130,7 +133,7 @@ def test_an_own_chain_and_what_is_wrong_with_it(visitor):
 
 
 def test_a_picture_is_inert(visitor):
-    """The drawing of an effect is an SVG that may run nothing; a forged one is refused."""
+    """The picture of an effect is an SVG without scripts; a forged address is refused."""
     (address,) = re.findall(r'src="(/exercises/picture[^"]+)"', shown(visitor, **FRICTION))
     drawn = visitor.get(address)
     assert drawn.headers["content-type"] == "image/svg+xml"
@@ -142,7 +145,7 @@ def test_a_picture_is_inert(visitor):
 
 
 def test_a_solution_is_what_the_command_writes(tmp_path):
-    """Made in the folder, shown in its page, with the expected values for programs."""
+    """Made in the folder, shown on its page, with the expected values as JSON."""
     folder = a_submission(tmp_path / "reference")
     with DeskServer(folder=folder) as server:
         visitor = Visitor.of(server.url)
@@ -156,7 +159,7 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
 
 @pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])
 def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
-    """Not its first digits; nothing is begun for more than there may be."""
+    """Not only its first digits; a number above the limit begins nothing."""
     out = tmp_path / "class"
     sent = {"preset": "throne-1dof", "out": str(out), "seed": "0", "folders": folders}
     assert visitor.post("/exercises/make", **sent).status == 422
@@ -165,7 +168,7 @@ def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
 
 @pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b", "a" * 300, "a/" * 5000])
 def test_a_place_that_is_none_is_said(visitor, typed):
-    """Whichever form it is typed into; `~` of nobody is no fault of the desk's own."""
+    """In whichever form it is typed; `~` of an unknown user is not a fault of the desk."""
     sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     assert visitor.post("/open", folder=typed).status == 422
     assert visitor.post("/exercises/make", out=typed, **sent).status == 422

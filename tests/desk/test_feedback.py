@@ -1,4 +1,4 @@
-"""A student's own feedback over plain forms: who reads what, who asks, and how TAs answer."""
+"""A student's own feedback through plain forms: who reads, who asks, and how TAs answer."""
 
 import re
 from html import unescape
@@ -61,7 +61,7 @@ HOSTILE = (
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """A graded class, not released; who asks, by name."""
+    """A graded class, not released; the visitors, by name."""
     write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
     a_submission(tmp_path / "five")
     with DeskServer(users=write_users(tmp_path, USERS)) as server:
@@ -89,7 +89,7 @@ def ask(who: Visitor, criterion: str = "laws", why: str = "see page 3") -> Answe
 
 
 def fields(answer: Answer, at: int = 0) -> dict[str, str]:
-    """Return what the form of a request on the queue sends along."""
+    """Return the hidden fields of a request's form in the queue."""
     names = ("team", "criterion", "seen")
     found = [re.findall(rf'name="{name}" value="(.*?)"', answer.text)[at] for name in names]
     return dict(zip(names, map(unescape, found), strict=True))
@@ -99,7 +99,7 @@ def fields(answer: Answer, at: int = 0) -> dict[str, str]:
 
 
 def test_students_see_nothing_before_the_release(lab):
-    """The instructor lets them, not a TA; and can hide it again."""
+    """The instructor releases feedback, a TA cannot; the instructor can hide it again."""
     student = lab("s4")
     for path in (HERE, HERE + "whole"):
         assert "points" not in student.get(path).text
@@ -119,7 +119,7 @@ def test_students_see_nothing_before_the_release(lab):
 
 
 def test_of_another_s_feedback_there_is_no_address(released):
-    """By number, by path, by role; nor a form for it."""
+    """Not by number, path or role; nor a form for it."""
     student = released("s4")
     assert student.get("/").headers["location"] == HERE
     assert "team-04" in student.get(HERE).text
@@ -138,7 +138,7 @@ def test_of_another_s_feedback_there_is_no_address(released):
 
 
 def test_the_grade_is_the_one_that_the_list_names(released):
-    """By its very name in the class that it names; nothing of the server is told."""
+    """By exact name in the class that the list names; nothing about the server is shown."""
     six = released("s6")
     assert "team-06" in six.get(HERE).text
     assert "Your feedback is not out." in six.get("/feedback/1/").text
@@ -175,7 +175,7 @@ def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
 
 
 def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
-    """The queue, its number everywhere, an answer with points; both see every step."""
+    """Queue, its count on every page, an answer with points; both sides see every step."""
     student, ta = released("s4"), released("Ada")
     assert 'href="/grades/0/again">0' not in ta.get(ROOM).text
     assert ask(student).status == 303
@@ -206,7 +206,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
 
 
 def test_what_cannot_be_is_said_beside_the_field(released, book):
-    """What was typed stays, and nothing is written."""
+    """The typed text stays, and nothing is written."""
     student, ta = released("s4"), released("Ada")
     long = "x" * (MOST_LETTERS + 1)
     refused = ask(student, why=long)
@@ -235,7 +235,7 @@ def test_what_cannot_be_is_said_beside_the_field(released, book):
 
 
 def test_few_requests_wait_at_once(released):
-    """The next is refused beside its own field."""
+    """The next one is refused beside its own field."""
     criteria = [criterion.id for criterion in two_cart_rubric().criteria]
     for criterion in criteria[:MOST_OPEN]:
         assert ask(released("s4"), criterion).status == 303
@@ -245,7 +245,7 @@ def test_few_requests_wait_at_once(released):
 
 
 def test_the_second_of_two_answers_sees_both(released, book):
-    """Nothing of the second is written, and what was written is shown beside theirs."""
+    """Nothing of the second is written; the first answer is shown beside it."""
     ask(released("s4"))
     seen = {name: fields(released(name).get(QUEUE)) for name in ("Ada", "Bob")}
     first = {"points": "0.5", "text": "ada's words"}
@@ -260,7 +260,7 @@ def test_the_second_of_two_answers_sees_both(released, book):
 
 
 def test_hostile_words_are_words(released):
-    """Markup, templates and control marks, on every page that has a reason or an answer."""
+    """Markup, templates and control characters, on every page that shows a reason or an answer."""
     student, ta = released("s4"), released("Ada")
     assert ask(student, why=HOSTILE).status == 303
     assert ask(student, "pieces", why="\u202e" * 40 + SECRET).status == 303
@@ -282,7 +282,7 @@ def test_hostile_words_are_words(released):
 
 @pytest.mark.parametrize("lab", [True], indirect=True)
 def test_an_anonymous_class_has_anonymous_requests(released, book):
-    """No page of a TA names who asked; the student reads their own all the same."""
+    """No page of a TA names the student; the student reads the answer all the same."""
     student, ta = released("s5"), released("Ada")
     assert "do not write your name" in student.get(HERE).text
     assert ask(student, why="I am S5 of team-05, see page 3").status == 303
@@ -305,7 +305,7 @@ def test_an_anonymous_class_has_anonymous_requests(released, book):
 
 
 def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path):
-    """Neither where it was nor why it cannot be read."""
+    """Neither its place nor the reason is shown."""
     (tmp_path / "grades").rename(tmp_path / "elsewhere")
     for answer in (released("s4").get(HERE), ask(released("s4"))):
         assert answer.status == 422
@@ -316,7 +316,7 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
 
 @pytest.mark.parametrize("by_class", [False, True])
 def test_who_is_to_find_the_numbers_reads_none(tmp_path, by_class):
-    """Points, outcomes and names of remarks; their own rubric decides, else that of the class."""
+    """Points, outcomes and names of flags; their own rubric decides, else the class's."""
     write_class(tmp_path / "grades")
     a_submission(tmp_path / "five")
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")

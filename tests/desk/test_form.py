@@ -1,4 +1,4 @@
-"""The form of `submission.toml`: what is typed comes back, and nothing else in the file changes."""
+"""The form of `submission.toml`: typed values come back, and nothing else in the file changes."""
 
 import tomllib
 from decimal import Decimal
@@ -35,14 +35,14 @@ def fields(text: str) -> dict[str, Field]:
 
 
 def changed(text: str, **values: str) -> str:
-    """Return a file in which these fields were typed."""
+    """Return a file after these fields were typed."""
     document = tomlkit.parse(text)
     write_fields(document, find_changes(fields(text).values(), values, lambda path: []))
     return tomlkit.dumps(document)
 
 
 def test_a_form_that_nobody_touched_changes_nothing():
-    """What is shown, sent back as it is, is no change."""
+    """Values sent back as they were shown change nothing."""
     form = {path: field.value for path, field in fields(WHOLE).items()}
     flags = {"system.springs.shown": "1"}
     on = [str(i) for i, flag in enumerate(fields(WHOLE)["system.springs"].on) if flag]
@@ -54,7 +54,7 @@ NUMBER = st.from_regex(r"-?(0|[1-9][0-9]{0,5})(\.[0-9]{1,8})?", fullmatch=True)
 
 @given(NUMBER, NUMBER, st.text(st.characters(exclude_categories=["C", "Z"]), max_size=20))
 def test_what_was_typed_stands_in_the_file(initial, final, title):
-    """Digits as typed, wherever the table has to be made; every other line is as it was."""
+    """Digits as typed, also if the table must be made first; every other line is as it was."""
     values = {"title": title, "reported.initial.K_1": initial, "reported.final.K_1": final}
     new = changed(WHOLE, **values)
     after = tomllib.loads(new, parse_float=Decimal)
@@ -130,7 +130,7 @@ def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
 
 
 def test_numbers_are_asked_for_by_their_symbols():
-    """As in the tables of the lab, not as a program spells them."""
+    """As in the tables of the lab, not as in a program."""
     (claims,) = [g for g in fill_form({"system": {"carts": 2}}) if g.title == "Your numbers"]
     labels = {field.path: field.label for field in claims.fields}
     assert labels["reported.initial.zeta_1"] == "ζ₁ initial"

@@ -1,4 +1,4 @@
-"""The TA's room over plain forms: the class, a team, what several change at once, in and out."""
+"""The TA's pages through plain forms: the class, a team, concurrent changes, import, export."""
 
 import io
 import re
@@ -38,7 +38,7 @@ def grades(tmp_path):
 
 @pytest.fixture
 def ta(grades):
-    """Who opened it at this computer."""
+    """A TA at this computer."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert visitor.post("/open", folder=str(grades)).headers["location"] == ROOM
@@ -47,7 +47,7 @@ def ta(grades):
 
 
 def names(answer: Answer) -> list[str]:
-    """Return the submissions of a page of the class."""
+    """Return the submissions listed on a page of the class."""
     assert answer.status == 200, answer.text
     return [unescape(n) for n in re.findall(r'<th scope="row"><a [^>]*>(.*?)</a>', answer.text)]
 
@@ -58,7 +58,7 @@ def at(team: str, **more: str) -> str:
 
 
 def version(answer: Answer, criterion: str) -> str:
-    """Return what a change of a criterion on this page rests on."""
+    """Return the version that a change of a criterion on this page rests on."""
     found = re.search(rf'value="{criterion}"><input type="hidden" name="seen" value="(.*?)"',
                       answer.text)  # fmt: skip
     assert found
@@ -84,7 +84,7 @@ def upload(who: Visitor, path: str, name: str, content: str, **fields: str) -> A
 
 
 def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
-    """Each filter against the gradebook itself; together they narrow."""
+    """Each filter agrees with the gradebook; several filters narrow the list."""
     with Gradebook(grades) as book:
         entries = {entry.submission: entry for entry in book.entries()}
     ta.post(at("team-03"), do="accept")
@@ -117,7 +117,7 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
 
 
 def test_the_class_says_who_shares_recordings(ta):
-    """How many at its head, leading to them; each in words, not by a code."""
+    """The number of pairs at the top leads to them; each is described in words."""
     page = ta.get(ROOM).text
     line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
     assert line
@@ -127,7 +127,7 @@ def test_the_class_says_who_shares_recordings(ta):
 
 
 def test_a_large_class_comes_a_page_at_a_time(tmp_path):
-    """Every team stands on one page."""
+    """Every team is on exactly one page."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         outcomes = [make_outcome(make_grade(f"t{n:03d}")) for n in range(120)]
         for outcome in outcomes:
@@ -150,7 +150,7 @@ def _batch(outcomes):
 
 
 def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
-    """The histogram, the class page, a team's feedback: of the gradebook, not of the folder."""
+    """Histogram, class page and feedback come from the gradebook, not from the folder."""
     before = ta.get(ROOM + "class.html").text
     picture = ta.get(ROOM + "distribution.svg")
     assert picture.headers["content-type"].startswith("image/svg+xml")
@@ -169,7 +169,7 @@ def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
 
 
 def test_a_team_has_its_numbers_beside_ours(ta):
-    """Reported and recomputed, the remark's evidence, the figure; hostile text is text."""
+    """Reported and recomputed, the flag's evidence, the figure; hostile text is only text."""
     page = ta.get(at("team-01")).text
     assert "3.12" in page
     assert "19.6" in page
@@ -189,7 +189,7 @@ def test_a_team_has_its_numbers_beside_ours(ta):
 
 
 def test_a_record_stands_beside_its_criterion(tmp_path):
-    """The figure that shows a number of it, a response by what was lost; others by themselves."""
+    """The figure shows the number on its record; other records are listed apart."""
     names = ("record-K_1", "record-omega_2-zeta_2", "response-1", "other")
     drawn = tuple((f"{n}.svg", f"<svg><title>{n}</title></svg>") for n in names)
     grade = make_grade("team", share=0.5)
@@ -221,7 +221,7 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
 
 
 def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
-    """Of two responses that of its cart; the other is one click away, without scripts."""
+    """Of two responses the one of its cart; the other is one click away, without scripts."""
     drawn = tuple((f"response-{n}.svg", f"<svg><title>cart {n}</title></svg>") for n in (1, 2))
     grade = make_grade("team", share=0.5)
     pair = {"found": {"K_1": 25.0, "K_2": 8.0}, "expected": {"K_1": 24.0, "K_2": 16.0}}
@@ -244,7 +244,7 @@ def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
 
 
 def test_what_lost_points_comes_first_and_is_shown(ta):
-    """Most lost first, what has all its points after it in one line each; any can be chosen."""
+    """The largest loss first; criteria with all points take one line each; any can be chosen."""
     with_all = ta.get(at("a-name-without-end-" * 5)).text
     titles = {asked.id: asked.title for asked in two_cart_rubric().criteria}
     assert "To look at" in with_all
@@ -284,12 +284,12 @@ def test_what_lost_points_comes_first_and_is_shown(ta):
     ],
 )
 def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
-    """As many as there are keys; else quarters, to the step."""
+    """At most as many steps as there are keys; else quarters, rounded to the rubric's step."""
     assert point_steps(out_of, step=step) == steps
 
 
 def test_points_are_changed_as_the_command_does(ta, grades):
-    """With a reason and a name, to be undone; the history tells all of it."""
+    """With a reason and a name, and with undo; the history lists all of it."""
     assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303
     with Gradebook(grades) as book:
         given = book.entry("team-01").overrides["laws"]
@@ -314,7 +314,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
      {"points": "nan", "why": "x"}, {"points": "many", "why": "x"}],
 )  # fmt: skip
 def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
-    """Nothing is written, and what was typed stays."""
+    """Nothing is written, and the typed text stays."""
     answer = change(ta, "team-01", **fields)
     assert answer.status == 422
     assert f'value="{fields["points"]}"' in answer.text
@@ -335,7 +335,7 @@ def test_forged_forms_change_nothing(ta, grades):
 
 
 def test_accept_goes_on_to_the_next_of_the_filter(ta):
-    """Through all that are not looked at yet, then back to the class; a mark can be taken back."""
+    """Through all teams that are not reviewed, then back to the class; a mark can be taken back."""
     query = {"flag": "hz_for_rad_s", "seen": "no"}
     expected = names(ta.get(f"{ROOM}?{urlencode(query)}"))
     address, visited = at(expected[0], **query), []
@@ -352,7 +352,7 @@ def test_accept_goes_on_to_the_next_of_the_filter(ta):
 
 
 def test_reasons_are_there_to_be_used_again(ta):
-    """Of the same criterion, the commonest first."""
+    """Those of the same criterion, the most common first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
         change(ta, team, points="1", why=why)
     page = ta.get(at("team-08", criterion="laws")).text
@@ -378,7 +378,7 @@ def database():
 
 @pytest.fixture
 def two_desks(database, tmp_path):
-    """Two desks of a lab on one database, and who asks the first and the second."""
+    """Two desks of a lab on one database, with a visitor at each."""
     users = "".join(
         f'[[users]]\nname = "{name}"\nrole = "{role}"\ngradebooks = ["{database}"]\n'
         for name, role in (("Ada", "ta"), ("Bob", "ta"))
@@ -393,7 +393,7 @@ def two_desks(database, tmp_path):
 
 
 def test_two_change_the_same_and_one_is_told(two_desks, database):
-    """The second sees both versions, and the news; nothing of theirs was written."""
+    """The second sees both versions and a message; nothing of theirs was written."""
     ada, bob, eve = two_desks
     seen = version(bob.get(at("team-04", criterion="laws")), "laws")
     since = re.search(r"since=(\d+)", bob.get(at("team-04")).text)
@@ -419,7 +419,7 @@ def test_two_change_the_same_and_one_is_told(two_desks, database):
 
 
 def test_of_changes_at_one_moment_one_counts(two_desks, database):
-    """Twenty rounds of two that rest on the same page: one is taken, one refused."""
+    """In twenty rounds of two changes from the same page, one is accepted and one refused."""
     ada, bob, _ = two_desks
     for number in range(20):
         seen = version(ada.get(at("team-06", criterion="pieces")), "pieces")
@@ -441,7 +441,7 @@ def test_of_changes_at_one_moment_one_counts(two_desks, database):
 
 
 def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
-    """A wrong line is named and nothing written; the same table again adds nothing."""
+    """A wrong line is named and nothing is written; the same table again adds nothing."""
     head = "submission,criterion,points,why\n"
     good = 'team-01,laws,1,"clear, at last"\nÜnal 学生 & co,pieces,0.5,late\n'
     for wrong in ("team-99,laws,1,x\n", "team-01,nothing,1,x\n", "team-01,laws,77,x\n",
@@ -463,7 +463,7 @@ def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
-    """Byte by byte; several files and remarks come as a zip."""
+    """Byte by byte; several files and messages come as a zip."""
     with Gradebook(grades) as book:
         done = export(book, platform, tmp_path / "out", title="Lab 3")
     answer = ta.post(ROOM + "export", lms=platform, title="Lab 3")
@@ -488,7 +488,7 @@ def test_a_roster_that_is_none_is_refused(ta):
 
 
 def test_a_class_is_graded_again_from_the_desk(tmp_path):
-    """What is as it was is not; points by hand stay; who is no owner names no folder."""
+    """Unchanged submissions are skipped; points by hand stay; only an owner may name a folder."""
     team = a_submission(tmp_path / "class" / "team-05", "one-cart")
     grades = tmp_path / "grades"
     grades.mkdir()
@@ -512,7 +512,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path):
 
 
 def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
-    """Every page that a link leads to, every address, every refusal; a table goes by its names."""
+    """On every linked page, in every address and every refusal; a table uses the stand-in names."""
     grades = write_class(tmp_path / "g", anonymous=True)
     with Gradebook(grades) as book:
         entries = list(book.entries())
@@ -557,7 +557,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_the_lines_of_a_class_are_those_of_its_grades(grades):
-    """Read in part, and again from what is known: the same."""
+    """Read in part and completed from the cache, they are the same."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:
@@ -574,7 +574,7 @@ def test_the_lines_of_a_class_are_those_of_its_grades(grades):
 
 
 def test_an_older_gradebook_gets_what_it_lacks(grades):
-    """Once; what was in it is as it was, and an open one of before goes on."""
+    """Once; its content stays, and a gradebook opened before goes on working."""
     with Gradebook(grades) as book:
         before = [(e.submission, e.grade) for e in book.entries()]
         with closing(sqlite3.connect(grades / FILE)) as raw:
@@ -594,7 +594,7 @@ def test_an_older_gradebook_gets_what_it_lacks(grades):
 
 
 def listed(answer: Answer) -> dict[str, list[str]]:
-    """Return the rows of a list of several: points now, after, total now, after."""
+    """Return the rows of the list: points now, after, total now, after."""
     assert answer.status in (200, 409), answer.text
     row = r'(?s)name="team" value="(.*?)".*?((?:<td class="r">.*?</td>\s*){4})'
     rows = re.findall(row, answer.text)
@@ -624,7 +624,7 @@ def apply(who: Visitor, address: str, form: str) -> Answer:
 
 
 def test_one_decision_for_several_is_looked_through_first(ta, grades):
-    """Points before and after; who is not ticked stays; signed, and undone at once."""
+    """Points before and after; teams that are not ticked stay; signed, and undone at once."""
     with Gradebook(grades) as book:
         before = {entry.submission: entry.grade for entry in book.entries()}
     page = ta.get(together(points="0.5"))
@@ -653,7 +653,7 @@ def test_one_decision_for_several_is_looked_through_first(ta, grades):
 
 
 def test_a_comment_changes_no_points(ta, grades):
-    """Points and outcome stay, the team reads the comment."""
+    """Points and outcome stay; the team reads the comment."""
     page = ta.get(together())
     names = list(listed(page))
     with Gradebook(grades) as book:
@@ -673,7 +673,7 @@ def test_a_comment_changes_no_points(ta, grades):
 
 
 def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
-    """No comment, points that are none, nobody ticked, somebody who changed meanwhile."""
+    """No comment, invalid points, no team ticked, a team that changed meanwhile."""
     page = ta.get(together())
     names = list(listed(page))
     for wrong, fields in (
@@ -698,7 +698,7 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
 
 
 def test_what_was_decided_keeps_its_place_in_the_list(ta):
-    """Going on to the next criterion never skips one, whatever points were given."""
+    """Going to the next criterion never skips one, whatever points were given."""
 
     def titles() -> list[str]:
         found = re.findall(r'<span class="title">(.*?)</span>', ta.get(at("team-05")).text)
@@ -713,7 +713,7 @@ def test_what_was_decided_keeps_its_place_in_the_list(ta):
 
 
 def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
-    """Those that were graded; once a file of the folder is another, nothing is offered."""
+    """Those that were graded; if a file has changed since, no link is offered."""
     team = a_submission(tmp_path / "lab" / "team-1")
     rubric, out = RUBRICS / "throne-1dof.toml", tmp_path / "grades"
     cartlab_here("grade", tmp_path / "lab", "--rubric", rubric, "--out", out, "--jobs", 1,
@@ -733,7 +733,7 @@ def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
 
 
 def test_only_a_decision_of_this_class_is_undone(ta, grades):
-    """Undo looks up the browser's moment first, and refuses one that is not in this class."""
+    """Undo checks the stated moment, and refuses one of another class."""
     change(ta, "team-01", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):
         assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
@@ -742,7 +742,7 @@ def test_only_a_decision_of_this_class_is_undone(ta, grades):
 
 
 def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
-    """Whoever was changed since stays, and is named; the class page has each decision."""
+    """Teams changed since then stay and are named; the class page lists each decision."""
     page = ta.get(together())
     names = list(listed(page))
     apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))

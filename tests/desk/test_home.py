@@ -1,4 +1,4 @@
-"""The first page, the line of rooms, and the list of folders that the owner chooses from."""
+"""The first page, the line of rooms, and the list of folders to choose from."""
 
 import re
 from html import unescape
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 @pytest.fixture
 def root(tmp_path, monkeypatch) -> Path:
-    """The folder that a desk is started in: of every kind one, hidden ones, links."""
+    """A desk's root folder: one folder of every kind, hidden ones, links."""
     root, outside = tmp_path / "course", tmp_path / "outside"
     a_submission(root / "team")
     write_class(root / "grades")
@@ -42,7 +42,7 @@ def links(page: str) -> list[str]:
 
 
 def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
-    """Each folder once, with what it is; links that lead out or to hidden folders are left out."""
+    """Each folder once, with its kind; links that lead out or to hidden folders are left out."""
     found = {one.inside: one.kind for one in list_folders(root, "").found}
     assert found == {"grades": "grading", "team": "submission", "empty": "empty", "years": "folder"}
     assert list(found)[:2] == ["grades", "team"]
@@ -57,7 +57,7 @@ def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
      "nowhere", "years/../..", "a\x00b", "loop"],
 )  # fmt: skip
 def test_no_folder_outside_of_the_root_is_listed(root, inside):
-    """Nor a hidden one, nor what is no folder; the desk answers with one sentence."""
+    """Neither a hidden folder nor a file; the desk answers with one sentence."""
     with pytest.raises(ConfigError):
         list_folders(root, inside)
     with DeskServer() as server:
@@ -66,7 +66,7 @@ def test_no_folder_outside_of_the_root_is_listed(root, inside):
 
 
 def test_a_large_folder_is_cut_and_says_so(root):
-    """The first of them are listed; the page says how to open another."""
+    """The first ones are listed; the page says how to open another."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
     listed = list_folders(root, "years")
@@ -77,7 +77,7 @@ def test_a_large_folder_is_cut_and_says_so(root):
 
 
 def test_what_can_be_opened_is_never_cut_off(root):
-    """A submission whose name comes last is the first of a long list."""
+    """A submission whose name comes last is first in a long list."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
     (root / "years" / "zoe").mkdir()
@@ -86,13 +86,13 @@ def test_what_can_be_opened_is_never_cut_off(root):
 
 
 def test_the_whole_disk_is_no_root(monkeypatch):
-    """A desk that was started from an icon lists the home folder."""
+    """A desk started from an icon lists the home folder."""
     monkeypatch.chdir(Path(Path.cwd().anchor))
     assert find_root() == Path.home()
 
 
 def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
-    """From the card to the room: report, bench, solution; a graded class opens as a class."""
+    """From the card to the page: report, bench, solution; a graded class opens as a class."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert "Nothing is open yet." in visitor.get("/").text
@@ -115,7 +115,7 @@ def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
 
 
 def test_the_line_of_rooms_stays_short(root):
-    """Those opened last and the one that is shown; its bench only where it is shown."""
+    """The folders opened last and the current one; its bench only while it is shown."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         for number in range(9):
@@ -128,7 +128,7 @@ def test_the_line_of_rooms_stays_short(root):
 
 
 def test_a_student_sees_nothing_of_the_instructor_s(root):
-    """No card, no link, no list of folders; neither does a TA."""
+    """No card, no link, no list of folders; the same holds for a TA."""
     users = """
     [[users]]
     name = "s"

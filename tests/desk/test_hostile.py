@@ -1,4 +1,4 @@
-"""Hostile uploads: whatever they hold, they reach nothing beside their folder and run nothing."""
+"""Hostile uploads reach nothing outside their folder and run nothing."""
 
 import os
 import re
@@ -14,7 +14,7 @@ _OURS = re.compile(r"\.turn|data/[^/]+|submission\.toml|notes\.md|\.lock")
 
 
 def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
-    """Upload every hostile hand-in into a room of its own, look at it; return how many."""
+    """Upload every hostile submission into a folder of its own, open it; return how many."""
     school, rooms = tmp_path / "school", tmp_path / "rooms"
     school.mkdir()
     good = {
@@ -63,11 +63,11 @@ def _quoted(name: str) -> str:
 
 
 def test_hostile_uploads_reach_nothing(tmp_path):
-    """Archives and folders of the hostile class, of the spoilt submissions some."""
+    """All archives and folders of the hostile class, and some spoilt submissions."""
     assert visit(tmp_path, every=12, drawn=6, seed=1) >= 50
 
 
 @pytest.mark.slow
 def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
-    """All of them, and as many drawn."""
+    """All of them, and as many random ones."""
     assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200

@@ -1,4 +1,4 @@
-"""Work in processes of its own: nobody waits for another's, and what became of it is said."""
+"""Work in separate processes: nobody waits for another's work, and results are reported."""
 
 import re
 import sys
@@ -20,14 +20,14 @@ HERE = "/student/0/"
 
 @pytest.fixture
 def jobs():
-    """The long work of a desk, which ends."""
+    """The long tasks of a desk, ended after the test."""
     jobs = Jobs()
     yield jobs
     jobs.close()
 
 
 def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
-    """Another's task is done meanwhile; of those that wait for the folder, not all threads do."""
+    """Another task is done meanwhile, and requests for that folder do not use up all threads."""
     slow, workers = a_submission(tmp_path / "slow"), WorkerPool()
 
     def ask(task: str) -> threading.Thread:
@@ -54,7 +54,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_a_stop_waits_for_no_thread(tmp_path):
-    """Where all that answer are busy, a page waits, and a Stop does not."""
+    """If all threads are busy, a page waits but a Stop does not."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         visitor, workers = Visitor.of(server.url), server._desk.workers
@@ -74,7 +74,7 @@ def test_a_stop_waits_for_no_thread(tmp_path):
 
 
 def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch):
-    """The desk says so, and does not wait for it when it is closed."""
+    """The desk says so, and can be closed without waiting for it."""
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
     job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over)
@@ -82,7 +82,7 @@ def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch)
 
 
 def test_a_fault_of_our_own_is_told(tmp_path, jobs):
-    """The end of what the process said, by which it can be reported."""
+    """The message ends with the process's last lines, which help to report the fault."""
     job = jobs.start("nonsense", title="Nonsense", place=tmp_path)
     until(lambda: job.over)
     assert job.state == "failed"
@@ -90,7 +90,7 @@ def test_a_fault_of_our_own_is_told(tmp_path, jobs):
 
 
 def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
-    """The same again is the same job; another is refused with what is under way."""
+    """The same task again is the same job; another is refused, naming the one that runs."""
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
     job = jobs.start("make_report", title="The report", **given)
     assert jobs.start("make_report", title="The report", **given) is job
@@ -102,9 +102,10 @@ def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
 
 
 def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_path):
-    """The page of any later moment shows it.
+    """Every later page shows it.
 
-    Stopped or killed, nothing half is there, and the desk makes the report when asked again.
+    Stopped or killed, it leaves no half-written file, and the desk makes the report when asked
+    again.
     """
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -141,7 +142,10 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
 
 
 def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
-    """The process that looks at it dies; the others are shown, the next task has another."""
+    """The process that reads it dies;
+
+    the other files are shown, and the next task has a new process.
+    """
     with DeskServer(folder=tmp_path) as server:
         visitor = Visitor.of(server.url)
         visitor.upload(HERE + "files", some_files(most=2))
@@ -169,7 +173,7 @@ def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
 
 
 def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
-    """What went wrong is said, with its kind; the same process does the next task."""
+    """The error is named with its kind; the same process does the next task."""
     workers = WorkerPool()
     with pytest.raises(Failed, match=r"cartlab itself failed \(TypeError: .*please report it"):
         workers.do("propose_recordings", folder=str(tmp_path), stock=True, nonsense=1)
@@ -191,7 +195,7 @@ def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
     ],
 )
 def test_who_dies_of_an_exception_got_no_signal(module, line):
-    """The words are those of the exception: Python ends while a thread waits for more to do."""
+    """The exception is reported, although Python ends while a thread waits."""
     process = LineProcess(module)
     try:
         process.send(line)
@@ -204,7 +208,7 @@ def test_who_dies_of_an_exception_got_no_signal(module, line):
 
 
 def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
-    """Nobody waits for ever for a job that could not be begun, whatever kept it."""
+    """A job that could not be started is over, whatever the cause."""
 
     def no_more(module: str) -> LineProcess:
         raise MemoryError("no more")

@@ -1,4 +1,4 @@
-"""The rubric over plain forms: which there are, its numbers and text, its preview on a class."""
+"""The rubric through plain forms: the list, its numbers and text, the preview on a class."""
 
 import json
 import re
@@ -23,14 +23,14 @@ ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
-    """Somebody at a desk."""
+    """A visitor at a desk."""
     with DeskServer() as server:
         yield Visitor.of(server.url)
 
 
 @pytest.fixture
 def lab(tmp_path) -> Path:
-    """A rubric of one's own."""
+    """A rubric of an instructor."""
     path = tmp_path / "lab.toml"
     path.write_text(ONE_CART, encoding="utf-8")
     return path
@@ -44,7 +44,7 @@ def editor(visitor: Visitor, path: Path) -> Answer:
 
 
 def sent(page: Answer, path: Path, **changed: str) -> dict[str, str]:
-    """Return what a page's form sends once some of it was changed."""
+    """Return the fields of a page's form after some of them were changed."""
     shown = unescape(page.value("shown"))
     typed = re.search(r'<textarea name="text"[^>]*>\n?(.*?)</textarea>', page.text, re.DOTALL)
     assert typed
@@ -57,7 +57,7 @@ def sent(page: Answer, path: Path, **changed: str) -> dict[str, str]:
 
 
 def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
-    """A new one begins with a shipped one; a mistake stands at its line, and is not written."""
+    """A new rubric starts from a shipped one; a mistake is shown at its line and not written."""
     path = tmp_path / "rubric.toml"
     page = visitor.get(f"/rubric/?{urlencode({'file': path, 'start': 'throne-2dof'})}")
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
@@ -88,7 +88,7 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
     assert "# mine" in answer.text
     assert lab.read_text(encoding="utf-8").startswith("# by another")
     new = visitor.post("/rubric/save", file=str(lab), text=mine, seen="new")
-    assert new.status == 409  # begun as a new file, which is there now
+    assert new.status == 409  # started as a new file, which exists by now
 
 
 @pytest.mark.parametrize(
@@ -97,12 +97,12 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
      "a" * 300 + ".toml"],
 )  # fmt: skip
 def test_a_rubric_lies_where_it_can(visitor, file):
-    """A name that is none is one clear sentence."""
+    """A bad name gives one clear sentence."""
     assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
 
 
 def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
-    """A name with the signs of an address: the page after saving is of the same file."""
+    """Even if the name has special characters of addresses."""
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
     path = folder / "rubric.toml"
@@ -112,7 +112,7 @@ def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path
 
 
 def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):
-    """With its title, carts and points; those of the folder can be opened; a free name is taken."""
+    """With title, carts and points; those of the folder can be opened; a free name is chosen."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rubric.toml").write_text(ONE_CART.replace("points", "pionts"), encoding="utf-8")
     (tmp_path / "other.toml").write_text("a = 1\n", encoding="utf-8")
@@ -129,7 +129,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
 
 
 def test_a_workshop_shows_its_own_files_alone(tmp_path):
-    """Neither those beside it, nor those that a link in it leads to."""
+    """Neither the files beside it nor those behind a link in it."""
     shop = tmp_path / "shop"
     for path in (shop / "deep" / "a.toml", shop / ".hidden" / "b.toml", tmp_path / "c.toml"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -149,7 +149,7 @@ def test_a_page_begins_with_what_the_rubric_is(visitor, lab):
 
 
 def test_late_work_at_half_is_one_number(visitor, lab):
-    """One line of the file is another, its neighbours and comments are not."""
+    """One line of the file changes; its neighbours and comments do not."""
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "50"}))
     assert answer.status == 303
@@ -158,7 +158,7 @@ def test_late_work_at_half_is_one_number(visitor, lab):
 
 
 def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
-    """What was typed in the text stays; a number of the form is put into that."""
+    """The typed text stays; a number from the form is inserted into it."""
     page = editor(visitor, lab)
     text = ONE_CART.replace("points are rounded to it", "quarters")
     fields = sent(page, lab, **{"criteria.pieces.points": "1,5", "text": text})
@@ -168,7 +168,7 @@ def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
 
 
 def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
-    """Nothing is written, and what was typed is still there."""
+    """Nothing is written, and the typed text is still there."""
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"criteria.pieces.points": "1.1"}))
     line = ONE_CART.split("\n").index("points = 1") + 1
@@ -182,7 +182,7 @@ def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
 
 
 def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
-    """The form is away while the text is wrong, and its number is put in once it is right."""
+    """While the text is wrong the form is hidden; its number is inserted once the text is right."""
     page = editor(visitor, lab)
     wrong = ONE_CART.replace("version = 1", "version = one")
     fields = sent(page, lab, **{"late.percent_per_day": "50", "text": wrong})
@@ -195,7 +195,7 @@ def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
 
 @pytest.mark.parametrize("shown", ["", "no JSON", "[]", '{"criteria.none.points": "1"}', "7"])
 def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
-    """What a page never showed changes nothing."""
+    """Fields that the page never showed change nothing."""
     seen = editor(visitor, lab).value("seen")
     fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
     answer = visitor.post("/rubric/check", **fields, **{"criteria.none.points": "2"})
@@ -207,7 +207,7 @@ def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
 
 
 def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
-    """What changes and by how much, the largest first; then the rubric is saved and applied."""
+    """Who changes and by how much, the largest first; then the rubric is saved and applied."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -238,7 +238,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
 
 
 def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
-    """A tolerance of the laws, or what must be handed in, is not guessed from kept findings."""
+    """Tolerances of the laws and required parts are not guessed from stored findings."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -251,7 +251,7 @@ def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
 
 
 def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
-    """Nor does the order of the names."""
+    """The order of the teams reveals nothing either."""
     write_class_of_two(tmp_path / "graded", anonymous=True)
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -264,7 +264,7 @@ def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
 
 
 def test_a_preview_is_of_a_class_that_is_open_and_a_rubric_that_is_valid(visitor, lab):
-    """Addresses of nothing are told as such; a mistake leads back to the editor."""
+    """Bad addresses get a message; a mistake in the rubric leads back to the editor."""
     page = editor(visitor, lab)
     for number in ("", "0", "-1", "²", "9" * 30):
         assert visitor.post("/rubric/preview", **sent(page, lab), **{"class": number}).status == 404

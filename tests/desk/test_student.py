@@ -1,4 +1,4 @@
-"""The student's room over plain forms: files, table, form, report, answers, zip, and no harm."""
+"""The student's pages through plain forms: files, table, form, report, answers, zip, safety."""
 
 import io
 import json
@@ -38,7 +38,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 @pytest.fixture
 def room(tmp_path):
-    """Return who opened the desk on an empty folder, and the folder."""
+    """Return a visitor who opened the desk on an empty folder, and the folder."""
     folder = tmp_path / "team"
     folder.mkdir()
     with DeskServer(folder=folder) as server:
@@ -47,7 +47,7 @@ def room(tmp_path):
 
 @pytest.fixture
 def filled(tmp_path):
-    """Return who opened the desk on a submission, and the folder."""
+    """Return a visitor who opened the desk on a submission, and the folder."""
     folder = a_submission(tmp_path / "Gruppe ж 7")
     with DeskServer(folder=folder) as server:
         yield Visitor.of(server.url), folder
@@ -55,21 +55,21 @@ def filled(tmp_path):
 
 @pytest.fixture(scope="module")
 def workers():
-    """What does the short tasks of no desk."""
+    """The processes for short tasks, without a desk."""
     workers = WorkerPool()
     yield workers
     workers.close()
 
 
 def take_upload(name: str, content: io.BytesIO, folder: Path, *, workers: WorkerPool) -> list[str]:
-    """Upload one file; return what is said."""
+    """Upload one file; return the message."""
     said = take_uploads([(name, content)], folder, workers=workers)
     assert all(("not taken" in line.text) == (line.tone == "refused") for line in said)
     return [line.text for line in said]
 
 
 def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
-    """Leave a report that asks questions."""
+    """Put a report that asks questions into the folder."""
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "report.html").write_text("<p>the report</p>", encoding="utf-8")
     (folder / "report" / "report.pdf").write_bytes(b"%PDF")
@@ -80,7 +80,7 @@ def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
 
 
 def handed_in(visitor: Visitor) -> str:
-    """Press "Hand in", wait for the report; return the page that shows what is handed in."""
+    """Press "Hand in", wait for the report; return the page that lists what will be submitted."""
     answer = visitor.post(HERE + "hand-in")
     assert (answer.status, answer.headers["location"]) == (303, HERE + "hand-in")
     until(lambda: "data-events" not in visitor.get(HERE + "hand-in").text)
@@ -93,7 +93,7 @@ def zipped(visitor: Visitor) -> zipfile.ZipFile:
 
 
 def test_from_an_empty_folder_to_the_zip(room):
-    """Without any script: files become a submission, it a report, answers notes, all a hand-in."""
+    """Without scripts: files become a submission, then a report, answers, and a zip."""
     visitor, folder = room
     assert "Begin with your files" in visitor.get(HERE).text
     assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE + "#files"
@@ -135,7 +135,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     seen = visitor.get(HERE).value("seen")
     assert visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "29.13"}).status == 303
     assert "The report is out of date" in visitor.get(HERE).text
-    assert "report/report.pdf" not in zipped(visitor).namelist()  # nobody hands in a stale one
+    assert "report/report.pdf" not in zipped(visitor).namelist()  # nobody submits a stale report
     assert "The report in the zip is of the files and answers as they are now" in handed_in(visitor)
     assert "29.13" in visitor.get(HERE + "report/report.html").text
     packed = visitor.get(HERE + "hand-in.zip")
@@ -151,7 +151,10 @@ def test_from_an_empty_folder_to_the_zip(room):
 
 
 def test_what_is_wrong_stands_beside_its_field(filled):
-    """As the file's own check words it; what was typed stays in the form, the file as it was."""
+    """In the words of the file's own check;
+
+    the form keeps what was typed, the file is unchanged.
+    """
     visitor, folder = filled
     before = (folder / NAME).read_bytes()
     seen = visitor.get(HERE).value("seen")
@@ -170,7 +173,7 @@ def test_what_is_wrong_stands_beside_its_field(filled):
 
 
 def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
-    """Positions in fractions are no counts; with the unit stated the question is gone."""
+    """Fractional positions are not counts; once the unit is stated, the question is gone."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)
@@ -186,7 +189,7 @@ def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
 
 
 def test_a_row_is_corrected_in_place(filled):
-    """Kind, carts, window of one file; and its table is taken out, the file stays."""
+    """Kind, carts and window of one file; its table can be removed, and the file stays."""
     visitor, folder = filled
     page = visitor.get(HERE)
     index = next(i for i, e in enumerate(load_submission(folder).experiments) if e.kind == "step")
@@ -204,7 +207,7 @@ def test_a_row_is_corrected_in_place(filled):
 
 
 def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
-    """Both versions have the fields that were touched in this one, and no others."""
+    """Both versions show the fields touched in this tab, and no others."""
     visitor, _ = filled
     page = visitor.get(HERE)
     shown = {"title": page.value("title"), "section": page.value("section")}
@@ -217,7 +220,7 @@ def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
 
 
 def test_a_recording_is_moved_aside_and_comes_back(filled):
-    """Whole, over nothing; one that a table names is not, nor a file that is no recording."""
+    """Never over another file; not if a table names it, nor if it is not a recording."""
     visitor, folder = filled
     (folder / "data" / "bad.csv").write_bytes(b"nothing in it")
     for round_ in ("bad.csv", "bad-2.csv"):
@@ -237,7 +240,7 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
-    """Blanks of all sorts and marks without a picture: replaced, said, and the file is used."""
+    """Spaces and invisible marks are replaced, with a message, and the file is used."""
     visitor, folder = room
     raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
     sent = [(f"a{mark}b.csv", raw + b"\n" * i) for i, mark in enumerate(marks)]
@@ -259,7 +262,7 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
 
 @pytest.mark.parametrize("named", [True, False])
 def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
-    """Whether a table names it by then, or it is gone: one clear sentence, and nothing moves."""
+    """If a table names it by then, or it is gone: one clear sentence, and nothing moves."""
     visitor, folder = filled
     recording = folder / "data" / "late.csv"
     recording.write_bytes(b"nothing in it")
@@ -281,7 +284,7 @@ def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
 
 
 def test_handing_in_warns_of_open_questions(filled):
-    """Until each has an answer; the zip is there all the same."""
+    """Until each question has an answer; the zip is offered all the same."""
     visitor, folder = filled
     ask_for(folder, "zeta", "level")
     for answered, open_ in ((None, "2 questions"), ("zeta", "1 question "), ("level", "")):
@@ -296,7 +299,7 @@ def test_handing_in_warns_of_open_questions(filled):
 
 @pytest.mark.parametrize("change", ["number", "answer", "older", "gone", "gap", "nothing"])
 def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
-    """Whatever was changed since, by whom and to what date; the zip goes without that report."""
+    """Whatever changed since, whoever changed it; the zip then lacks that report."""
     visitor, folder = filled
     ask_for(folder, "zeta")
     file = folder / load_submission(folder).experiments[0].file
@@ -322,7 +325,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
 
 
 def test_what_is_handed_in_is_shown_before(filled):
-    """What the zip holds, the questions without an answer, what was assumed; then the zip."""
+    """The content of the zip, open questions, assumptions; then the zip."""
     visitor, folder = filled
     text = (folder / NAME).read_text(encoding="utf-8")
     bare = re.sub(r"(?m)^(springs|input|position) = .*\n", "", text)
@@ -343,7 +346,7 @@ def test_what_is_handed_in_is_shown_before(filled):
 
 
 def test_only_a_report_of_these_files_says_what_was_assumed(filled):
-    """Each with the reason; once a file has changed, the page no longer speaks for the report."""
+    """Each with its reason; if a file has changed, the page no longer quotes the report."""
     visitor, folder = filled
     ask_for(folder)
     asked = folder / "report" / "questions.json"
@@ -365,7 +368,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
-    """What went wrong is said; the zip goes without one."""
+    """The error is named, and the zip has no report."""
     visitor, folder = filled
     (folder / "report").symlink_to(folder.parent)
     page = handed_in(visitor)
@@ -376,7 +379,7 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
 
 
 def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
-    """In the answer to the drop, with the one that it is a copy of; only the first has a table."""
+    """The message names the original; only the first file gets a table."""
     visitor, folder = room
     (name, raw), *_ = some_files(most=1)
     visitor.upload(HERE + "files", [(name, raw), ("theirs.csv", raw)])
@@ -387,7 +390,7 @@ def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
 
 
 def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
-    """There are none to tell; of one that can be read and tells nothing they are."""
+    """A file that cannot be read shows none; one whose columns are unclear asks for them."""
     visitor, folder = filled
     (folder / "data" / "new.csv").write_bytes(b"")
     page = visitor.get(HERE).text
@@ -407,7 +410,7 @@ def test_an_essay_and_an_empty_file_are_no_recordings(filled):
 
 
 def test_a_recording_that_was_cut_short_is_not_green(filled):
-    """A report does not take it, so its row says so and its group stays open."""
+    """A report does not use it, so its row says so and its group stays open."""
     visitor, folder = filled
     assert 'id="kind-decay" open' not in visitor.get(HERE).text
     file = folder / "data" / "decay-1b.csv"
@@ -418,7 +421,7 @@ def test_a_recording_that_was_cut_short_is_not_green(filled):
 
 
 def test_edits_from_outside_show_and_are_not_written_over(filled):
-    """A form of an older state is refused with both versions; so is an answer."""
+    """A form of an older state is refused with both versions; an answer too."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     text = (folder / NAME).read_text(encoding="utf-8")
@@ -441,7 +444,7 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
 
 
 def test_what_a_page_showed_is_known_a_hundred_states_later():
-    """A window is left open while others save; what is remembered of a person is bounded."""
+    """A window stays open while others save; the memory for each person is limited."""
     desk, seen = Desk(), "seen"
     desk.keep_shown("title = ''", digest=seen, to="")
     for i in range(100):
@@ -454,7 +457,7 @@ def test_what_a_page_showed_is_known_a_hundred_states_later():
 
 
 def test_of_two_at_once_one_is_told_of_the_other(filled):
-    """Eight windows save what they were shown: one does, and it is its title that stands there."""
+    """Eight windows save what they were shown: one succeeds, and the file has its title."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     answers: dict[str, int] = {}
@@ -485,7 +488,7 @@ edit_submission(folder, change, seen=text_digest(submission_text(folder)))
 
 
 def test_another_process_waits_its_turn(filled):
-    """The command in a terminal and the desk: who comes second is told of the first."""
+    """If the command in a terminal and the desk collide, the second gets a message."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
@@ -505,7 +508,7 @@ def test_another_process_waits_its_turn(filled):
 
 
 def test_of_two_answers_at_once_none_is_lost(filled):
-    """Either both stand in the notes, or one is told of the other."""
+    """Either both are in the notes, or one gets a conflict message."""
     visitor, folder = filled
     asked = ask_for(folder, *(f"zeta_{i}" for i in range(6)))
     seen = visitor.get(HERE + "questions").value("seen")
@@ -521,7 +524,7 @@ def test_of_two_answers_at_once_none_is_lost(filled):
 
 
 def test_an_answer_that_is_refused_stays_on_the_page(filled):
-    """With what is wrong; the notes are as they were, whatever it leaves open or how long."""
+    """With the reason; the notes stay as they were, whatever is open or too long."""
     visitor, folder = filled
     ask_for(folder, "zeta")
     (folder / "notes.md").write_text("## level\n\nMine.\n", encoding="utf-8")
@@ -539,7 +542,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
 
 
 def test_lines_of_a_note_stay_lines(filled):
-    """Whatever else of its row is changed; blanks around it are no change."""
+    """Also when something else in its row changes; blanks around it do not count."""
     visitor, folder = filled
     note = "one\n\ntwo\n"
     edit_submission(folder, lambda d: d["experiments"][0].update(note=note))
@@ -555,7 +558,7 @@ def test_lines_of_a_note_stay_lines(filled):
 
 @pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])
 def test_a_broken_file_is_shown_as_such(filled, text):
-    """The room opens all the same, says what is wrong, and makes no report."""
+    """The page opens all the same, says what is wrong, and makes no report."""
     visitor, folder = filled
     (folder / NAME).write_bytes(text.encode("latin-1"))
     page = visitor.get(HERE)
@@ -566,7 +569,7 @@ def test_a_broken_file_is_shown_as_such(filled, text):
 
 @pytest.mark.parametrize("broken", [b"version = \n", b"\xff", b"#" * 1_000_001])
 def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
-    """An uploaded one is checked before it is stored; over one on disk a sound one goes."""
+    """An upload is checked before it is stored; a sound file replaces an unreadable one on disk."""
     visitor, folder = filled
     sound = (folder / NAME).read_bytes()
     (folder / NAME).unlink()
@@ -582,7 +585,7 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
 
 @pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
 def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, workers):
-    """By the limit of what is read."""
+    """By the limit on what is read."""
     for name in ("notes.md", "there/notes.md"):
         (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
         assert "not taken" in said
@@ -604,7 +607,7 @@ NAMES = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
-    """Whatever it is called."""
+    """Under any name."""
     (tmp_path / "team").mkdir()
     take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", workers=workers)
     found = [path.relative_to(tmp_path / "team") for path in tmp_path.rglob("*.csv")]
@@ -615,7 +618,7 @@ def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
 
 
 def test_nothing_is_written_over(tmp_path, workers):
-    """The same file again is none; another of its name gets another name; links stay links."""
+    """The same file again is ignored; another of its name gets a new name; links stay links."""
     for raw in (b"one", b"one", b"two", b"two"):
         take_upload("a.csv", io.BytesIO(raw), tmp_path, workers=workers)
     assert {p.name: p.read_bytes() for p in (tmp_path / "data").iterdir()} == {
@@ -630,7 +633,7 @@ def test_nothing_is_written_over(tmp_path, workers):
 
 
 def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
-    """Each under a name of its own."""
+    """Each under its own name."""
     raws = [str(i).encode() * 200_000 for i in range(8)]
 
     def take(raw: bytes) -> list[str]:
@@ -642,7 +645,7 @@ def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
 
 
 def test_a_linked_data_folder_is_refused(tmp_path, workers):
-    """What a link points at may be anybody's."""
+    """A link may point at anybody's files."""
     (tmp_path / "theirs").mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs")
@@ -655,7 +658,7 @@ def test_a_linked_data_folder_is_refused(tmp_path, workers):
 
 
 def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
-    """Recordings of a zip are taken; a bomb, a link and a way out are refused with their reason."""
+    """Recordings of a zip are taken; a bomb, a link and a path outside are refused with reasons."""
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
         buffer = io.BytesIO()
@@ -677,7 +680,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
 
 
 def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
-    """Then nothing more is taken."""
+    """Beyond that nothing is accepted."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
     (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=workers)
@@ -693,7 +696,7 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
 
 
 def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
-    """What was set aside, reports, a bench's raw files; what the zip holds counts."""
+    """Files set aside, reports and raw files do not count; the content of the zip does."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes(bytes(100))
@@ -705,7 +708,7 @@ def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypat
 
 
 def test_names_and_texts_of_files_are_never_markup(room):
-    """What a file or its heading is called is shown as text."""
+    """Names of files and headings are shown as text."""
     visitor, folder = room
     evil = "<img src=x onerror=alert(1)>"
     (folder / "data").mkdir()
@@ -717,7 +720,7 @@ def test_names_and_texts_of_files_are_never_markup(room):
 
 
 def test_other_files_of_the_folder_are_not_served(filled):
-    """The report's files are, where no link leads out; and the zip, by a name that headers know."""
+    """The report's files are, unless a link leads out; and the zip, under a safe name."""
     visitor, folder = filled
     zipped = visitor.get(HERE + "hand-in.zip").headers["content-disposition"]
     plain, _, whole = zipped.partition("; filename*=UTF-8''")
@@ -733,7 +736,7 @@ def test_other_files_of_the_folder_are_not_served(filled):
 
 
 def test_a_report_page_that_is_not_ours_runs_nothing(filled):
-    """Its scripts are not those of the report, which alone the policy lets run."""
+    """Its scripts are not the report's own, which are the only ones the policy allows."""
     visitor, folder = filled
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "report.html").write_text("<script>alert(1)</script>", encoding="utf-8")
@@ -746,7 +749,7 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 
 
 def test_the_gap_is_looked_for_as_a_job(filled):
-    """The page is that of `cartlab gap`, in the folder, and shown."""
+    """The page is that of `cartlab gap`, in the folder, and is shown."""
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
     assert visitor.post(HERE + "make-gap").status == 303
@@ -766,7 +769,7 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
 
 
 def test_saving_what_is_not_valid_changes_nothing(tmp_path):
-    """Whatever way it comes in."""
+    """By every way to save."""
     folder = a_submission(tmp_path / "team")
     before = (folder / NAME).read_bytes()
     with pytest.raises(SubmissionError):
@@ -776,7 +779,7 @@ def test_saving_what_is_not_valid_changes_nothing(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names, and links need rights")
 def test_files_that_are_not_read_are_named_with_what_to_do(filled):
-    """A spreadsheet and a link out of the folder stand below the table, each with its advice."""
+    """A spreadsheet and a link out of the folder are listed below the table, each with advice."""
     visitor, folder = filled
     assert "Not read" not in visitor.get(HERE).text
     (folder / "data" / "book.xlsx").write_bytes(b"PK")
@@ -792,13 +795,13 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
 
 
 def answers(page: str) -> dict[str, str]:
-    """Return the buttons that answer a doubt: what each types, by its words."""
+    """Return the buttons that answer a doubt: what each types, by its text."""
     found = re.findall(r'<button name="answer" value="([^"]*)">([^<]*)</button>', page)
     return {unescape(label): unescape(value) for value, label in found}
 
 
 def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
-    """The button saves the whole form; the doubt is gone from the page and from the file."""
+    """The button saves the whole form; the doubt disappears from the page and from the file."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)
@@ -812,7 +815,7 @@ def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
 
 @pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("There is one", True)])
 def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
-    """Either way: the doubt goes, though the answer may be what stood there."""
+    """Either way the doubt disappears, even if the answer confirms the file."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files("two-cart"))
     page = visitor.get(HERE)
@@ -824,7 +827,7 @@ def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room
 
 
 def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
-    """A sign is turned, while the report is of the files as they are."""
+    """A sign is turned, as long as the report is up to date."""
     visitor, folder = filled
     ask_for(folder)
     asked = folder / "report" / "questions.json"
@@ -841,7 +844,7 @@ def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
 
 
 def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
-    """By one click in its row, which takes the mark out of the file too."""
+    """By one click in its row, which removes the mark from the file too."""
     visitor, folder = room
     rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(400)]
     visitor.upload(HERE + "files", [("a.csv", "\n".join(["time,input,x1,x2", *rows]).encode())])
@@ -857,7 +860,7 @@ def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
 
 
 def test_what_was_not_taken_does_not_look_like_what_was(room):
-    """Where it was dropped: done, changed and refused differ in looks and in words."""
+    """Accepted, changed and refused files differ in look and in words."""
     visitor, _ = room
     raw = some_files(most=1)[0][1]
     sent = [("a.csv", raw), ("a.csv", raw + b"\n"), ("plot.py", b"import os")]
@@ -871,7 +874,7 @@ def test_what_was_not_taken_does_not_look_like_what_was(room):
 
 
 def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
-    """A dwell has its frequency; a group in which something is wrong is open."""
+    """A dwell shows its frequency; a group with a problem is open."""
     visitor, folder = filled
     page = visitor.get(HERE).text
     kinds = {e.kind for e in load_submission(folder).experiments}

@@ -1,4 +1,4 @@
-"""The way of a student: every step's state, by plain facts."""
+"""The steps of a student's way, computed from plain facts."""
 
 import pytest
 
@@ -40,14 +40,14 @@ READY = Facts(recordings=33, sound=True, report="current", questions=3)
     ],
 )
 def test_each_step_follows_from_the_facts(facts, states, following):
-    """A step is done, needs somebody, is out of date, or not yet; the first not done is next."""
+    """Done, needs you, out of date, or not yet; the first step not done is next."""
     steps = find_steps(facts)
     assert " ".join(step.state for step in steps) == states
     assert next_step(steps).key == following
 
 
 def test_a_zip_that_was_downloaded_as_it_is_now_ends_the_way():
-    """Then nothing is left to do, and the last step stays the one to go to."""
+    """Then there is nothing left to do, and the last step is the current one."""
     facts = Facts(recordings=1, sound=True, report="current", handed=True)
     assert {step.state for step in find_steps(facts)} == {"done"}
     assert next_step(find_steps(facts)).key == "hand-in"
