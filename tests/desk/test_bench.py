@@ -104,7 +104,7 @@ def test_many_viewers_stop_nobody(tmp_path, real):
     ],
 )
 def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, fields):
-    """Kill -9 of the desk in mid-run: its acquisition tells the bench to stop and saves."""
+    """After kill -9 of the desk during a run, its acquisition stops the bench and saves."""
     work = write_work(tmp_path / "team", [sine("long", seconds=300), SWEEP])
     command = [sys.executable, "-m", "pipeline", "desk", str(work), "--no-browser"]
     desk = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")

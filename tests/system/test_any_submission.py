@@ -1,4 +1,4 @@
-"""Broken student data, drawn at random: a result or one line of what is wrong, nothing else."""
+"""Random broken student data give a result or one line of error, and nothing else."""
 
 import csv
 import json
@@ -24,22 +24,22 @@ MOST_RUNS = 6  # of a kind: more only cost time
 
 
 def stuck(y: Array) -> Array:
-    """Stop a third of the way."""
+    """Stop after a third of the record."""
     return np.where(np.arange(y.size) < y.size // 3, y, y[y.size // 3])
 
 
 def jumping(y: Array) -> Array:
-    """Miss a thousand units halfway."""
+    """Jump by a thousand units halfway."""
     return y + 1e3 * (np.arange(y.size) >= y.size // 2)
 
 
 def spiked(y: Array) -> Array:
-    """Stand still but for one sample."""
+    """Stand still except for one sample."""
     return np.eye(1, y.size, y.size // 2)[0]
 
 
 def clipped(y: Array) -> Array:
-    """Cut a tenth of the largest value off."""
+    """Cut off a tenth of the largest value."""
     return np.clip(y, -0.1 * np.abs(y).max(), 0.1 * np.abs(y).max())
 
 
@@ -91,7 +91,7 @@ def example(name: str) -> tuple[Submission, dict[str, tuple[list[str], Array]]]:
 
 @st.composite
 def broken(draw: st.DrawFn, names: list[str]) -> Case:
-    """Draw an example with kinds missing, channels spoilt, and experiments said to be others."""
+    """Draw an example with missing kinds, spoilt channels, and mislabelled experiments."""
     name = draw(st.sampled_from(names))
     submission, tables = example(name)
     system = submission.system
@@ -121,7 +121,7 @@ def broken(draw: st.DrawFn, names: list[str]) -> Case:
 
 
 def spoil(draw: st.DrawFn, header: list[str], values: Array) -> tuple[Array, list[str]]:
-    """Spoil one or two columns other than the time, or cut the record short."""
+    """Spoil one or two columns other than the time, or truncate the record."""
     values, done = values.copy(), []
     for _ in range(draw(st.integers(1, 2))):
         column = draw(st.integers(1, len(header) - 1))
@@ -137,7 +137,7 @@ def spoil(draw: st.DrawFn, header: list[str], values: Array) -> tuple[Array, lis
 
 
 def mislabelled(draw: st.DrawFn, run: Experiment, n: int) -> Experiment:
-    """State another kind or other free carts than the recording had."""
+    """State another kind or other free carts than those recorded."""
     if draw(st.booleans()):
         return run.model_copy(update={"kind": draw(st.sampled_from(KINDS))})
     carts = draw(st.sets(st.integers(1, n), min_size=1))
@@ -149,7 +149,7 @@ def refuse(constant: str) -> None:
 
 
 def check(case: Case) -> None:
-    """Analyse: valid JSON comes out, or a one-line PipelineError."""
+    """Analyse: expect valid JSON or a one-line PipelineError."""
     with tempfile.TemporaryDirectory() as folder:
         for name, (header, values) in case.files.items():
             path = Path(folder) / name
@@ -170,7 +170,7 @@ quick = settings(max_examples=5, deadline=None, suppress_health_check=[HealthChe
 @quick
 @given(broken(["one-cart", "two-cart"]))
 def test_broken_data_end_in_a_result_or_in_one_line(case):
-    """Whatever is wrong with the channels of a submission, `analyse` says so or goes on."""
+    """Whatever is wrong with the channels, `analyse` reports it or goes on."""
     check(case)
 
 
@@ -178,5 +178,5 @@ def test_broken_data_end_in_a_result_or_in_one_line(case):
 @settings(quick, max_examples=400)
 @given(broken(["one-cart", "two-cart", "three-cart"]))
 def test_broken_data_of_up_to_three_carts_end_in_a_result_or_in_one_line(case):
-    """The same for many more submissions, three carts among them."""
+    """The same for many more submissions, also with three carts."""
     check(case)

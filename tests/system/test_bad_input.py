@@ -1,4 +1,4 @@
-"""Broken submissions: each is one clear line that names the file and what is wrong in it."""
+"""Broken submissions: each gives one clear line that names the file and the mistake."""
 
 import gzip
 import io
@@ -45,7 +45,7 @@ def good_rows(n: int = 40) -> list[str]:
 
 
 def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
-    """Write a submission; a data file that is not given is a good one."""
+    """Write a submission; data files that are not given are good ones."""
     (folder / "data").mkdir(parents=True)
     raw = toml if isinstance(toml, bytes) else toml.encode()
     (folder / "submission.toml").write_bytes(raw)
@@ -57,7 +57,7 @@ def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
 
 
 def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
-    """Load and read, and expect few lines that match; the command line says them with status 2."""
+    """Load and read, and expect a few matching lines; the command prints them with status 2."""
     with pytest.raises(SubmissionError, match=pattern) as caught:
         read_data(load_submission(folder))
     message = str(caught.value)
@@ -75,7 +75,7 @@ def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
 
 
 def test_the_good_one_is_read(tmp_path):
-    """What the broken ones are made from is itself sound."""
+    """The submission that the broken ones are made from is itself sound."""
     assert read_data(load_submission(write(tmp_path / "team-01"))).records[0].carts == (1, 2)
 
 
@@ -243,7 +243,7 @@ BAD_TOML = {
 
 @pytest.mark.parametrize(("toml", "pattern"), BAD_TOML.values(), ids=BAD_TOML.keys())
 def test_a_broken_submission_file_is_a_line_each(toml, pattern, tmp_path):
-    """Whatever is wrong in submission.toml is named by key or line, in a line each."""
+    """Whatever is wrong in submission.toml is named by key or line, one line for each mistake."""
     one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_TOLD)
 
 
@@ -377,7 +377,7 @@ BAD_DATA = {
 
 @pytest.mark.parametrize(("content", "pattern"), BAD_DATA.values(), ids=BAD_DATA.keys())
 def test_a_broken_data_file_is_one_line(content, pattern, tmp_path):
-    """Whatever is wrong in a data file is named with its line, in one line."""
+    """Whatever is wrong in a data file is one line that names the line."""
     one_line(write(tmp_path / "team-01", **{"step.csv": content}), pattern)
 
 
@@ -409,7 +409,7 @@ def test_only_the_wrong_cart_in_the_file_is_one_line(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 @pytest.mark.parametrize("place", ["file", "folder", "toml", "notes", "loop", "chain"])
 def test_no_link_leads_out_of_the_submission(place, tmp_path):
-    """A link out of the folder is refused wherever it stands, and so is a loop of links."""
+    """A link out of the folder is refused wherever it is, and so is a loop of links."""
     folder = write(tmp_path / "team-01")
     outside = write(tmp_path / "other")
     target, pattern = folder / "data" / "step.csv", r"leaves the submission folder through a link"
@@ -481,7 +481,7 @@ SLIPS = {
 
 @pytest.mark.parametrize("typed", SLIPS)
 def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
-    """What people type that TOML refuses: the line, the reason, their line mended, and as it is."""
+    """TOML refuses it; the message has the line, the reason, and the corrected line."""
     write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
     words, mended = SLIPS[typed]
     with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{words}") as caught:
@@ -493,7 +493,7 @@ def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
 
 
 def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
-    """What is like the missing file, but already given its place, is not what was meant."""
+    """A similar file that another experiment already uses is not proposed."""
     second = STEP.replace("step-a", "step-b").replace("step.csv", "step2.csv")
     folder = write(tmp_path / "team-01", GOOD + second)
     assert read_data(load_submission(folder)).unreadable == {
@@ -510,7 +510,10 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
 def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
-    """A missing folder, one without submission.toml and a file of another kind are told apart."""
+    """Each gets its own message:
+
+    a missing folder, one without submission.toml, a file of another kind.
+    """
     write(tmp_path / "team-01")
     one_line_patterns = {
         "nowhere": r"no such folder",

@@ -1,4 +1,4 @@
-"""The command line as people meet it: exit codes, one clear line, files where they belong."""
+"""The command line as people use it: exit codes, one clear line, files in the right place."""
 
 import html
 import json
@@ -29,12 +29,12 @@ def test_every_command_has_help_and_is_in_the_readme(command):
     done = cartlab_here(command, "--help")
     assert done.returncode == 0
     assert "Usage" in done.stdout
-    if README.exists():  # absent only where the tests run against an installed wheel
+    if README.exists():  # absent only if the tests run against an installed wheel
         assert f"`cartlab {command}" in README.read_text(encoding="utf-8")
 
 
 def test_help_imports_nothing_heavy():
-    """`--help` answers at once because numpy is not even loaded."""
+    """`--help` answers at once because it does not even load numpy."""
     code = "import sys, pipeline.cli; print('numpy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
@@ -100,10 +100,10 @@ def test_failed_checks_are_status_one(tmp_path):
 
 
 def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
-    """One missing, one broken: told on stderr and in results.json with status 1, the rest is there.
+    """One missing, one broken: reported on stderr and in results.json, status 1, the rest computed.
 
-    A reference made of them is doubtful, for each reason, told once. Without a single file that can
-    be read there is nothing to report.
+    A solution made from them is doubtful, with each reason given once. Without a single readable
+    file there is nothing to report.
     """
     folder = tmp_path / "team"
     shutil.copytree(EXAMPLES / "one-cart", folder)
@@ -146,9 +146,9 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
 
 
 def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
-    """Points beside a sharp peak: no final ζ, with its reason, and the pictures are drawn.
+    """Points beside a sharp peak give no final ζ, with its reason; the figures are still drawn.
 
-    One of the points of the fit's curve lies on the pole.
+    One of the points of the fitted curve lies on the pole.
     """
     hertz = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]  # resonance at 2 Hz, K = 20 cm/V
     rows = [f"{f},{20 / abs(1 - (f / 2) ** 2):.6g}" for f in hertz]
@@ -192,7 +192,10 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
 
 
 def test_one_broken_file_does_not_make_a_folder_unreadable(tmp_path):
-    """The table of the others is made, so the status is that of a check that failed; else 2."""
+    """The other files get their table and the status is that of a failed check;
+
+    without any, it is 2.
+    """
     broken = tmp_path / "broken.csv"
     broken.write_text("time,x1\n0,oops\n1,2\n", encoding="utf-8")
     alone = cartlab_here("inspect", tmp_path)

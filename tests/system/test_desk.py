@@ -27,7 +27,7 @@ FILES = sorted((ROOT / "submissions" / "one-cart" / "data").iterdir())
 
 @pytest.fixture
 def show(browser):
-    """Open a desk in a window of its own; errors and requests to elsewhere fail the test."""
+    """Open a desk in a new window; script errors and requests to other hosts fail the test."""
     contexts, errors = [], []
 
     def opened(url: str, *, size=WIDE, **options):
@@ -58,9 +58,9 @@ def show(browser):
 
 
 def fits(window) -> bool:
-    """Tell whether nothing is wider than a screen, and axe finds nothing by day and by night.
+    """Return whether nothing is wider than the screen, and axe finds no fault by day or night.
 
-    It looks at the phone's, on which more has to be scrolled to and touched.
+    Axe looks at the phone's page, which needs the most scrolling and touching.
     """
     own, overhang = window.viewport_size, []
     for width, height in (WIDE, PHONE):
@@ -78,7 +78,7 @@ def unfold(window) -> None:
 
 
 def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
-    """Files dropped, a doubt answered, a mistake mended, the form, the report, the zip."""
+    """Files dropped, a doubt answered, a mistake fixed, the form, the report, the zip."""
     folder = tmp_path / "team"
     with DeskServer() as server:
         window = show(server.url)
@@ -156,7 +156,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
-    """From the doubt about a unit to the zip: Tab, letters, Enter and the space bar."""
+    """From the doubt about a unit to the zip with Tab, letters, Enter and the space bar."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
     for file in FILES:
@@ -218,7 +218,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
-    """Another form is saved, a row taken out, a form refused as outdated: what was typed stands."""
+    """It survives when another form is saved, a row removed, or a form refused as outdated."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -253,7 +253,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
 
 
 def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
-    """Zip and report are held and say so; they go on where it is saved, or all the same."""
+    """Zip and report wait and say so; they go on after saving, or on request without it."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -304,7 +304,7 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_everybody_can_use_it(show, tmp_path):
-    """Axe finds nothing by day and by night; nothing is wider than the screen; keys do."""
+    """Axe finds no fault by day or night; nothing is wider than the screen; all keys work."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
@@ -341,7 +341,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """One line when ready, one where the port is taken; a signal ends it by name, status 0."""
+    """One line when ready, one if the port is taken; a signal ends it by name, with status 0."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None
@@ -361,7 +361,7 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
 
 
 def test_a_row_is_typed_through_without_waiting(show, tmp_path):
-    """While one field is saved the next is typed: no letter, no field and no notice is lost."""
+    """While one field is saved the next is typed: no letter, field or message is lost."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)

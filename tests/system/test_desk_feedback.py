@@ -66,7 +66,7 @@ def press(window, control, key: str = "Enter") -> None:
 
 
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
-    """Released, asked on a phone, answered with points, read; dark and by axe all the way."""
+    """Released, asked on a phone, answered with points, read; in dark mode, checked by axe."""
     prof = show(f"{lab}/", extra_http_headers=named("prof"))
     press(prof, prof.get_by_role("button", name="Let students read their feedback"))
     expect(prof.get_by_role("status")).to_contain_text("Students can read their feedback.")

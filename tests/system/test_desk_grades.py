@@ -1,4 +1,4 @@
-"""The TA's room in a real browser: a class gone through by its keys, two at once, nobody named."""
+"""The TA's pages in a real browser: a class graded by keys, two TAs at once, anonymous names."""
 
 import re
 from urllib.parse import quote
@@ -19,7 +19,7 @@ REASON = "the plot is clear"
 
 
 def signed(window, name: str) -> None:
-    """Say on a team's page who changes points."""
+    """Enter a name on a team's page as the author of changes."""
     window.get_by_text("Changes are signed").click()
     window.get_by_label("Your name").fill(name)
     with window.expect_navigation():
@@ -33,7 +33,7 @@ def press(window, key: str) -> None:
 
 
 def test_everybody_can_grade(show, tmp_path):
-    """The class, a team with figures, a refusal: axe finds nothing, nothing is too wide."""
+    """Class, team with figures and refusal: axe finds no fault, and nothing is too wide."""
     with DeskServer(folder=write_class(tmp_path / "grades")) as server:
         window = show(server.url)
         expect(window.locator("#teams tbody tr")).to_have_count(16)
@@ -47,7 +47,7 @@ def test_everybody_can_grade(show, tmp_path):
             window.get_by_role("link", name="Frequencies from the Bode fit").click()
         expect(window.locator("img.drawing").first).to_be_visible()
         assert fits(window)
-        # Who goes from field to field finds the same without the letters.
+        # Moving from field to field with Tab finds the same without the letter keys.
         window.get_by_label("Another number of points").fill("99")
         window.get_by_label("Reason").fill("far too many")
         with window.expect_navigation():
@@ -58,7 +58,7 @@ def test_everybody_can_grade(show, tmp_path):
 
 
 def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
-    """A right team takes one key; a change, and the same for all with the remark, is undone."""
+    """A right team takes one key; a change, and the same for all with the flag, can be undone."""
     grades = write_class(tmp_path / "grades")
     with DeskServer(folder=grades) as server:
         window = show(server.url, size=LAPTOP)
@@ -151,7 +151,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
 
 
 def test_two_at_once_see_what_the_other_did(show):
-    """On one database: news of the other's change comes by itself, a change over it is refused."""
+    """On one database, the other's change is announced; a change over it is refused."""
     if why := postgres.missing():
         pytest.skip(why)
     with postgres.running() as place:
@@ -191,7 +191,7 @@ def test_two_at_once_see_what_the_other_did(show):
 
 
 def test_an_anonymous_class_shows_no_name(show, tmp_path):
-    """Not on the pages that a browser shows, nor in any address that it asks for."""
+    """Neither on a page that a browser shows, nor in any address that it requests."""
     grades = write_class(tmp_path / "g", anonymous=True)
     with Gradebook(grades) as book:
         real = {entry.submission for entry in book.entries()} - {"broken"}

@@ -1,6 +1,6 @@
-"""The desk's server is killed at random moments: what it confirmed is there, and nothing is half.
+"""The desk's server is killed at random: confirmed changes survive, and nothing is half done.
 
-A change is confirmed by the answer to its form; of a regrade, by the page that says it is done.
+A change is confirmed by the answer to its form; a regrade, by the page that says it is done.
 """
 
 import http.client
@@ -34,7 +34,7 @@ _RECORD = some_files(most=1)[0][1]
 
 @dataclass(kw_only=True)
 class _Save:
-    """Titles of a submission, one after the other."""
+    """Saves of new titles of a submission, one after the other."""
 
     folder: Path
     page: str = "/student/0/"
@@ -60,7 +60,10 @@ class _Save:
 
 @dataclass(kw_only=True)
 class _Upload(_Save):
-    """Recordings, each of its own length; the form's answer comes when its table is written too."""
+    """Uploads of recordings of different lengths;
+
+    the answer comes when the table is written too.
+    """
 
     longest: float = 4.0
 
@@ -117,7 +120,7 @@ class _Override(_Save):
 
 @dataclass(kw_only=True)
 class _Regrade(_Save):
-    """A submission that is another each time, graded beside one with points by hand."""
+    """Grading again with a changed submission, beside one with points by hand."""
 
     page: str = "/grades/0/"
     longest: float = 20.0
@@ -132,7 +135,7 @@ class _Regrade(_Save):
             book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
             book.override("team-04", "laws", 0.5, why="as told", by="Ada")
         self.team = a_submission(self.folder.with_name("team-x"), "two-cart")
-        self.rubric = self.folder.with_name("lab.toml")  # its name is the class's
+        self.rubric = self.folder.with_name("lab.toml")  # its name is that of the class
         shutil.copy(RUBRICS / "throne-2dof.toml", self.rubric)
 
     def act(self, who: Visitor) -> None:
@@ -160,7 +163,7 @@ def _whole(folder: Path) -> None:
 
 
 def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
-    """Kill the server so often, look at what is there each time; return what was confirmed."""
+    """Kill the server many times, check its data each time; return what was confirmed."""
     draw = random.Random(seed)
     work.prepare()
     command = [sys.executable, "-m", "pipeline", "desk", work.folder, "--no-browser"]
@@ -172,10 +175,10 @@ def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
 
 
 def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
-    """Ask for one change after the other; what the desk had started ends with it, by itself."""
+    """Make one change after the other; the desk's own processes end with it."""
     assert desk.stderr is not None
     who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []
-    assert who.get(work.page).status == 200  # the processes that it needs are there
+    assert who.get(work.page).status == 200  # the processes that it needs are running
 
     def end() -> None:
         started_by_it.extend(psutil.Process(desk.pid).children(recursive=True))
@@ -208,5 +211,5 @@ def test_a_kill_loses_nothing(work, tmp_path):
     ("work", "kills"), [(_Override, 18), (_Upload, 16), (_Regrade, 16), (_Save, 5)]
 )
 def test_fifty_kills_lose_nothing(work, kills, tmp_path):
-    """At random moments of overrides, uploads and regrades; and five of saves."""
+    """At random moments of overrides, uploads and regrades, and five of saves."""
     assert kill_again_and_again(work(folder=tmp_path / "it"), kills=kills, seed=2) > 0

@@ -1,4 +1,4 @@
-"""The rooms of the bench and of the instructor in a real browser, from nothing to their end."""
+"""The pages of bench and instructor in a real browser, from the start to the end."""
 
 import re
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeypatch):
-    """From the first page to a session: keep a run, record the next, end another; then the rest."""
+    """From the first page to a session: keep a run, record the next, end another, then the rest."""
     monkeypatch.chdir(tmp_path)
     work = write_work(
         tmp_path / "team",
@@ -84,7 +84,10 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeyp
 
 
 def test_an_exploration_is_watched_and_steered(show, tmp_path):
-    """Veto has another chosen, an experiment of one's own comes next, Esc ends; the diary tells."""
+    """After a veto another is chosen, your own experiment comes next, Esc ends;
+
+    the diary shows it.
+    """
     work = a_recorded_cart(tmp_path / "team")
     with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:
         window = show(server.url, size=PHONE)
@@ -125,7 +128,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
 
 
 def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
-    """An effect is ticked, its slider moved, its picture redrawn; the exercise opens."""
+    """Tick an effect, move its slider, see the picture change; the exercise opens."""
     out = tmp_path / "exercise"
     with DeskServer() as server:
         window = show(server.url, size=WIDE)
@@ -158,7 +161,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
 
 
 def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_path, monkeypatch):
-    """From a shipped one; what is wrong shows as it is typed, and goes; no mouse is needed."""
+    """From a shipped one; errors appear and disappear while typing; no mouse is needed."""
     monkeypatch.chdir(tmp_path)
     write_class_of_two(tmp_path / "graded")
     path = tmp_path / "lab.toml"
@@ -202,7 +205,7 @@ def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_pat
 
 
 def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
-    """When its row is opened."""
+    """Once its row is opened."""
     with DeskServer() as server:
         window = show(server.url)
         window.goto(f"{window.url}effects/")

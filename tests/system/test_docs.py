@@ -1,4 +1,4 @@
-"""The documentation is true: its commands run, its links lead somewhere, it leaves nothing out."""
+"""The documentation is true: its commands run, its links work, and it is complete."""
 
 import re
 import shlex
@@ -19,7 +19,7 @@ COMMANDS = get_command(app).commands  # pyright: ignore[reportAttributeAccessIss
 
 
 def examples(page: Path) -> Iterator[tuple[list[str], int, bool]]:
-    """Yield arguments, the exit status stated and whether it is slow, of every command to type."""
+    """Yield arguments, stated exit status, and whether it is slow, for every command."""
     for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         for line in block.splitlines():
             command, _, remark = line.partition("#")
@@ -30,7 +30,7 @@ def examples(page: Path) -> Iterator[tuple[list[str], int, bool]]:
 
 
 def run_page(page: Path, monkeypatch, folder: Path, *, slow: bool) -> int:
-    """Run a page's commands from top to bottom in an empty folder; return how many ran."""
+    """Run a page's commands in order in an empty folder; return how many ran."""
     monkeypatch.chdir(folder)
     ran = 0
     for words, status, is_slow in examples(page):
@@ -51,9 +51,9 @@ TUTORIALS = [page for page in PAGES if page.name.startswith(("tutorial", "comman
 @pytest.mark.sample
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
-    """From an empty folder, every command ends with the exit status that the page states.
+    """From an empty folder, every command ends with the stated exit status.
 
-    What a page quotes of the terminal's line on open questions is what its own commands print.
+    A quoted line about open questions is what the page's own commands print.
     """
     assert run_page(page, monkeypatch, tmp_path, slow=False) >= 4
     text, printed = page.read_text(encoding="utf-8"), capsys.readouterr().err
@@ -64,13 +64,13 @@ def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_the_slow_commands_of_a_page_work_too(page, monkeypatch, tmp_path):
-    """The same with the gap workflow, where the page has it."""
+    """The same for the slow commands, such as the gap workflow."""
     run_page(page, monkeypatch, tmp_path, slow=True)
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_command_and_option_is_documented(command):
-    """`docs/commands.md` has a section a command, and names each of its options there."""
+    """`docs/commands.md` has a section for each command, with each of its options."""
     text = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
     sections = re.split(r"^## ", text, flags=re.MULTILINE)
     (section,) = [s for s in sections if re.match(rf"`cartlab {command}(?![\w-])", s)]
@@ -82,7 +82,7 @@ def test_every_command_and_option_is_documented(command):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
-    """Every file that a page links or shows is there, and so is the heading it points at."""
+    """Every linked or shown file exists, and so does the heading that a link names."""
     for target in _LINK.findall(page.read_text(encoding="utf-8")):
         if target.startswith(("http://", "https://")):
             continue
@@ -96,7 +96,7 @@ def test_links_lead_somewhere(page):
 
 
 def test_every_picture_is_shown_somewhere():
-    """No picture lies about that no page shows."""
+    """Every picture is shown on some page."""
     shown = {
         (page.parent / target).resolve()
         for page in PAGES
@@ -107,7 +107,7 @@ def test_every_picture_is_shown_somewhere():
 
 
 def test_the_files_that_contributors_are_sent_to_are_there():
-    """Every path of CONTRIBUTING.md that is not to be written anew is in the repository."""
+    """Every path in CONTRIBUTING.md exists, unless the reader should create it."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     paths = re.findall(r"`((?:pipeline|tests|docs|templates|rubrics)/[\w./-]+)`", text)
     assert len(paths) > 30
@@ -116,7 +116,7 @@ def test_the_files_that_contributors_are_sent_to_are_there():
 
 
 def test_the_hooks_before_a_commit_are_the_checks_of_ci():
-    """Each of ruff, pyright and mkdocs that `.ci/run` calls is run by a hook, as strictly."""
+    """Each call of ruff, pyright and mkdocs in `.ci/run` has a hook that is as strict."""
     checked = re.findall(
         r"^(?:\w+=\S+ )?((?:ruff|pyright|mkdocs)\b.*)", (ROOT / ".ci/run").read_text(), re.MULTILINE
     )

@@ -1,4 +1,4 @@
-"""The firmware's C core does what the reference controller in Python does, byte for byte."""
+"""The firmware's C core equals the reference controller in Python, byte for byte."""
 
 import ctypes
 import shutil
@@ -58,7 +58,7 @@ def _both(library, encoders=2):
     return FirmwareCore(library, description), ReferenceCore(description)
 
 
-# ------------------------------------------------------------------- the same as the reference
+# ----------------------------------------------------------------- equal to the reference
 
 FREQUENCIES = st.floats(1e-3, 1e3) | st.floats(0.1, 10.0)
 GAINS = st.floats(-1e3, 1e3) | st.sampled_from([0.0, 1e9, -1e9, 1e-9])
@@ -83,7 +83,7 @@ COMMANDS = st.one_of(
 
 @st.composite
 def _damaged(draw):
-    """Commands that lost a byte, got one too many, or one for another."""
+    """Commands with a byte lost, added or changed."""
     data = bytearray(b"".join(draw(st.lists(COMMANDS, min_size=1, max_size=3))))
     at = draw(st.integers(0, len(data) - 1))
     data[at : at + draw(st.integers(0, 1))] = draw(st.binary(max_size=1))
@@ -104,10 +104,10 @@ TICKS = st.tuples(
 @example(encoders=2, session=[(b"?;?;?;d;s;o;o;1;5;1;", [([0, 0, 0], 1)])])
 @settings(max_examples=200)
 def test_any_session_is_that_of_the_reference(library, encoders, session):
-    """Whatever arrives, in whatever condition, duties and lines are those of the reference.
+    """Whatever arrives, in whatever state, duties and lines equal those of the reference.
 
-    The host reads all the while: what finds no room on its way out is left out (see below),
-    while the reference, which answers at its next tick, has room for everything.
+    The host reads all the time: lines without room on their way out are dropped (see below), while
+    the reference, which answers at its next tick, has room for all.
     """
     firmware, reference = _both(library, encoders)
     stamp, sent = 0, b""
@@ -127,7 +127,7 @@ def test_any_session_is_that_of_the_reference(library, encoders, session):
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave != Wave.MULTISINE])
 def test_whole_runs_are_those_of_the_reference(library, wave):
-    """Ten seconds of each wave at an odd frequency are the same line by line, to the last one."""
+    """Ten seconds of each wave at an odd frequency agree line by line, to the last one."""
     firmware, reference = _both(library)
     start = Start(wave=wave, frequency=3.7, amplitude=4321, cycles=37)
     for core in (firmware, reference):
@@ -144,7 +144,7 @@ def test_whole_runs_are_those_of_the_reference(library, wave):
 
 @pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
 def test_chirps_end_where_they_are_told(library, end):
-    """Below where they start, there (which is a sine), and above."""
+    """Below their start frequency, at it (a sine), and above."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
     for core in (firmware, reference):
@@ -160,7 +160,7 @@ def test_chirps_end_where_they_are_told(library, end):
     [PidGains(kp=2.0, ki=3.0, kd=0.05), StateGains(gains=(3.0, 0.2, -1.0, 0.1), prefilter=2.0)],
 )
 def test_loops_are_those_of_the_reference(library, gains):
-    """Both laws on a bench that answers them: a mass that the duty pushes, rounded to counts."""
+    """Both laws on a bench that answers: a mass pushed by the duty, rounded to counts."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=1.0, amplitude=700, cycles=3)
     for core in (firmware, reference):
@@ -215,7 +215,7 @@ controller = { type = "state_feedback", cart = 1 }
 
 
 class SlowToBite(FirmwareCore):
-    """Its watchdog waits for 10 s, for a host on a machine that may be busy."""
+    """A controller whose watchdog waits 10 s for a host on a busy machine."""
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
         """Return the duty that acts from now on."""
@@ -235,8 +235,8 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
         acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))
     loop = next(check for check in analysis.hardware if check.loop == "closed")
-    # Noise and rounding are 0.2 % of the motion and the model is known to about 1 %; gains in wrong
-    # units, or at the wrong encoder, would leave tens of per cent.
+    # Noise and rounding are 0.2 % of the motion and the model is accurate to about 1 %; gains in
+    # wrong units, or at the wrong encoder, would leave tens of percent.
     assert loop.nrmse < 0.02
     assert loop.settling_measured is not None
     assert loop.settling_measured < 0.8  # s, as designed
@@ -281,7 +281,7 @@ NOT_STOPPING = [
     [(data, True) for data in STOPPING] + [(data, False) for data in NOT_STOPPING],
 )
 def test_no_lost_byte_swallows_a_stop(library, data, stops):
-    """A stop behind anything stops; what is no stop lets the run go on; the reference agrees."""
+    """A stop after any bytes stops; other bytes let the run go on; the reference agrees."""
     duties = []
     for core in _both(library):
         core.receive(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=70)))
@@ -292,7 +292,7 @@ def test_no_lost_byte_swallows_a_stop(library, data, stops):
 
 
 def test_a_reset_forgets_gains_and_chirp_end(library):
-    """After a reset a chirp ends where it does unasked, and a closed loop has gains of zero."""
+    """After a reset a chirp has its default end, and a closed loop has gains of zero."""
     firmware, reference = _both(library)
     told = encode(PidGains(kp=1.0, ki=0.0, kd=0.0)) + encode(ChirpEnd(frequency=2.0))
     chirp = Start(wave=Wave.CHIRP, encoder=1, frequency=1.0, amplitude=1000)
@@ -305,7 +305,7 @@ def test_a_reset_forgets_gains_and_chirp_end(library):
 
 
 def test_the_clock_may_go_round(library):
-    """A run and the watchdog go on where 32 bits of milliseconds begin again."""
+    """A run and the watchdog go on when the 32-bit milliseconds wrap around."""
     core, _ = _both(library)
     core.receive(b"k;" + encode(Start(wave=Wave.SQUARE, frequency=0.1, amplitude=50)))
     turn = 2**32
@@ -319,7 +319,7 @@ def test_the_clock_may_go_round(library):
 
 
 def test_a_host_that_does_not_read_loses_whole_lines(library):
-    """What finds no room on its way out is left out line by line, so that every line is whole."""
+    """Output without room is dropped line by line, so that every line is whole."""
     core, _ = _both(library)
     core.receive(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=4000, cycles=9)))
     for stamp in range(500):
@@ -327,7 +327,7 @@ def test_a_host_that_does_not_read_loses_whole_lines(library):
     sent = core.take()
     readings = [parse_reading(line) for line in sent.splitlines()]
     assert sent.endswith(b"\n")
-    assert 200 < len(sent) < 256  # the ring's room, but for a line
+    assert 200 < len(sent) < 256  # the ring's room, minus a line
     assert [reading.ms for reading in readings if reading] == list(range(len(readings)))
 
 
@@ -339,7 +339,7 @@ def test_the_answer_to_a_query_is_a_description(library):
 
 
 def test_noise_breaks_nothing(tmp_path):
-    """Half a million ticks of noise, extreme gains and jumping clocks touch no foreign memory."""
+    """Half a million ticks of noise, extreme gains and jumping clocks corrupt no memory."""
     sanitize = ("-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
     probe = tmp_path / "probe.c"
     probe.write_text("int main(void) { return 0; }\n", encoding="utf-8")
@@ -353,7 +353,8 @@ def test_noise_breaks_nothing(tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-# What the sketch asks of a board with 32 bits and Teensy's additions to Arduino, without a body.
+# The functions that the sketch needs of a 32-bit board and of Teensy's additions to Arduino,
+# without bodies.
 ARDUINO = """
 #include <stdint.h>
 #include <stdlib.h>
@@ -405,7 +406,7 @@ def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
     "text", ["12345678901234567890123", "0.1234567890123456789012", "98765432109876543210.5e-3"]
 )
 def test_more_digits_than_fit_keep_their_place(library, text):
-    """Beyond 18 digits only the size counts: the rest is less than double can tell."""
+    """Beyond 18 digits only the magnitude counts: a double cannot hold more."""
     read = ctypes.c_double()
     assert library.read_number(text.encode(), False, ctypes.byref(read))
     assert read.value == pytest.approx(float(text), rel=1e-15)
@@ -416,7 +417,7 @@ def test_more_digits_than_fit_keep_their_place(library, text):
     ["", "+", ".", "e5", "1e", "1e+", "--1", "1.2.3", "0x10", "inf", "nan", "1_0", "1 ", "1e999"],
 )
 def test_what_is_no_number_is_refused(library, text):
-    """Neither words nor halves of numbers nor infinities pass for a number."""
+    """Neither words nor halves of numbers nor infinities are taken for a number."""
     assert not library.read_number(text.encode(), False, ctypes.byref(ctypes.c_double()))
 
 
@@ -441,7 +442,7 @@ RING = (0b00, 0b10, 0b11, 0b01)  # the channels A and B, one forward step after 
 
 @given(steps=st.lists(st.integers(-1, 1), max_size=60))
 def test_every_edge_of_an_encoder_counts(library, steps):
-    """Counts are the steps along the ring of states, forwards less backwards; none is missed."""
+    """Counts are the steps around the ring of states, forwards minus backwards, all of them."""
     encoder, at = _Quadrature(), 0
     for step in steps:
         at += step
@@ -451,7 +452,7 @@ def test_every_edge_of_an_encoder_counts(library, steps):
 
 @pytest.mark.parametrize("at", range(4))
 def test_a_transition_that_cannot_be_is_counted_as_missed(library, at):
-    """Both channels at once: the count stays, and goes on rightly from the new state."""
+    """If both channels change at once, the count stays and goes on from the new state."""
     encoder = _Quadrature(state=RING[at])
     for state in (RING[(at + 2) % 4], RING[(at + 3) % 4]):
         library.quadrature_update(ctypes.byref(encoder), state)
@@ -459,7 +460,7 @@ def test_a_transition_that_cannot_be_is_counted_as_missed(library, at):
 
 
 def test_full_scale_is_the_protocols(library):
-    """A target beyond full scale is clipped to what the protocol calls full scale."""
+    """A target beyond full scale is clipped to the full scale of the protocol."""
     core, _ = _both(library)
     core.receive(encode(Start(wave=Wave.SQUARE, frequency=1.0, amplitude=-5000)))
     core.tick((0, 0), stamp=0, now=0)

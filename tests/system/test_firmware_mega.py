@@ -61,7 +61,7 @@ def _readings(mega: Mega) -> list[Reading]:
 
 
 def test_the_sketch_leaves_room(program):
-    """It takes less than a quarter of the Mega's flash and of its RAM; the rest is the stack's."""
+    """It uses less than a quarter of the Mega's flash and RAM; the rest is for the stack."""
     flash, ram = memory(program)
     assert flash < 64 * 1024
     assert ram < 2 * 1024
@@ -77,14 +77,14 @@ def _describe(mega: Mega) -> Description:
 
 
 def test_it_says_what_it_is(mega):
-    """The answer to a query is a description in the protocol's own form."""
+    """Its answer to a query is a description in the protocol's own form."""
     description = _describe(mega)
     assert (description.encoders, description.period) == (2, PERIOD)
     assert description.commands == frozenset("cfks")
 
 
 def test_every_edge_at_the_pins_counts(mega):
-    """Some thousand edges back and forth, two encoders in turn at 50,000 a second, all counted."""
+    """Thousands of edges back and forth, on two encoders at 50,000 a second, are all counted."""
     rng = np.random.default_rng(5)
     turns = rng.integers(-60, 61, size=(50, 2))
     mega.send(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=1000)))
@@ -97,7 +97,7 @@ def test_every_edge_at_the_pins_counts(mega):
 
 
 def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
-    """Built for three encoders, the sketch counts at pins 20 and 21 as well, and says so."""
+    """Built for three encoders, the sketch also counts at pins 20 and 21, and says so."""
     mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)
     mega.run(0.05)
     assert _describe(mega).encoders == 3
@@ -110,7 +110,7 @@ def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
 
 
 def test_a_run_lasts_and_ticks_as_told(mega):
-    """A tenth of a second is 25 lines, 4 ms apart, and the motor is off after it."""
+    """A tenth of a second gives 25 lines, 4 ms apart, and then the motor is off."""
     mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
     mega.run(0.03)
     assert mega.duty == -4096
@@ -121,7 +121,10 @@ def test_a_run_lasts_and_ticks_as_told(mega):
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dqm"])
 def test_waves_are_those_of_the_reference(mega, wave):
-    """Numbers of 32 bits are at most a count off: 2000 counts are known to a thousandth of one."""
+    """Numbers of 32 bits differ by at most one count:
+
+    2000 counts are exact to a thousandth of one.
+    """
     start = Start(wave=wave, frequency=2.0, amplitude=2000)
     mega.send(encode(start))
     mega.run(0.55)
@@ -143,10 +146,10 @@ def test_waves_are_those_of_the_reference(mega, wave):
     [PidGains(kp=0.8, ki=1.0, kd=0.04), StateGains(gains=(0.9, 0.05, 0.2, 0.01), prefilter=1.5)],
 )
 def test_it_closes_the_loop_over_its_pins(mega, gains):
-    """A simulated cart, felt by encoder edges and moved by PWM, follows; duties are to the count.
+    """A simulated cart with encoder edges and PWM follows; duties agree to the count.
 
-    Each line is handed to the reference as it is, so only rounding to 24 bits is left: the duty of
-    some thousand counts is known to a thousandth, and may be rounded either way.
+    The reference gets each line as it is, so only rounding to 24 bits is left. A duty of some
+    thousand counts is exact to a thousandth, and may round either way.
     """
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=0.5, amplitude=800)
     mega.send(encode(gains) + encode(start))
@@ -171,7 +174,7 @@ def test_it_closes_the_loop_over_its_pins(mega, gains):
 
 
 def test_a_silent_host_stops_the_motor(mega):
-    """The motor's pins go off 100 ms after the last heartbeat, at the first tick from then on."""
+    """The motor's pins go off 100 ms after the last heartbeat, at the next tick."""
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=0)))
     mega.send(b"k;" + encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=3000)))
     before = mega.clock
@@ -195,14 +198,14 @@ def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
     assert mega.duty == 0
     mega.flicker(1, 0.3, every=4e-6)
     assert mega.duty == 0
-    mega.run(0.3)  # the wire is whole again: it answers, and rests
+    mega.run(0.3)  # the wire is whole again: the board answers, and rests
     mega.take()
     assert _describe(mega).encoders == 2
     assert mega.duty == 0
 
 
 def test_a_stop_stops_the_motor_at_the_next_tick(mega):
-    """Three bytes on the line and a tick after the stop is sent the motor is off."""
+    """Three bytes on the line and one tick after the stop is sent, the motor is off."""
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
     mega.run(0.08)
     assert mega.duty == 2000
@@ -232,11 +235,11 @@ amplitude = 0.03
 frequency = 0.1
 settle = 0.1
 """
-STEP = 1e-3  # s from edge to edge of what the carts and the board know of each other
+STEP = 1e-3  # s between exchanges of data between carts and board
 
 
 def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
-    """Let board and carts move each other at the pace of the clock, or as fast as it goes."""
+    """Let board and carts drive each other in real time, or as fast as possible."""
     at, ahead = carts.counts(), mega.clock - time.monotonic()
     volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in the carts' own
     while not until():
@@ -253,7 +256,7 @@ def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool
 
 @pytest.mark.slow
 def test_acquire_records_with_the_board(mega, tmp_path):
-    """Host, pty, UART, PWM, carts, encoder pins, and back: the gain is the cart's."""
+    """Host, pty, UART, PWM, carts, encoder pins and back: the gain is that of the cart."""
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
@@ -261,6 +264,6 @@ def test_acquire_records_with_the_board(mega, tmp_path):
     with closing(open_link("pty")) as link, kept_going(partial(_serve, mega, carts, link)):
         acquire(tmp_path, port=link.address, only=["step"])
     [gain] = analyse(load_submission(tmp_path)).step_gains
-    # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a per cent; the last
-    # swing of 1 % of it that is left after 5 s is in the mean once.
+    # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a percent; after 5 s a
+    # swing of 1 % is left, and enters the mean once.
     assert gain.gain == pytest.approx(bench.chain.static_gains()[0], rel=0.01)

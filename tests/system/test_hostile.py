@@ -1,4 +1,4 @@
-"""A class full of hostile hand-ins, graded beside honest ones: all rows there, none escapes."""
+"""A class full of hostile submissions beside honest ones: every row is there, none escapes."""
 
 import base64
 import csv
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes, links an
 NOBODY = 65_534
 HONEST = ("honest-1", "honest-2")
 
-# Python itself tells what it is about to do: every process of a run writes it down.
+# Python itself reports what it is about to do: every process of a run logs it.
 AUDIT = """\
 import os, sys
 _log = os.open(os.environ["AUDIT_LOG"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -61,7 +61,7 @@ sys.addaudithook(_tell)
     ],
 )
 def graded(request, tmp_path_factory):
-    """A hostile class and what the command line made of it: folder, names, audit lines."""
+    """A hostile class and the output of the command line: folder, names, audit lines."""
     base = tmp_path_factory.mktemp("hostile")
     school = base / "school"
     for number, place in enumerate((*(school / name for name in HONEST), base / "spoilt")):
@@ -82,7 +82,7 @@ def graded(request, tmp_path_factory):
 
 
 def _small(folder: Path) -> dict[str, bytes]:
-    """Return the files of a submission with a few of its dwells only, to be graded quickly."""
+    """Return the files of a submission with few of its dwells, which is quick to grade."""
     files = {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*.*")}
     head, *runs = files["submission.toml"].decode().split("[[experiments]]\n")
     dropped = [run for run in runs if re.match(r'id = "sine-(?!04|07|10|13|16|20)', run)]
@@ -118,7 +118,7 @@ def _below(folder: Path) -> list[tuple[str, int]]:
 
 
 def test_every_hand_in_has_its_row_and_its_reason(graded):
-    """However it is called and whatever is in it; one line of reason, no fault of the grader."""
+    """Whatever its name and content: one line of reason, and no fault of the grader."""
     base, names, done = graded
     assert done.returncode == 1, done.stderr
     assert len(names) >= 100
@@ -140,7 +140,7 @@ def test_every_hand_in_has_its_row_and_its_reason(graded):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is of is told by Linux")
 def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
-    """No file but in the folder that was named, no connection, no program but Python itself."""
+    """It writes only into its own folder, connects to nobody, and starts only Python."""
     base, _, _ = graded
     lines = (base / "audit.txt").read_text(encoding="utf-8").splitlines()
     events = [line.partition("\t")[::2] for line in lines]
@@ -168,7 +168,7 @@ def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
 
 
 def test_the_honest_are_graded_as_if_they_were_alone(graded):
-    """Same bytes, whoever else is in the class."""
+    """The same bytes, no matter which other submissions are in the class."""
     base, _, _ = graded
     _grade(base, "alone")
     for name in HONEST:
@@ -198,7 +198,7 @@ def test_no_page_runs_or_fetches_anything_of_theirs(graded):
 
 
 def _elements(text: str) -> Iterator[tuple[str, dict[str, str]]]:
-    """Yield the elements of a page as HTML parsers see them, without name spaces."""
+    """Yield the elements of a page as HTML parsers see them, without namespaces."""
     tree = html5lib.parse(text, namespaceHTMLElements=False)
     for element in tree.iter():
         if isinstance(element.tag, str):
@@ -207,12 +207,12 @@ def _elements(text: str) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
-    """In the class's table and in what learning platforms import."""
+    """In the class's table and in the tables for learning platforms."""
     base, _, _ = graded
     out = base / "out-school"
     for lms in ("canvas", "moodle", "gradescope"):
         done = cartlab_here("export", out, "--lms", lms, "--out", base / "lms")
-        assert done.returncode == 1  # some who have points are named by nothing
+        assert done.returncode == 1  # some with points have no name at all
         assert "so not exported" in done.stderr
     tables = [out / "grades.csv", *(base / "lms").glob("*.csv")]
     assert len(tables) == 4
@@ -240,7 +240,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
 )
 def test_what_may_not_be_read_is_a_row(tmp_path_factory):
-    """A folder or file without rights costs its own row, at whatever step it is met."""
+    """A folder or file without read permission costs its own row, at whichever step."""
     base = tmp_path_factory.mktemp("rights")
     for name in ("folder", "inside", "toml", "listed", "good"):
         (base / "class" / name / "data").mkdir(parents=True)
@@ -270,7 +270,7 @@ def test_what_may_not_be_read_is_a_row(tmp_path_factory):
 
 
 def test_what_goes_away_or_changes_meanwhile_is_a_row(tmp_path):
-    """A file that is gone when its turn comes, and one that is another by then."""
+    """A file that is gone when it is read, and one that was replaced by then."""
     for name in ("gone", "changed"):
         (tmp_path / "class" / name).mkdir(parents=True)
         (tmp_path / "class" / name / "submission.toml").write_text(

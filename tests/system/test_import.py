@@ -1,4 +1,4 @@
-"""Files of other programs, taken into a submission as they appear in a folder."""
+"""Files of other programs are imported into a submission as they appear in a folder."""
 
 import os
 import sys
@@ -61,20 +61,20 @@ def source(tmp_path):
 
 
 def put(folder, name: str, text: str | bytes, *, at: int) -> None:
-    """Write a file as of a certain second."""
+    """Write a file with a given time of change."""
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     os.utime(path, (at, at))
 
 
 def take(work, source) -> tuple[list, Notes]:
-    """Take what is there now."""
+    """Import the files that are there now."""
     notes = Notes()
     return list(Importer(work, source, observer=notes).watch(once=True)), notes
 
 
 def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
-    """In the order they were written, each is matched to the next item; a stray is kept as such."""
+    """In the order they were written, each matches the next item; a stray file is kept as such."""
     put(source, "B.txt", dwell(2.0), at=200)
     put(source, "A.txt", STEP, at=100)
     put(source, "extra run!.txt", dwell(5.0), at=150)
@@ -95,7 +95,7 @@ def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
 
 
 def test_a_file_is_taken_once(work, source):
-    """A second session finds a copy of what it took, also under another name, and leaves it."""
+    """A second session recognises copies of imported files, also under another name."""
     put(source, "A.txt", STEP, at=100)
     assert len(take(work, source)[0]) == 1
     put(source, "A again.txt", STEP, at=300)
@@ -121,7 +121,7 @@ def test_the_usb_logger_is_known(tmp_path, source):
 
 
 def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
-    """A bare table is what the plan asks for next; its columns are numbers to check, as is said."""
+    """A bare table becomes the next item of the plan; the message asks to check its columns."""
     u = np.where((T > 1) & (T < 3), 0.5, 0.0)
     rows = "".join(
         f"{t:.5f}\t{round(400 * v)}\t{round(200 * v + i % 2)}\t{v:.4f}\n"
@@ -144,7 +144,7 @@ def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
     ],
 )
 def test_what_is_no_record_is_refused_and_said(work, source, name, content, why):
-    """A file that cannot be used is left where it is, with one line; nothing else changes."""
+    """A file that cannot be used stays where it is, with one line; nothing else changes."""
     before = (work / "submission.toml").read_bytes()
     put(source, name, content, at=1)
     taken, notes = take(work, source)
@@ -155,7 +155,7 @@ def test_what_is_no_record_is_refused_and_said(work, source, name, content, why)
 
 
 def test_an_export_for_matlab_is_a_record(work, source):
-    """`NAME.m` with its matrix in brackets is taken as any export is."""
+    """`NAME.m` with its matrix in brackets is imported like any export."""
     heading, matrix = STEP.split("\n", 1)
     put(source, "run.m", f"% {heading}\ndata = {matrix.rstrip()};\n", at=1)
     taken, notes = take(work, source)
@@ -165,7 +165,7 @@ def test_an_export_for_matlab_is_a_record(work, source):
 
 
 def test_everything_else_in_the_folder_is_said_once(work, source):
-    """A script, a picture and a folder are named with why; what a program hides is its own."""
+    """A script, a picture and a folder are named with the reason; hidden files are ignored."""
     put(source, "plot.m", "x = load('run.txt');\nplot(x(:, 1))\n", at=1)
     put(source, "photo.JPG", b"\xff\xd8", at=2)
     put(source, "~run.txt", STEP, at=3)
@@ -186,7 +186,7 @@ def test_everything_else_in_the_folder_is_said_once(work, source):
 
 
 def test_a_file_is_waited_for_until_it_is_complete(work, source):
-    """A program that writes slowly is not caught half way; when the plan is done, watching ends."""
+    """A slow program's file is not read half-written; when the plan is done, watching ends."""
     half = len(STEP) // 2
     looks = iter(range(100))
 
@@ -205,21 +205,21 @@ def test_a_file_is_waited_for_until_it_is_complete(work, source):
 
 
 class Tidy(Notes):
-    """Deletes a file as soon as anything is said."""
+    """A user who deletes a file as soon as a message appears."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self._path = path
 
     def remark(self, sentence: str) -> None:
-        """Note the sentence; the file vanishes."""
+        """Keep the sentence; delete the file."""
         super().remark(sentence)
         if "not taken" in sentence:
             self._path.unlink(missing_ok=True)
 
 
 def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
-    """What its program takes away again before it is read is passed over, the rest is taken."""
+    """A file removed before it is read is skipped, and the others are imported."""
     put(source, "A.txt", "no table\n", at=1)
     put(source, "B.txt", STEP, at=2)
     put(source, "C.txt", STEP, at=3)
@@ -231,7 +231,7 @@ def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
     sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
 )
 def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
-    """A file that its program still keeps to itself is said once, and taken later."""
+    """A file still locked by its program is reported once, and imported later."""
     put(source, "A.txt", STEP, at=1)
     (source / "A.txt").chmod(0)
     waits = iter(range(9))
@@ -249,7 +249,7 @@ def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
 
 
 def test_the_command_takes_what_is_there(work, source):
-    """`cartlab acquire DIR --import FOLDER --once` says what it took."""
+    """`cartlab acquire DIR --import FOLDER --once` lists what it imported."""
     put(source, "A.txt", STEP, at=100)
     result = CliRunner().invoke(
         app, ["acquire", str(work), "--import", str(source), "--once"], catch_exceptions=False
@@ -260,6 +260,6 @@ def test_the_command_takes_what_is_there(work, source):
 
 
 def test_a_folder_that_is_none_is_said(work, source):
-    """A folder to watch that is not there is one line."""
+    """A missing folder gives one line."""
     with pytest.raises(ConfigError, match="nowhere: is no folder to watch"):
         Importer(work, source / "nowhere", observer=Notes())

@@ -1,4 +1,4 @@
-"""Ctrl-C while the program still loads ends it like any other program: 130, and no traceback."""
+"""Ctrl-C while the program still loads ends it like any other program: 130, no traceback."""
 
 import subprocess
 import sys
@@ -9,8 +9,8 @@ from tests.helpers.places import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signal")
 
-# Presses Ctrl-C as the N-th module is asked for: at the same moment on any machine. The first two
-# are the package itself and the command line's, before anything of it runs.
+# Presses Ctrl-C when the N-th module is imported: at the same moment on any machine. The first two
+# are the package itself and the command line, before anything of it runs.
 _PRESS = """
 import os, signal, sys
 at, *words = sys.argv[1:]
@@ -33,23 +33,23 @@ main()
 
 @pytest.mark.parametrize("at", [*range(3, 12), *range(12, 300, 24)])
 def test_ctrl_c_while_the_commands_load_is_quiet(at):
-    """Whatever module is being loaded: nothing has begun, so there is nothing to say."""
+    """Whichever module is being loaded: nothing has begun, so there is no message."""
     done = _pressed(at, "effects")
     assert (done.returncode, done.stderr) == (130, "")
 
 
 @pytest.mark.parametrize("at", range(400, 1300, 100))
 def test_ctrl_c_while_a_command_loads_what_it_needs_is_one_line(tmp_path, at):
-    """Numbers, figures, pages: each is loaded by the command that needs it, under way."""
+    """Numbers, figures and pages are loaded by the command that needs them, while it runs."""
     out = tmp_path / "out"
     done = _pressed(at, "report", "submissions/one-cart", "--no-pdf", "--out", str(out))
     assert done.returncode == 130
     *progress, last = done.stderr.splitlines() or [""]
     assert last in ("", "stopped; the same command begins anew")
-    assert all(" … " in line for line in progress)  # of a machine that is busy
+    assert all(" … " in line for line in progress)  # on a machine that is busy
 
 
 def _pressed(at: int, *words: str) -> subprocess.CompletedProcess[str]:
-    """Run a command in which Ctrl-C is pressed."""
+    """Run a command during which Ctrl-C is pressed."""
     command = [sys.executable, "-c", _PRESS, str(at), *words]
     return subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)

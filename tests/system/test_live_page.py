@@ -1,4 +1,4 @@
-"""The live page: who may see it, what it shows in a real browser, that it never holds a run up."""
+"""The live page: who may see it, what it shows in a browser, and that it never delays a run."""
 
 import http.client
 import json
@@ -65,7 +65,7 @@ PLAN = Plan(limits=PlanLimits(input=0.4, travel=2.5), recordings=(DECAY, SINE, L
 
 
 def lines(first: int, last: int) -> list[Reading]:
-    """Return what a bench sends from one ms to another."""
+    """Return the lines that a bench sends between two times in ms."""
     return [
         Reading(counts=(ms, -ms), target=100, duty=round(100 * np.sin(0.0126 * ms)), ms=ms)
         for ms in range(first, last)
@@ -80,7 +80,7 @@ def folder(tmp_path):
 
 @pytest.fixture
 def page(folder) -> Iterator[LivePage]:
-    """A page that is served, with a plan of which one run is done."""
+    """A page with a plan, of which one run is done."""
     with LivePage(folder) as page:
         page.planned(PLAN, frozenset({"decay-1"}))
         yield page
@@ -90,7 +90,7 @@ def page(folder) -> Iterator[LivePage]:
 
 
 def test_points_are_few_in_units_and_of_this_run(folder):
-    """One line in five, volts and centimetres; a new run forgets the old one's."""
+    """One line in five, in volts and centimetres; a new run clears the old points."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
     state.started(SINE)
@@ -113,7 +113,7 @@ def test_points_are_few_in_units_and_of_this_run(folder):
 
 
 def test_a_slow_reader_gets_less_and_not_later(folder):
-    """After a minute nobody read, the last twelve seconds are there and nothing has grown."""
+    """After a minute without a reader, the last twelve seconds are there and no queue has grown."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
     state.started(SINE)
@@ -125,7 +125,7 @@ def test_a_slow_reader_gets_less_and_not_later(folder):
 
 
 def test_the_plan_says_what_is_done_now_and_broken(folder):
-    """Each recording has its state; a partial one its reason, until it comes off."""
+    """Each recording has its state, and a partial one its reason until it succeeds."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset({"decay-1"}))
     state.started(SINE)
@@ -140,7 +140,7 @@ def test_the_plan_says_what_is_done_now_and_broken(folder):
 
 
 def test_an_instruction_waits_for_its_own_answer(folder):
-    """The word for an earlier instruction is void; closing the page ends the wait."""
+    """An answer to an earlier instruction does not count; closing the page ends the wait."""
     state = LiveState(folder)
     assert not state.answer(1)
     waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
@@ -159,7 +159,7 @@ def test_an_instruction_waits_for_its_own_answer(folder):
 
 
 def ask(page: LivePage, path: str = "", method: str = "GET", body: str | None = None, **headers):
-    """Make one request as any program could; returns the response, read."""
+    """Make one request as any program could; return the response, read."""
     url = urlsplit(page.url)
     connection = http.client.HTTPConnection(url.hostname or "", url.port or 0, timeout=PATIENCE)
     named = {key.replace("_", "-"): value for key, value in headers.items()}
@@ -182,7 +182,7 @@ def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
 
 
 def test_it_is_served_to_this_computer_only_with_strict_headers(page):
-    """Loopback, no script or style but its own files, no framing, no referrer, no cache."""
+    """Loopback only, own scripts and styles only, no framing, no referrer, no cache."""
     assert urlsplit(page.url).hostname == "127.0.0.1"
     response, text = ask(page)
     assert response.status == 200
@@ -199,7 +199,7 @@ def test_it_is_served_to_this_computer_only_with_strict_headers(page):
 
 
 def test_who_does_not_know_the_secret_sees_nothing(page):
-    """No secret, a wrong one, one cut short or without its slash: 403, whatever is asked for."""
+    """No secret, a wrong one, a truncated one, or no slash: 403 for every address."""
     path = urlsplit(page.url).path
     for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
         response, text = ask(page, other)
@@ -210,7 +210,7 @@ def test_who_does_not_know_the_secret_sees_nothing(page):
 
 
 def test_requests_of_other_pages_are_refused(page):
-    """A name that leads here, another origin, a request a browser calls cross-site: 403."""
+    """Another host name, another origin, a cross-site request: 403."""
     port = urlsplit(page.url).port
     good = f"http://127.0.0.1:{port}"
     assert ask(page, Host=f"evil.example:{port}")[0].status == 403
@@ -237,14 +237,14 @@ def test_requests_of_other_pages_are_refused(page):
     ],
 )
 def test_nonsense_confirms_nothing(page, body, status):
-    """Broken, strange or long answers are refused and the page goes on."""
+    """Broken, strange or long answers are refused, and the page goes on."""
     origin = page.url[: page.url.index("/", 8)]
     assert ask(page, "press", "POST", body, Origin=origin)[0].status == status
     assert ask(page)[0].status == 200
 
 
 def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
-    """Two pages differ; no log line and nothing printed holds the secret."""
+    """Two pages differ; the secret is in no log line and no printed line."""
     caplog.set_level(logging.DEBUG)
     secrets = set()
     for _ in range(2):
@@ -285,14 +285,14 @@ def test_news_come_as_events_and_too_many_pages_are_turned_away(page):
 
 
 def _held(page: LivePage) -> int:
-    """Return how many connections the page holds open at this moment."""
+    """Return the number of connections that the page holds open now."""
     port = urlsplit(page.url).port
     mine = psutil.Process().net_connections("tcp")
     return sum(c.laddr[1:] == (port,) and c.status == psutil.CONN_ESTABLISHED for c in mine)
 
 
 def test_strangers_leave_the_run_its_descriptors(page):
-    """Of 400 idle connections some are held, half a request or not; who has the secret gets in."""
+    """Of 400 idle connections some are held, with or without half a request; the owner gets in."""
     url = urlsplit(page.url)
     with ExitStack() as opened:
         stream = news(page, opened)
@@ -309,7 +309,7 @@ def test_strangers_leave_the_run_its_descriptors(page):
 
 
 def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
-    """As many others as can be waiting, all accepted at once with it, drive no request out."""
+    """A full queue of other connections, accepted at once with it, crowds out no request."""
     url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
     snapshot = page.snapshot
 
@@ -321,7 +321,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
     monkeypatch.setattr(page, "snapshot", slow)
     with ExitStack() as opened:
         threading.Thread(target=news, args=(page, opened), daemon=True).start()
-        assert held.wait(PATIENCE)  # the server's loop stands still
+        assert held.wait(PATIENCE)  # the server's loop is blocked
         rightful = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
         opened.enter_context(rightful)
         rightful.sendall(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
@@ -334,7 +334,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
 
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
-    """An idle connection ends by itself; one that has shown the secret goes on."""
+    """An idle connection ends by itself; one with the secret stays."""
     monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
@@ -343,7 +343,7 @@ def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatc
         with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
             with suppress(ConnectionResetError):
                 assert stranger.recv(1) == b""
-        page.planned(PLAN, frozenset())  # told to who still listens
+        page.planned(PLAN, frozenset())  # sent to all that still listen
         while line := stream.readline():
             if line == b"event: state\n":
                 break
@@ -351,7 +351,7 @@ def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatc
 
 
 def test_a_run_is_not_held_up(folder):
-    """With two pages that read and one that does not, 50 lines are handed on within a heartbeat."""
+    """With two pages that read and one that does not, 50 lines pass within a heartbeat."""
     took = []
     with ExitStack() as opened:
         with LivePage(folder) as page:
@@ -388,7 +388,7 @@ def test_pages_hear_the_end_and_the_server_is_gone(folder):
 
 @pytest.fixture
 def show(browser, page):
-    """Open the page in a window of its own; errors and requests to elsewhere fail the test."""
+    """Open the page in a new window; script errors and requests to other hosts fail the test."""
     contexts, errors = [], []
 
     def opened(*, size=WIDE, **options):
@@ -415,7 +415,7 @@ def show(browser, page):
 
 
 def record(page: LivePage) -> None:
-    """Have two seconds of a sine come in."""
+    """Feed two seconds of a sine."""
     page.settling(SINE, 3.0)
     page.started(SINE)
     page.readings(lines(0, 2000), Anomalies(lost=3))
@@ -433,7 +433,7 @@ BLUE, ORANGE = "0,114,178", "213,94,0"
 
 
 def test_it_shows_plan_progress_counters_and_curves(page, show):
-    """What the acquisition tells stands on the page, curves in the colours of their keys."""
+    """The page shows the acquisition's state, and curves in the colours of their labels."""
     window = show()
     record(page)
 
@@ -457,7 +457,7 @@ def test_it_shows_plan_progress_counters_and_curves(page, show):
 
 @pytest.mark.parametrize("how", ["click", "Enter"])
 def test_an_instruction_is_confirmed_with_its_button(page, show, how):
-    """It appears with the focus on its button, and goes once it is done."""
+    """It appears with the focus on its button, and disappears once it is done."""
     window = show()
     done = threading.Event()
 
@@ -478,7 +478,7 @@ def test_an_instruction_is_confirmed_with_its_button(page, show, how):
 
 
 def test_the_buttons_are_those_that_would_be_heeded(page, show):
-    """Skip, Keep and Repeat count in a run, once; Stop always, also as Esc from anywhere."""
+    """Skip, Keep and Repeat work once in a run; Stop works always, also as Esc from anywhere."""
     window = show()
     skip = window.get_by_role("button", name="Skip")
     expect(skip).to_be_disabled()
@@ -502,7 +502,7 @@ def test_the_buttons_are_those_that_would_be_heeded(page, show):
 
 
 def test_every_page_open_sees_the_same(page, show):
-    """A second page opened in mid-run has the points from before; confirming on one clears both."""
+    """A second page opened during a run has the earlier points; confirming on one clears both."""
     first = show()
     record(page)
     second = show(size=PHONE)
@@ -515,7 +515,7 @@ def test_every_page_open_sees_the_same(page, show):
 
 @pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
 def test_everybody_can_read_it(page, show, size):
-    """Axe finds nothing, by day and by night; nothing is wider than the screen."""
+    """Axe finds no fault by day or night; nothing is wider than the screen."""
     window = show(size=size)
     record(page)
     threading.Thread(target=page.confirm, args=("let go of all carts",)).start()
@@ -537,7 +537,7 @@ def test_by_night_the_curves_change_colour(page, show):
 
 
 def test_the_end_is_told(folder, browser):
-    """Once the session is over the page says so, keeps its curves, and asks no more."""
+    """After the session the page says so, keeps its curves, and sends no more requests."""
     context = browser.new_context()
     context.set_default_timeout(1e3 * PATIENCE)
     window = context.new_page()
@@ -555,7 +555,7 @@ def test_the_end_is_told(folder, browser):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
-    """`acquire --web` on a stock bench: a button lets it start; no file holds the secret."""
+    """`acquire --web` on a stock bench: a button starts it; no file holds the secret."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
     toml = work / "submission.toml"
     scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')

@@ -1,4 +1,4 @@
-"""The page of plots in a browser: from the student's page, by keyboard, on a phone, by night."""
+"""The page of plots in a browser: from the student's page, by keyboard, on a phone, in the dark."""
 
 import re
 
@@ -19,7 +19,7 @@ DRAWN = f"canvases => canvases.map(c => ({INK})(c).some(v => v > 0))"
 
 
 def shown(window) -> str:
-    """Return what the address keeps of a view."""
+    """Return the view that an address holds."""
     return window.evaluate("location.hash")
 
 
@@ -33,7 +33,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
         expect(window.locator(".result")).to_contain_text("The linear model is furthest off in")
         assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # a plot a cart
 
-        # By keys: a second run, one cart of the two, what the model leaves, how often it swings.
+        # By keys: a second run, one cart of two, the residual, its spectrum.
         window.get_by_role("checkbox", name="step-2").focus()
         window.keyboard.press("Space")
         window.get_by_role("checkbox", name="x₂").focus()
@@ -60,7 +60,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
         assert window.locator("canvas").evaluate_all(DRAWN) == [True]
         expect(window.locator(".key li")).to_have_count(4)
 
-        # A number of the table opens its residual; an address opens its view again.
+        # A number in the table opens its residual; an address opens its view again.
         window.get_by_role("link", name=re.compile("residual of sweep, x₂, linear model")).click()
         expect(window.locator("#told")).to_have_text("sweep: residual")
         address = window.url
@@ -87,7 +87,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
 
 
 def test_without_scripts_there_is_a_picture_and_the_table(browser, tmp_path):
-    """The run that the model is furthest off in, and the error of every run."""
+    """The run with the largest error, and the errors of every run."""
     analysis = make_analysis(1)
     runs = compare_runs(analysis, gap=None, progress=silent)
     page = tmp_path / "compare.html"

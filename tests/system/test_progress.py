@@ -1,4 +1,4 @@
-"""Progress: a line that changes on a terminal, elsewhere now and then a line more."""
+"""Progress: one changing line on a terminal; elsewhere a new line now and then."""
 
 import io
 import os
@@ -21,7 +21,7 @@ from tests.helpers.waiting import until
 
 
 def test_short_work_says_nothing_to_a_pipe(tmp_path):
-    """Where stderr is no terminal there is the summary alone, without control characters."""
+    """If stderr is not a terminal, only the summary is printed, without control characters."""
     done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
 
     assert done.stdout == ""
@@ -32,7 +32,7 @@ def test_short_work_says_nothing_to_a_pipe(tmp_path):
 
 @pytest.mark.parametrize("work", [progress_line, _batch_progress])
 def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
-    """Ever more seldom while it goes on, and no more once it is over."""
+    """Less and less often while it goes on, and not after its end."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.02)
     said, threads = [], threading.active_count()
 
@@ -51,7 +51,7 @@ def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
 
 
 def test_what_was_known_before_is_no_speed():
-    """Of 1000 hand-ins 990 were graded before; at 2 s for each of the others 8 s are left."""
+    """Of 1000 submissions 990 were graded before; at 2 s for each of the others, 8 s are left."""
     now = 0.0
     bar = Progress(get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -65,7 +65,7 @@ def test_what_was_known_before_is_no_speed():
 
 
 def test_a_time_says_what_it_is_of():
-    """Behind each of the two times stands whether it is gone or to come."""
+    """Each of the two times says whether it has passed or is still to come."""
     now = 0.0
     bar = Progress(*columns(), get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -80,7 +80,7 @@ def test_a_time_says_what_it_is_of():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
-    """On a terminal the stages pass by with the time, and the line is gone in the end."""
+    """A terminal shows the stages with the time, and finally removes the line."""
     import pty
 
     ours, theirs = pty.openpty()
@@ -98,7 +98,7 @@ def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_ctrl_c_is_answered(tmp_path):
-    """Who stops a report at work is told so, and the exit status is that of Ctrl-C."""
+    """A message confirms that the report was stopped, with the exit status of Ctrl-C."""
     import pty
 
     ours, theirs = pty.openpty()
@@ -119,5 +119,5 @@ def test_ctrl_c_is_answered(tmp_path):
 def _read(terminal: int) -> bytes:
     try:
         return os.read(terminal, 4096)
-    except OSError:  # on Linux the other end has been closed
+    except OSError:  # on Linux the other end is closed by now
         return b""

@@ -16,7 +16,7 @@ def two_carts(real_data, tmp_path_factory):
 
 
 def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
-    """Masses and springs agree within 10 % with those an independent viscous fit found."""
+    """Masses and springs agree within 10 % with those of an independent viscous fit."""
     chain = two_carts.chain
     assert_allclose(chain.m, [5.5e-6, 3.7e-6], rtol=0.1)
     assert_allclose(chain.k[:2], [1.79e-3, 1.03e-3], rtol=0.1)
@@ -24,7 +24,7 @@ def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
 
 
 def test_the_repeat_that_stands_off_is_named(two_carts):
-    """The first of the five repeats moved otherwise; it is left out by name."""
+    """The first of five repeats moved differently; it is left out by name."""
     assert [(one.experiment, one.is_wrong) for one in two_carts.left_out] == [("both-1", False)]
 
 
@@ -50,7 +50,7 @@ def test_the_closed_loop_is_compared_and_its_logged_effort_found_out(two_carts):
 
 
 def test_every_skipped_stage_says_why(two_carts):
-    """There are no dwells: that stage is skipped with its reason, and the rest has run."""
+    """Without dwells that stage is skipped with its reason, and the rest has run."""
     assert "sine steady state" in {skip.stage for skip in two_carts.skipped}
     assert two_carts.fit.method == "time_fit"
     assert two_carts.feedback is not None

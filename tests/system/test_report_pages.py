@@ -1,4 +1,4 @@
-"""Reports as a reader meets them: in a real browser, on a phone, in the dark, on paper."""
+"""Reports as a reader sees them: in a real browser, on a phone, in dark mode, on paper."""
 
 import math
 import re
@@ -45,7 +45,7 @@ WIDE, LAPTOP, PHONE = (1280, 900), (1100, 800), (390, 844)
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return the folder of a case's report, made when first asked for."""
+    """Return the folder of a case's report, made on first use."""
     made: dict[str, Path] = {}
 
     def of(case: str, request) -> Path:
@@ -80,7 +80,7 @@ def _submission(case: str, out: Path, request) -> Path:
 
 @pytest.fixture(params=CASES)
 def made(request, folder) -> Path:
-    """The folder of one case after the other."""
+    """The folders of the cases, one after the other."""
     return folder(request.param, request)
 
 
@@ -97,13 +97,13 @@ def page_of(made: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def window(browser):
-    """The window in which most pages are shown: another takes a second to open."""
+    """The window that shows most pages: a new one takes a second to open."""
     return browser.new_context().new_page()
 
 
 @pytest.fixture
 def show(browser, window):
-    """Open a page, in a window of its own where that has options; its errors fail the test."""
+    """Open a page, in a new window if that has options; its errors fail the test."""
     pages, errors = [], []
 
     def on_error(error) -> None:
@@ -137,7 +137,7 @@ def show(browser, window):
 
 
 def test_the_page_is_valid_html(made):
-    """A strict parser finds no fault, every id stands once, and the file is small."""
+    """A strict parser finds no fault, every id is unique, and the file is small."""
     html = page_of(made).read_text(encoding="utf-8")
 
     html5lib.HTMLParser(strict=True).parse(html)
@@ -147,15 +147,15 @@ def test_the_page_is_valid_html(made):
     assert len(html.encode()) < LARGEST
 
 
-# Word boxes are those of the fonts, ascent and descent included: letters on lines that touch may
-# overlap by a little; a word that lies on another does so by more than half.
+# Word boxes include ascent and descent of the font: letters on neighbouring lines may overlap a
+# little, and a word on top of another overlaps by more than half.
 _MOST_OVERLAP = 0.25
 _WORD = re.compile(r'<word xMin="(.*?)" yMin="(.*?)" xMax="(.*?)" yMax="(.*?)">(.*?)</word>')
 
 
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
 def test_no_word_of_the_pdf_is_cut_or_covered(made):
-    """All words lie on their page, and none on another."""
+    """All words lie on their page, and none lies on another."""
     pdf = next(made.glob("*.pdf"), None)
     if pdf is None:
         pytest.skip("a page alone, without a PDF")
@@ -175,7 +175,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
         assert covered(words) == []
 
 
-# Of the height of a page's text; the last page ends where the report does.
+# In units of the height of a page's text; the last page may end early.
 MOST_WHITE = 1 / 3
 PRINTED = ("one", "two", "three", "gap", "solution")
 
@@ -183,7 +183,7 @@ PRINTED = ("one", "two", "three", "gap", "solution")
 @pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="no pdftoppm: poppler-utils")
 @pytest.mark.parametrize("case", PRINTED)
 def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
-    """Where a figure does not fit, those of the page are drawn smaller, or tables break."""
+    """If a figure does not fit, the figures of the page shrink, or tables break."""
     (pdf,) = folder(case, request).glob("*.pdf")
     pages = subprocess.run(
         ["pdftoppm", "-gray", "-r", "36", pdf], capture_output=True, check=True
@@ -196,7 +196,7 @@ def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
 
 
 def pictures(pgm: bytes) -> Iterator[NDArray[np.uint8]]:
-    """Yield the pages that pdftoppm wrote one after the other."""
+    """Yield the pages written by pdftoppm, one after the other."""
     while head := re.match(rb"P5\s+(\d+)\s+(\d+)\s+255\s", pgm):
         width, height = map(int, head.groups())
         end = head.end() + width * height
@@ -205,7 +205,7 @@ def pictures(pgm: bytes) -> Iterator[NDArray[np.uint8]]:
 
 
 def white_stretch(page: NDArray[np.uint8]) -> float:
-    """Return the longest stretch of a page without ink, as a share of the height of its text."""
+    """Return the longest stretch of a page without ink, as a share of its text height."""
     body = page[round(0.064 * len(page)) : round(0.929 * len(page))]  # between the margins
     inked = np.flatnonzero((body < 200).any(axis=1))
     edges = np.concatenate([[0], inked, [len(body)]])
@@ -214,7 +214,7 @@ def white_stretch(page: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize("case", PRINTED)
 def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
-    """With its caption stand at least its headings and four rows."""
+    """Beside the caption there are at least its headings and four rows."""
     (pdf,) = folder(case, request).glob("*.pdf")
     tables = list(rows_by_page(PdfReader(pdf)))
     assert len(tables) > 2
@@ -223,7 +223,7 @@ def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
 
 
 def rows_by_page(pdf: PdfReader) -> Iterator[list[int]]:
-    """Yield of each table how many of its rows stand on one page after the other."""
+    """Yield for each table the number of its rows on each page."""
     references = (page.indirect_reference for page in pdf.pages)
     numbers = {at.idnum: n for n, at in enumerate(references) if at}
     for table in elements(pdf.root_object["/StructTreeRoot"], "/Table"):
@@ -245,7 +245,7 @@ def elements(node: Any, kind: str) -> Iterator[Any]:
 
 
 def pages_of(node: Any, numbers: dict[int, int]) -> Iterator[int]:
-    """Yield the pages on which what is inside a node is drawn."""
+    """Yield the pages on which the content of a node is drawn."""
     node = node.get_object() if hasattr(node, "get_object") else node
     if isinstance(node, list):
         for one in node:
@@ -257,7 +257,7 @@ def pages_of(node: Any, numbers: dict[int, int]) -> Iterator[int]:
 
 
 class Box(NamedTuple):
-    """A text and where it stands."""
+    """A text and its place."""
 
     left: float
     top: float
@@ -277,7 +277,7 @@ class Box(NamedTuple):
 
 
 def covered(boxes: list[Box]) -> list[tuple[str, str]]:
-    """Return pairs of texts of which one lies on the other."""
+    """Return pairs of texts of which one covers the other."""
     pairs = []
     boxes = sorted(boxes)
     for i, a in enumerate(boxes):
@@ -332,10 +332,11 @@ BROKEN = """() => Array.from(document.querySelectorAll('td:nth-child(2):not(:las
 
 
 def test_everybody_can_read_it_on_every_screen(made, show):
-    """Axe finds nothing serious or critical: names, roles, order of headings, contrast by night.
+    """Axe finds nothing serious or critical: names, roles, order of headings, contrast at night.
 
-    Nothing sticks out but what can be scrolled, no text lies on another, figures hold theirs. On a
-    laptop every column of a table is in sight; on a phone the name of a check stands in one line.
+    Nothing exceeds the page except what can be scrolled, no text covers another, figures contain
+    their texts. On a laptop every column of a table is in sight; on a phone the name of a check is
+    on one line.
     """
     page = show(page_of(made))
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
@@ -392,7 +393,7 @@ SPLIT = """() => {
 
 
 def test_a_phone_squeezes_no_column_and_splits_no_unit(three, show):
-    """No cell of a table is higher than five lines; a number and its unit stand in one line."""
+    """No cell of a table is higher than five lines; a number and its unit are on one line."""
     page = show(page_of(three), size=PHONE)
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert 0 < page.evaluate(TALL) < 130
@@ -404,7 +405,7 @@ SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg
 
 
 def test_figures_can_be_read_on_a_laptop(made, show):
-    """No letter of a figure is lower than ten pixels, of buttons on it none below the figure."""
+    """No letter of a figure is lower than ten pixels; no button lies below its figure."""
     page = show(page_of(made), size=LAPTOP)
     assert page.evaluate(SMALLEST) >= 10
     for plot in page.locator(".plot").all():
@@ -415,7 +416,7 @@ def test_figures_can_be_read_on_a_laptop(made, show):
 
 
 def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
-    """The distribution is in sight at once; flags come before criteria, which have their titles."""
+    """The distribution is in sight at once; flags come before criteria, which show their titles."""
     page = show(page_of(folder("class", request)), size=LAPTOP)
     first = page.locator("figure").first.bounding_box()
     assert first["y"] + first["height"] < LAPTOP[1]
@@ -427,7 +428,7 @@ def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):
-    """Words narrow the table, headings sort it by number or name, up and down; names are links."""
+    """Words filter the table, headings sort it by number or name, up and down; names are links."""
     page = show(page_of(folder("class", request)))
     table = page.locator("table.finder")
     rows = table.locator("tbody tr:visible")
@@ -459,7 +460,7 @@ def numbers(text: str) -> list[float]:
 
 
 def test_a_figure_says_the_values_under_the_pointer(three, show):
-    """Over a measured point of the Bode figure its frequency, magnitude and phase are told."""
+    """Over a measured point of the Bode figure, frequency, magnitude and phase are shown."""
     analysis = analyse(load_submission(EXAMPLES / "three-cart"))
     response = next(r for r in analysis.frequency_responses if r.cart == 3)
     page = show(page_of(three))
@@ -473,14 +474,14 @@ def test_a_figure_says_the_values_under_the_pointer(three, show):
     assert "|X₃/U| measured" in told
     omega, magnitude = numbers(told.replace("X₃", ""))[:2]
     index = int(abs(response.omega - omega).argmin())
-    # Four digits are told.
+    # Four digits are shown.
     assert omega == pytest.approx(response.omega[index], rel=1e-3)
     decibel = 20 * math.log10(response.magnitude[index])
     assert magnitude == pytest.approx(decibel, abs=0.01)
 
 
 def test_a_figure_zooms_where_it_is_dragged_and_comes_back(three, show):
-    """Dragging shows a part on all panels of one axis; the button shows all again, as it was."""
+    """Dragging shows a part on all panels that share an axis; the button shows all again."""
     page = show(page_of(three))
     figure = page.locator("figure").first
     figure.scroll_into_view_if_needed()
@@ -533,7 +534,7 @@ def test_a_figure_answers_to_the_keyboard(three, show):
 
 
 def test_numbers_can_be_copied(three, show):
-    """A table goes to the clipboard with tabs and plain numbers, value and error apart."""
+    """A table is copied with tabs and plain numbers, value and error apart."""
     page = show(page_of(three), permissions=["clipboard-read", "clipboard-write"])
 
     page.get_by_role("button", name="Copy Table 2").click()
@@ -552,7 +553,7 @@ def test_numbers_can_be_copied(three, show):
 
 
 def test_without_scripts_the_page_is_whole(three, show):
-    """Figures, numbers and what is folded can be read where no script runs."""
+    """Figures, numbers and folded parts can be read where no script runs."""
     page = show(page_of(three), java_script_enabled=False)
 
     assert page.locator("figure svg").count() == page.locator("figure").count() > 5
@@ -562,7 +563,7 @@ def test_without_scripts_the_page_is_whole(three, show):
 
 
 def test_paper_shows_what_a_page_folds(three, show, tmp_path):
-    """Printing opens the folded tables and leaves out what only works on a screen."""
+    """Printing opens the folded tables and omits what only works on a screen."""
     page = show(page_of(three))
     paper = tmp_path / "paper.pdf"
     page.pdf(path=paper, format="A4")

@@ -1,4 +1,4 @@
-"""Whole submissions spoilt at random, given to the commands: a result or one line, each in time."""
+"""Whole submissions spoilt at random: every command gives a result or one line, in time."""
 
 import json
 import re
@@ -50,7 +50,7 @@ def good(carts: int) -> dict[str, bytes]:
 
 
 def odd(files: dict[str, bytes], rng: Random) -> None:
-    """Change what a submission says of its bench and its runs into something it may well say."""
+    """Change a submission's statements about its bench and runs into other plausible ones."""
     toml = files["submission.toml"].decode("utf-8", "replace")
 
     def change(pattern: str, *new: str) -> str:
@@ -85,7 +85,7 @@ def odd(files: dict[str, bytes], rng: Random) -> None:
 
 
 def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
-    """Do to a column of a table, or of all tables, what a bench may do to it."""
+    """Spoil a column of a table, or of all tables, as a bench may do."""
     tables = sorted(name for name in files if name.endswith(".csv"))
     how, column = CHANNELS[rng.choice(sorted(CHANNELS))], rng.randrange(1, 5)
     for name in tables if every else [rng.choice(tables)]:
@@ -101,7 +101,7 @@ def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
 
 
 def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
-    """Return a submission of so many carts with a few things wrong."""
+    """Return a submission of that many carts with a few faults."""
     files = dict(good(carts))
     for _ in range(rng.choice([1, 1, 2, 4])):
         if rng.random() < 0.6:
@@ -112,7 +112,7 @@ def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
 
 
 def run(command: str, folder: Path) -> None:
-    """Give the submission in a folder to a command, and look at what comes of it."""
+    """Give a submission folder to a command, and check the result."""
     out = folder.parent / "out"
     document = {"report": "results.json"}.get(command, f"{command}.json")
     began = time.process_time()

@@ -1,4 +1,4 @@
-"""Files of teachers and of earlier runs, spoilt at random: one line a complaint, or a result."""
+"""Files of teachers and of earlier runs, spoilt at random: one line for each fault, or a result."""
 
 import json
 import tempfile
@@ -52,7 +52,7 @@ SENT = """submission_77001:
 
 @cache
 def sound() -> dict[str, bytes]:
-    """Return what is spoilt below, by the name of the file."""
+    """Return the files that are spoilt below, by name."""
     with tempfile.TemporaryDirectory() as folder:
         submission = load_submission(write_work(Path(folder), []))
         plan = plan_text(propose_plan(submission), submission.system).encode()
@@ -73,7 +73,7 @@ def sound() -> dict[str, bytes]:
 
 
 def spoilt(name: str, rng: Random) -> bytes:
-    """Return a sound file with something done to its bytes, or to what they mean."""
+    """Return a sound file after a change of its bytes, or of their meaning."""
     raw = FILES[rng.choice(sorted(FILES))] if name == "import" else sound()[name]
     if rng.random() < 0.5:
         return damaged(raw, rng)
@@ -90,7 +90,7 @@ def spoilt(name: str, rng: Random) -> bytes:
 
 
 def use(name: str, path: Path) -> None:
-    """Read a file, and write what would be written of it."""
+    """Read a file, and write its result."""
     student = Student(
         id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
     )
@@ -128,7 +128,7 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Spoil a file and read it: one line of complaint (one a mistake in TOML), or none."""
+    """Spoil a file and read it: at most one line of error (one for each mistake in TOML)."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(spoilt(name, Random(f"{name} {seed}")))

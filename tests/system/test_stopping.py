@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command, whatever a library makes of it."""
+"""Ctrl-C ends a command, whatever a library does with it."""
 
 import contextlib
 import signal
@@ -10,7 +10,7 @@ from pipeline.cli.stopping import ctrl_c_says
 
 
 def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
-    """Press Ctrl-C at work that drops it, then look, or end in an error."""
+    """Press Ctrl-C during work that drops it, then look, or end in an error."""
     with ctrl_c_says(lambda: said.append("stopped")) as looked:
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -23,9 +23,9 @@ def _work(said: list[str], *, look: bool = False, error: Exception | None = None
 
 @pytest.mark.parametrize("how", [{"look": True}, {"look": False}, {"error": ValueError("broken")}])
 def test_an_interrupt_that_a_library_drops_ends_the_work(how):
-    """As Python drops one that falls into the callback of a weak reference: at the next look.
+    """Python drops one that falls into the callback of a weak reference; the next look finds it.
 
-    Or at the end, or with the error that a library that is interrupted makes of it.
+    At the latest it is found at the end, or with the error that the interrupted library raises.
     """
     said = []
     with pytest.raises(typer.Exit) as ended:
@@ -35,13 +35,13 @@ def test_an_interrupt_that_a_library_drops_ends_the_work(how):
 
 
 def test_an_error_without_ctrl_c_stays_an_error():
-    """Only what follows on Ctrl-C is one."""
+    """Only an error after Ctrl-C counts as an interrupt."""
     with pytest.raises(ValueError, match="broken"), ctrl_c_says(lambda: None):
         raise ValueError("broken")
 
 
 def test_afterwards_ctrl_c_is_what_it_was():
-    """The handler of before is there again."""
+    """The earlier handler is back."""
     before = signal.getsignal(signal.SIGINT)
     with ctrl_c_says(lambda: None):
         assert signal.getsignal(signal.SIGINT) is not before

@@ -8,7 +8,7 @@ from tests.helpers.places import ROOT
 
 
 def test_the_page_of_effects_is_the_catalogue():
-    """What `docs/effects_page.py` writes is what stands there, and each effect has its picture."""
+    """The page is what `docs/effects_page.py` writes, and each effect has its picture."""
     page = (ROOT / "docs" / "effects.md").read_text(encoding="utf-8")
     assert page == effects_page(), "run python -m docs.codegen"
     pictures = {path.stem for path in (ROOT / "docs" / IMAGES).iterdir()}
@@ -36,7 +36,7 @@ def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
 
 
 def test_links_and_local_files_are_no_loads(tmp_path):
-    """A link to another site, a namespace and a file beside the page are nobody's business."""
+    """A link to another site, a namespace and a file beside the page load nothing."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / "a.html").write_text(
         '<a href="https://example.org">there</a> <img src="../a.png"> <script src="a.js"></script>'
