@@ -1,4 +1,4 @@
-"""Checks of the fitted carts: a mass, damper or spring that may as well not be there."""
+"""Checks of the fitted carts: a mass, damper or spring that may not exist."""
 
 import shutil
 import tomllib
@@ -23,7 +23,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 def fitted(
     chain: Chain, *, relative: float = 1e-3, converged: bool = True, **std: float
 ) -> ChainFit:
-    """Return a fit of a chain with so large errors."""
+    """Return a fit of a chain with errors of the given size."""
     values = {f"m_{i}": v for i, v in enumerate(chain.m, 1)}
     values |= {f"c_{i}": v for i, v in enumerate(chain.c, 1)}
     values |= {f"k_{i}": v for i, v in enumerate(chain.k, 1) if v or f"k_{i}" in std}
@@ -44,7 +44,7 @@ def fitted(
 
 
 def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
-    """Return what is said of each parameter that may not be there."""
+    """Return the message for each parameter that may not exist."""
     return {check.about: check.message for check in checks if check.kind == "vanishing"}
 
 
@@ -60,7 +60,10 @@ def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
     ],
 )
 def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
-    """Zero within its error, or next to nothing beside its neighbour: asked about, with a line."""
+    """Zero within its error, or tiny beside its neighbour:
+
+    the message asks, with the line to change.
+    """
     plant = PRESETS["throne-2dof"]
     values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}
     values["k"][0] = 0.1
@@ -78,7 +81,7 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
-    """The paper's plants have no spring wall-1; where it is declared so, all is well."""
+    """The paper's plants have no spring wall-1; if it is declared missing, nothing is asked."""
     chain = PRESETS[preset]
     springs = tuple(bool(k > 0) for k in chain.k)
     assert check_vanishing(fitted(chain), bench=Bench(springs=springs)) == []
@@ -91,14 +94,14 @@ def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
 
 
 def test_the_shipped_examples_pass():
-    """Nothing that they declare vanishes."""
+    """None of their parameters vanishes."""
     for name in ("one-cart", "two-cart", "three-cart"):
         assert vanishing(analysed(name).checks) == {}
 
 
 @pytest.mark.parametrize("name", ["two-cart", "three-cart"])
 def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
-    """The line to change holds the springs that the example's bench has."""
+    """The line to change lists the springs that the example's bench has."""
     shutil.copytree(EXAMPLES / name, tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -113,7 +116,7 @@ def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="the recordings are not here")
 def test_a_far_spring_that_the_real_rig_has_not_is_asked_about(tmp_path):
-    """Declared, it takes 1 % of its neighbour, for dry friction has to be explained somehow."""
+    """If declared, it gets 1 % of its neighbour, since the fit uses it to explain dry friction."""
     folder: Path = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     assert vanishing(analyse(load_submission(folder), design=False).checks) == {}
     toml = folder / "submission.toml"

@@ -1,4 +1,4 @@
-"""Checks of single estimates: what they promise of a number."""
+"""Checks of single estimates: what they state about a number."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from tests.helpers.examples import analysed
 
 
 def test_the_interval_of_a_cart_that_sticks_is_no_bound():
-    """Two steps of one bench may give intervals that share no gain: neither need hold it."""
+    """Two steps of one bench may give intervals that share no gain; neither must contain it."""
     steps = [
         StepGain(
             experiment=f"step-{i}",
@@ -34,7 +34,7 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
 
 
 def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
-    """It stops short alike on both sides, so its gain looks like one; others show the friction."""
+    """It stops short equally on both sides, so one gain fits; other records show the friction."""
     hidden = "coulomb_friction:cart=1,force=0.003"
     done = CliRunner().invoke(
         app,
@@ -54,7 +54,7 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
 
 
 def test_one_edge_does_not_tell_whether_a_cart_sticks():
-    """A step that is never switched off shows one level only; on and off again it is a test."""
+    """A step that is never switched off shows one level only; on and off again is a test."""
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(
         [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)],
@@ -80,7 +80,7 @@ def row(name: str, source: str, final: str) -> ParameterRow:
 
 
 def test_advice_looks_only_at_what_there_is():
-    """No dwells, decays or steps are named where the estimates do not rest on them."""
+    """Dwells, decays or steps are named only if the estimates rest on them."""
     said = {
         (name, source, final): check_rows([row(name, source, final)])[0].message
         for name, source, final in (

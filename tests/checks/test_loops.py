@@ -1,4 +1,4 @@
-"""The designed loop as python-control sees it: its step, its margins, its gains once more."""
+"""The designed loop as python-control sees it: its step, its margins, its gains again."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def designed(
 
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_the_closed_loop_makes_the_step_of_the_design(name, method):
-    """Its states are named, and its step response is the run that the design was judged by."""
+    """Its states are named, and its step response is the one that the design was judged by."""
     chain = PLANTS[name]
     design, controller = designed(chain, method)
 
@@ -67,7 +67,7 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
 
 @pytest.mark.parametrize(
     ("name", "method", "sample_time", "settling_time"),
-    # Poles that are placed are as good or bad a loop at any pace as at the usual one.
+    # Placed poles are as good or bad a loop at any pace as at the usual one.
     [
         (name, method, *pace)
         for pace in PACES
@@ -78,8 +78,8 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
 def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_time):
     """Within them the loop is stable, on both sides, and just beyond them it is not.
 
-    A turn of the phase is a gain of size one: the loop's poles tell of both exactly. The response
-    has the modulus margin's size of 1 + L nowhere less, and it is reached.
+    A turn of the phase is a gain of size one, and the poles of the loop show both exactly. |1 + L|
+    is nowhere below the modulus margin, and reaches it.
     """
     chain = PLANTS[name]
     design, controller = designed(
@@ -117,7 +117,7 @@ def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_t
 
 
 def test_an_unstable_loop_has_no_margins():
-    """Where the loop runs away there is nothing to be far from, and the stage says so."""
+    """An unstable loop has no margins, and the stage says so."""
     chain = PRESETS["throne-3dof"]
     design, controller = designed(chain, "lqr")
     wild = StateFeedback(gains=50 * controller.gains, prefilter=1.0, model=chain)
@@ -127,7 +127,7 @@ def test_an_unstable_loop_has_no_margins():
 
 
 def test_undamped_carts_have_no_margins():
-    """A fit may hold a damping at zero; what then limits the gain is no property of the bench."""
+    """A fit may put a damping at zero; the limit of the gain is then no property of the bench."""
     design, _ = designed(UNDAMPED, "lqr")
     with pytest.raises(DataError, match="found a mode without damping"):
         design_margins(UNDAMPED, design)
@@ -136,7 +136,7 @@ def test_undamped_carts_have_no_margins():
 @pytest.mark.parametrize("sample_time", [None, 0.001])
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_control_finds_the_same_gains(name, method, sample_time):
-    """The check passes for what was designed, and fails where one gain is a hundredth off."""
+    """The check passes for the design, and fails if one gain is a hundredth off."""
     chain = PLANTS[name]
     design, _ = designed(chain, method, sample_time=sample_time)
     assert verify_design(chain, design).outcome == "pass"
@@ -159,7 +159,7 @@ def test_poles_asked_for_twice_are_verified_too():
 
 
 def test_a_design_that_is_not_finite_does_not_pass():
-    """A prefilter that is no number is no right one."""
+    """A prefilter that is not a number fails."""
     chain = PRESETS["throne-1dof"]
     design, _ = designed(chain, "lqr")
     assert verify_design(chain, replace(design, prefilter=np.nan)).outcome == "fail"

@@ -1,4 +1,4 @@
-"""A recording in the few numbers in which a person says it."""
+"""A recording described by a few numbers, as a person would."""
 
 import pytest
 
@@ -11,7 +11,7 @@ from tests.helpers.acquisitions import sine, write_work
 
 @pytest.fixture
 def work(tmp_path):
-    """Two carts with a dwell planned, 0.5 V and 2.5 cm at most."""
+    """A folder of two carts with a planned dwell, 0.5 V and 2.5 cm at most."""
     return write_work(tmp_path / "work", [sine("sine-1", seconds=5, settle=7.0)])
 
 
@@ -29,7 +29,7 @@ def work(tmp_path):
     ],
 )
 def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbers, expected):
-    """Of each kind, with an id of its own and the rest of the plan's other runs."""
+    """For each kind, with an id of its own and the common settings of the plan."""
     submission = load_submission(work)
     plan = load_plan(submission)
     wanted = make_recording(
@@ -61,7 +61,7 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
     ],
 )
 def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers, words):
-    """With what was expected; nothing is written."""
+    """The message has the allowed range; nothing is written."""
     submission = load_submission(work)
     plan = load_plan(submission)
     given = {"seconds": 20.0, **numbers}
@@ -74,7 +74,7 @@ def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers,
     ("seconds", "frequency", "cycles"), [(100.0, 0.07, 7), (101.0, 0.07, 8), (120.0, 0.07, 8)]
 )
 def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
-    """100 s at 0.07 Hz are 7, which 64 bits make 7.000000000000001; none goes beyond 120 s."""
+    """100 s at 0.07 Hz are 7 periods, in floating point 7.000000000000001; the limit is 120 s."""
     submission = load_submission(work)
     made = make_recording(
         WantedRecording(kind="sine", seconds=seconds, amplitude=0.1, frequency=frequency),
@@ -85,7 +85,7 @@ def test_whole_periods_last_as_long_as_typed(work, seconds, frequency, cycles):
 
 
 def test_what_others_added_meanwhile_stays(work):
-    """Whoever extends the plan may have thought of it for minutes, on the plan as it was."""
+    """A person may have considered the plan for minutes while others added to it."""
     old = load_plan(load_submission(work))
     theirs = add_recording(work, sine("theirs", seconds=5))
     new = [sine(name, seconds=4) for name in ("sine-1", "theirs")]

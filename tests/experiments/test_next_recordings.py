@@ -1,4 +1,4 @@
-"""The next experiment: what a record will tell, which are chosen, what is promised and kept."""
+"""The next experiment: the information in a record, the choice, the promise and its result."""
 
 import itertools
 import json
@@ -50,7 +50,7 @@ COMMANDS = frozenset("cm")
 
 @pytest.fixture(scope="module")
 def analysis():
-    """The shipped two carts as steps and a sweep tell of them."""
+    """The shipped two carts, identified from steps and a sweep."""
     submission = load_submission(EXAMPLES / "two-cart")
     kept = tuple(e for e in submission.experiments if e.kind in ("decay", "step", "sweep"))
     return analyse(submission.model_copy(update={"experiments": kept}))
@@ -75,11 +75,11 @@ def multisine(known: Knowledge, goal: Goal) -> Recording:
     )
 
 
-# ------------------------------------------------------------------- what a record tells
+# ------------------------------------------------------------ the information in a record
 
 
 def test_what_is_known_is_what_the_fit_says(known, analysis):
-    """H and S give back the fit's standard error of every named parameter."""
+    """H and S reproduce the fit's standard error of every named parameter."""
     half = known.by_parameters() @ np.linalg.inv(known.told[0])
     std = np.sqrt(np.diag(half @ known.told[1] @ half.T))
     fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
@@ -88,7 +88,7 @@ def test_what_is_known_is_what_the_fit_says(known, analysis):
 
 @pytest.mark.slow
 def test_what_is_promised_is_kept(tmp_path):
-    """On the emulator's carts the fit afterwards states what was promised, and the truth is there.
+    """On the emulator's carts the later fit has the promised errors, and the truth lies within.
 
     A stated error is itself uncertain by some 20 %, and the worst of ten by more.
     """
@@ -115,7 +115,7 @@ def test_what_is_promised_is_kept(tmp_path):
 
 
 def test_steady_sines_tell_what_a_long_record_does(known):
-    """Twice the time, twice as much; and so much more does a record tell that is so much longer."""
+    """Twice the time gives twice the information, also in a long record."""
     omega = known.chain.omega_carts
     once = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=10.0)
     twice = known.of_lines(omega, amplitude=np.full(2, 0.05), seconds=20.0)
@@ -140,12 +140,12 @@ def test_steady_sines_tell_what_a_long_record_does(known):
     np.testing.assert_allclose(np.diag(long - short), np.diag(expected), rtol=0.02)
 
 
-# ------------------------------------------------------------------------ which are chosen
+# ---------------------------------------------------------------------------- the choice
 
 
 @pytest.mark.parametrize("mean", ["largest", "root mean square", "volume"])
 def test_the_exchange_finds_the_best_of_all_sets(mean):
-    """As good as the best of all 220 choices of three among ten, for every criterion."""
+    """It equals the best of all 220 choices of three among ten, for every criterion."""
     rng = np.random.default_rng(5)
     J = rng.standard_normal((10, 3, 4))
     H = np.einsum("cjp,cjq->cpq", J, J)
@@ -158,7 +158,7 @@ def test_the_exchange_finds_the_best_of_all_sets(mean):
 
 
 def test_the_goals_are_errors_of_what_they_name(known, analysis):
-    """One parameter's is its standard error; the worst is the largest of them all."""
+    """A parameter's goal is its standard error; the worst is the largest of them all."""
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
         goal = find_goal(name, known, feedback=None)
@@ -171,7 +171,7 @@ def test_the_goals_are_errors_of_what_they_name(known, analysis):
 
 
 def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
-    """As many carts drawn from the covariance overshoot under the same controller."""
+    """That many carts drawn from the covariance overshoot under the same controller."""
     feedback = analysis.feedback
     goal = find_goal("design", known, feedback=feedback)
     covariance = np.linalg.inv(known.told[0]) @ known.told[1] @ np.linalg.inv(known.told[0])
@@ -186,12 +186,12 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
             setup=LoopSetup(sample_time=feedback.sample_time),
         )
         peaks.append(loop.x[feedback.cart - 1].max() / feedback.reference)
-    # 300 draws tell a spread to 4 %; the rest is what is not linear.
+    # 300 draws determine a spread to 4 %; the rest is nonlinearity.
     assert np.std(peaks) / widened == pytest.approx(float(goal.of(known.told)), rel=0.2)
 
 
 def test_each_choice_serves_its_own_goal(analysis):
-    """What is chosen for one parameter leaves it no worse known than what is chosen for another."""
+    """A choice made for one parameter is at least as good for it as a choice for another."""
     plan = Plan(limits=LIMITS)
     left = {}
     for goal in ("K_1", "zeta_2"):
@@ -206,7 +206,7 @@ def test_each_choice_serves_its_own_goal(analysis):
 
 
 def test_no_choice_passes_a_limit(analysis):
-    """Simulated from rest on the carts as identified, travel and input stay inside."""
+    """Simulated from rest on the identified carts, travel and input stay inside."""
     for commands in (frozenset(), frozenset("c"), COMMANDS):
         found = choose_next(analysis, Plan(limits=LIMITS), n=3, goal="mean", commands=commands)
         assert {r.wave for r in found.recordings} <= {"square", "chirp", "multisine"}
@@ -221,7 +221,7 @@ def test_no_choice_passes_a_limit(analysis):
 
 
 def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known):
-    """Theirs alone, its own alone; the one is what `choose_next` promises of an open recording."""
+    """A user's alone, the program's alone; the latter equals the promise of `choose_next`."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     plan = Plan(limits=LIMITS)
@@ -236,7 +236,7 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
 
 
 def test_what_makes_the_fit_know_worse_says_so(analysis):
-    """Minutes of rest whose rounding does not average out weigh more than what they tell."""
+    """Minutes of rest, whose rounding error does not average out, cost more than they give."""
     mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
                      frequency=2 / 120, cycles=4)  # fmt: skip
     found = weigh(analysis, mine, Plan(limits=LIMITS), goal="worst", commands=COMMANDS)
@@ -254,7 +254,7 @@ def test_what_makes_the_fit_know_worse_says_so(analysis):
     ],
 )
 def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
-    """It is of another kind than the fit takes, holds a cart, or goes too far."""
+    """It is of a kind that the fit does not use, holds a cart, or goes too far."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
     assert tells_nothing(mine, known, limits=LIMITS) == ""
@@ -262,7 +262,7 @@ def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
 
 
 def test_where_dwells_identify_dwells_are_chosen():
-    """The carts are then fitted to dwells alone: another sweep would change nothing."""
+    """The carts are then fitted to dwells alone, so another sweep would change nothing."""
     analysis = analysed("two-cart")
     found = choose_next(analysis, Plan(limits=LIMITS), n=2, goal="zeta_2", commands=COMMANDS)
     assert {r.kind for r in found.recordings} == {"sine"}
@@ -270,7 +270,7 @@ def test_where_dwells_identify_dwells_are_chosen():
 
 
 def test_a_new_dwell_lies_as_far_off_as_those_before():
-    """Where friction, say, puts every point off the carts, one more tells what they tell."""
+    """If friction puts every point off the carts, one more point is off as well."""
     known = Knowledge.of(analysed("two-cart"))
     dwell = Recording(
         id="sine-new", kind="sine", carts=(1, 2), wave="sine", amplitude=0.05, frequency=2.0,
@@ -283,7 +283,7 @@ def test_a_new_dwell_lies_as_far_off_as_those_before():
 
 
 def test_carts_that_hardly_settle_get_no_dwells():
-    """A transient of a slow mode would pass for a steady state: it is said, and none is chosen."""
+    """A slow transient would be taken for a steady state: a message says so, no dwell is chosen."""
     known = Knowledge.of(analysed("two-cart"))
     slow = replace(known, chain=replace(known.chain, c=0.2 * known.chain.c))
     goal = find_goal("worst", slow, feedback=None)
@@ -292,7 +292,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
 
 
 def test_a_promise_below_any_calibration_says_so(analysis):
-    """And the worst parameter is named before and after, where that is another."""
+    """The worst parameter is named before and after, if it changes."""
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
     assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
@@ -307,7 +307,7 @@ def test_a_promise_below_any_calibration_says_so(analysis):
 
 
 def test_clipped_phases_keep_the_swing_low():
-    """Of twelve lines on three carts the motion peaks lower than for the best of 500 by chance."""
+    """With twelve lines on three carts the motion peaks lower than for 500 random phases."""
     lines = np.arange(10, 70, 5)
     omega = np.asarray(2 * np.pi * 0.1 * lines, dtype=np.float64)
     G = PRESETS["throne-3dof"].frequency_response(omega)
@@ -323,7 +323,7 @@ def test_clipped_phases_keep_the_swing_low():
 
 
 def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
-    """Whatever the goal, the sum of shares as rounded for the file reaches one."""
+    """Whatever the goal, the rounded shares add up to one."""
     for name in ("mean", "K_1"):
         recording = multisine(known, find_goal(name, known, feedback=None))
         h, share, phase = np.array(recording.tones).T[:, :, None]
@@ -332,7 +332,7 @@ def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
 
 
 def test_a_bench_adds_the_tones_it_is_told():
-    """The sum of the last ones told, forgotten on harmonic zero and on a reset."""
+    """The sum of the tones last received; harmonic zero and a reset clear them."""
     core = ReferenceCore(Description(name="x", encoders=2, carts=2, commands=EXTENSIONS))
     tones = (Tone(harmonic=3, share=0.5, phase=0.25), Tone(harmonic=7, share=-0.25, phase=1.0))
     start = Start(wave=Wave.MULTISINE, frequency=2.0, amplitude=1000, cycles=2)
@@ -356,7 +356,7 @@ def test_a_bench_adds_the_tones_it_is_told():
 
 @pytest.fixture
 def work(tmp_path):
-    """The shipped one-cart submission without its dwells, in a folder of its own."""
+    """The shipped one-cart submission without its dwells, in a new folder."""
     source = load_submission(EXAMPLES / "one-cart")
     text = (EXAMPLES / "one-cart" / "submission.toml").read_text(encoding="utf-8")
     head, *tables = text.split("[[experiments]]")
@@ -373,7 +373,7 @@ def work(tmp_path):
 
 
 def test_the_command_adds_what_it_chose_to_the_plan(work):
-    """What it promises is said, in the plan, and in JSON; a plan of choices gets no dwells."""
+    """The message, the plan and the JSON have the promise; a plan of choices gets no dwells."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta", "--json")
     data = json.loads(done.stdout)
     assert data["next"]["errors"] == sorted(data["next"]["errors"], reverse=True)
@@ -388,7 +388,7 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
     again = json.loads(cartlab_here("plan", work, "--next", 1, "--for", "zeta", "--json").stdout)
     planned = again["next"]["planned"]
     assert set(planned) >= {r.id for r in chosen}
-    # What was promised for the first of two is what it would leave by itself.
+    # The promise for the first of two is its benefit alone.
     assert planned[chosen[0].id] == pytest.approx(data["next"]["errors"][1], rel=1e-9)
     # What is planned is not promised twice.
     assert again["next"]["errors"][0] == pytest.approx(data["next"]["errors"][2], rel=1e-9)
@@ -396,7 +396,7 @@ def test_the_command_adds_what_it_chose_to_the_plan(work):
 
 
 def test_what_is_written_is_counted(work):
-    """With the recordings that every bench begins with, where there was no plan yet."""
+    """Including the recordings that every bench begins with, if there was no plan."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
     assert f"the {usual} recordings that a bench begins with, and 2 chosen beside" in done.stderr
@@ -407,7 +407,7 @@ def test_what_is_written_is_counted(work):
 
 
 def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
-    """They count noise, and tell nothing where more than noise is left."""
+    """They count noise, so they are worthless where more than noise is left."""
     for chi_square, doubted in ((556.0, True), (1.0, False)):
         fit = replace(analysis.fit, chi_square_per_dof=chi_square)
         assert bool(_doubt(replace(analysis, fit=fit), tmp_path)) == doubted
@@ -415,7 +415,7 @@ def test_beside_a_misfit_the_errors_are_doubted(analysis, tmp_path):
 
 @pytest.mark.parametrize("words", [("--for", "zeta"), ("--next", 1, "--for", "omega_x")])
 def test_what_cannot_be_chosen_is_one_line(work, words, monkeypatch):
-    """A goal without a number, a name that is none: before the data are asked."""
+    """A goal without a number, an unknown name: refused before the data are read."""
     monkeypatch.setattr("pipeline.experiments.next_recordings.analyse", None)
     done = cartlab_here("plan", work, *words)
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""What is proposed for a session at the bench, and the file it stands in."""
+"""The plan proposed for a session at the bench, and its file."""
 
 import json
 import sys
@@ -38,7 +38,7 @@ FIRST = ("decay", "step", "sweep")
 
 
 def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
-    """A submission of which nothing is recorded yet."""
+    """A submission without any recording."""
     springs = (True,) * (carts + 1) if springs is None else springs
     system = System(
         carts=carts, springs=springs, **{"position": PositionScale(unit="cm"), **system}
@@ -47,7 +47,7 @@ def bare(*, carts=2, springs=None, design=None, **system) -> Submission:
 
 
 def recorded(example: str, *kinds: str) -> Submission:
-    """A shipped example with some kinds of its runs only."""
+    """A shipped example with only some kinds of its runs."""
     submission = load_submission(EXAMPLES / example)
     kept = tuple(e for e in submission.experiments if e.kind in kinds)
     return submission.model_copy(update={"experiments": kept})
@@ -61,7 +61,7 @@ def of_kind(plan: Plan, kind: str) -> list[Recording]:
 
 
 def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
-    """Each cart is let go alone, then small steps to both sides and one sweep, all carts free."""
+    """Each cart is released alone, then small steps to both sides and one sweep, all carts free."""
     plan = propose_plan(bare(carts=3))
 
     runs = [(r.kind, r.carts, r.release) for r in plan.recordings]
@@ -73,7 +73,7 @@ def test_the_first_runs_are_those_a_bench_of_unknown_carts_allows():
 
 
 def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_aside():
-    """What cannot swing is not released; what rests anywhere gets no step, only the sweep."""
+    """A cart that cannot swing is not released; free carts get no step, only the sweep."""
     plan = propose_plan(bare(carts=1, springs=(False, False)))
     assert [r.kind for r in plan.recordings] == ["sweep"]
     plan = propose_plan(bare(carts=2, springs=(False, True, False)))
@@ -81,7 +81,7 @@ def test_a_cart_without_springs_is_not_let_go_and_untied_carts_are_not_pushed_as
 
 
 def test_a_stock_bench_gets_no_command_it_does_not_know():
-    """The sweep is a square wave then, and after the dwells it runs its own PID on cart 1."""
+    """Its sweep is a square wave, and after the dwells its own PID runs on cart 1."""
     (sweep,) = of_kind(propose_plan(bare(), bench=STOCK), "sweep")
     assert (sweep.wave, sweep.frequency_end) == ("square", None)
     whole = recorded("two-cart", *FIRST, "sine")
@@ -96,7 +96,7 @@ def test_a_stock_bench_gets_no_command_it_does_not_know():
 
 
 def test_what_is_recorded_is_not_proposed():
-    """A submission with its decays, steps and sweep is asked for nothing of the first stage."""
+    """A submission with decays, steps and sweep needs nothing of the first stage."""
     assert propose_plan(recorded("two-cart", *FIRST)).recordings == ()
 
 
@@ -115,14 +115,14 @@ def test_what_is_recorded_is_not_proposed():
     ],
 )
 def test_limits_come_from_what_is_stated(system, design, expected):
-    """The design, the scale of the input, the unit of the positions; else usual ones."""
+    """The design, the scale of the input, the unit of the positions; else the usual ones."""
     limits = propose_plan(bare(**system, design=design)).limits
     assert (limits.input, limits.travel) == expected
 
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
-    """On a bench whose full scale holds the carts some 12 cm out: over 0.2 cm, under the limit."""
+    """If full scale holds the carts 12 cm out: more than 0.2 cm, and below the limit."""
     chain, per_count = PRESETS[preset], 0.5 / FULL_SCALE
     plan = propose_plan(bare(carts=chain.n, input=InputScale(per_count=per_count)))
     for recording in (*of_kind(plan, "step"), *of_kind(plan, "sweep")):
@@ -144,14 +144,14 @@ def test_the_first_runs_move_the_carts_well_and_not_too_far(preset):
 
 @pytest.fixture(scope="module", params=sorted(PRESETS))
 def extended(request):
-    """A preset's chain and the plan that its decays, steps and sweep lead to."""
+    """A preset's chain and the plan that follows from its decays, steps and sweep."""
     submission = recorded(EXAMPLE_OF[request.param], *FIRST)
     plan = propose_plan(submission)
     return PRESETS[request.param], extend_plan(plan, submission), submission
 
 
 def test_dwells_bracket_every_resonance_and_null(extended):
-    """A dwell lies within 1 % of each or within its bandwidth, and within 15 % on either side."""
+    """A dwell is within 1 % of each or within its bandwidth, and within 15 % on either side."""
     chain, plan, _ = extended
     dwells = np.array([2 * np.pi * r.frequency for r in of_kind(plan, "sine")])
     for roots in (chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))):
@@ -163,7 +163,7 @@ def test_dwells_bracket_every_resonance_and_null(extended):
 
 
 def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended):
-    """On the true plant, by steady state: 0.3 to 1.3 of the aim; from rest: within the limit."""
+    """On the true plant, in steady state: 0.3 to 1.3 of the aim; from rest: within the limit."""
     chain, plan, _ = extended
     aim = AIM * plan.limits.travel
     wait = settling_wait(chain, time_constants=SETTLED_DWELL)
@@ -180,7 +180,7 @@ def test_dwells_move_the_carts_as_far_as_asked_and_never_past_the_limit(extended
 
 
 def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
-    """Both signs; on the true plant they end 0.5 to 1 of the aim away."""
+    """To both sides; on the true plant they end at 0.5 to 1 of the aim."""
     chain, plan, _ = extended
     aim, amplitudes = AIM * plan.limits.travel, [r.amplitude for r in of_kind(plan, "step")]
     assert amplitudes[0] == -amplitudes[1]
@@ -193,7 +193,7 @@ def test_steps_rest_near_the_aim_and_overshoot_within_the_limit(extended):
 
 
 def test_extending_twice_changes_nothing(extended):
-    """Nor does it once the person at the bench changed or removed a dwell."""
+    """Not even after the person at the bench changed or removed a dwell."""
     _, plan, submission = extended
     assert extend_plan(plan, submission) == plan
     first, *rest = plan.recordings
@@ -216,7 +216,7 @@ def test_the_loop_comes_once_the_dwells_are_recorded():
 
 
 def test_a_long_set_point_is_cut_to_the_travel():
-    """A reference beyond the travel limit is not asked of the carts."""
+    """A reference beyond the travel limit is reduced."""
     submission = recorded("two-cart", *FIRST, "sine")
     plan = Plan(limits=PlanLimits(input=5.0, travel=0.5))
     (loop,) = extend_plan(plan, submission).recordings
@@ -224,7 +224,7 @@ def test_a_long_set_point_is_cut_to_the_travel():
 
 
 def test_new_recordings_take_names_of_their_own():
-    """Steps go on counting where the submission's end; ids never clash."""
+    """Steps continue the submission's numbers; ids never clash."""
     submission = recorded("two-cart", *FIRST)
     taken = {e.id for e in submission.experiments}
     plan = extend_plan(propose_plan(submission), submission)
@@ -235,7 +235,7 @@ def test_new_recordings_take_names_of_their_own():
 
 
 def test_data_that_identify_nothing_say_so():
-    """A lone sweep of carts that no spring ties gives a reason in place of dwells."""
+    """A single sweep of free carts gives a reason in place of dwells."""
     submission = recorded("one-cart", "sweep")
     rigid = submission.system.model_copy(update={"springs": (False, False)})
     submission = submission.model_copy(update={"system": rigid})
@@ -244,7 +244,7 @@ def test_data_that_identify_nothing_say_so():
 
 
 def test_counts_in_the_plural_are_counts():
-    """A travel limit in "counts" is that of an ECP 210, not two and a half counts."""
+    """A travel limit in "counts" is that of an ECP 210, not 2.5 counts."""
     assert propose_plan(bare(position=PositionScale(unit="counts"))).limits.travel == 1100.0
 
 
@@ -302,7 +302,7 @@ def test_a_plan_reads_back_as_it_was_written(
 
 
 def test_adding_keeps_every_byte_that_stood_there(tmp_path):
-    """Comments, order and numbers of the person at the bench stay; new tables come at the end."""
+    """Comments, order and numbers stay; new tables come at the end."""
     example = recorded("two-cart", *FIRST)
     submission = example.model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(
@@ -323,7 +323,7 @@ def test_adding_keeps_every_byte_that_stood_there(tmp_path):
 
 
 def test_what_is_added_while_the_data_are_asked_stays(tmp_path):
-    """Whoever adds a recording meanwhile finds it in the plan, before what the data ask for."""
+    """A recording added meanwhile is in the plan, before those that the data ask for."""
     work = a_recorded_cart(tmp_path / "work")
     submission = load_submission(work)
     old = propose_plan(submission)
@@ -424,7 +424,7 @@ def with_run(**changes) -> str:
     ],
 )
 def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
-    """File, key, what was expected, what was found, what is near."""
+    """File, key, what was expected, what was found, and the nearest valid key."""
     submission = bare().model_copy(update={"folder": tmp_path})
     plan_path(submission).write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=message) as caught:
@@ -435,7 +435,7 @@ def test_what_is_wrong_is_a_line_that_names_the_key(tmp_path, text, message):
 
 
 def test_a_link_in_its_place_is_not_followed(tmp_path):
-    """A plan that is a link to somewhere else is refused, also for writing."""
+    """A plan that is a link is refused, also for writing."""
     submission = bare().model_copy(update={"folder": tmp_path})
     (tmp_path / "other").write_text(with_run(), encoding="utf-8")
     plan_path(submission).symlink_to(tmp_path / "other")
@@ -454,7 +454,7 @@ def run(monkeypatch, *arguments) -> str | int:
 
 
 def test_the_command_writes_shows_and_extends(monkeypatch, capsys, tmp_path):
-    """It tells what to hold and how long it takes; run again it changes nothing."""
+    """It says which carts to hold and how long it takes; a second run changes nothing."""
     new_submission(tmp_path / "bench", carts=2)
     assert run(monkeypatch, "plan", tmp_path / "bench") == 0
     out, err = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""What is said of the records as such."""
+"""Warnings about the records as such."""
 
 from dataclasses import replace
 
@@ -13,7 +13,10 @@ from pipeline.submission import load_submission
 
 @pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
 def test_centimetres_said_to_be_metres_are_asked_about(name):
-    """Carts that run at 60 km/h are in another unit; in centimetres, millimetres or counts not."""
+    """Carts at 60 km/h must have another unit;
+
+    centimetres, millimetres and counts are not questioned.
+    """
     data = read_data(load_submission(EXAMPLES / name))
     (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]
     assert "no cart at a bench runs so fast" in said
@@ -22,7 +25,7 @@ def test_centimetres_said_to_be_metres_are_asked_about(name):
 
 
 def test_one_kind_of_recording_or_a_jump_accuses_no_unit():
-    """A slip in one file is its own, and an encoder that jumps is no cart that runs."""
+    """A slip in one file concerns that file; an encoder that jumps is not a fast cart."""
     data = read_data(load_submission(EXAMPLES / "one-cart"))
     steps = replace(data, records=tuple(r for r in data.records if r.kind == "step"))
     assert not [one for one in reading_remarks(steps, unit="m") if "runs so fast" in one]

@@ -1,4 +1,4 @@
-"""Answers are found and written in `notes.md` by their question's id; the rest stays."""
+"""Answers are found in and written to `notes.md` by their question's id; the rest stays."""
 
 import pytest
 from hypothesis import given
@@ -52,7 +52,7 @@ def test_an_answer_is_replaced_added_and_taken_away():
 
 
 def test_a_heading_that_would_end_the_answer_is_refused():
-    """What the report would not show as the answer is not written as one."""
+    """Text that the report would not show as the answer is refused."""
     with pytest.raises(SubmissionError, match="begins with ###"):
         with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
@@ -63,12 +63,12 @@ OPEN = ["```\ncode", "~~~", "So <!-- why", "```\n<!-- x\n```", "So.\n\n### outlo
 
 @pytest.mark.parametrize("text", OPEN)
 def test_an_answer_that_would_swallow_another_is_refused(text):
-    """Code and comments that are left open run on; closed, they are part of the answer."""
+    """Unclosed code and comments would run on; closed ones are part of the answer."""
     with pytest.raises(SubmissionError, match="close every"):
         with_answer(NOTES, "friction-2", text)
     for closed in ("```\n# code\n```", "So <!-- why --> it is.", "### In detail\n\nMore."):
         assert written_answer(with_answer(NOTES, "friction-2", closed), "friction-2") == closed
-    with pytest.raises(SubmissionError, match="close every"):  # it would stand in the open code
+    with pytest.raises(SubmissionError, match="close every"):  # it would be inside the open code
         with_answer("## zeta_b\n\n```\ncode", "level", "So.")
     with pytest.raises(SubmissionError, match="close every"):  # the next one would
         with_answer(NOTES, "level", "So.\n```")
@@ -79,7 +79,7 @@ WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C"]), max_size
 
 @given(st.lists(WORDS, max_size=6), WORDS.filter(str.strip), st.integers(0, 6))
 def test_what_is_written_is_what_the_report_shows(lines, answer, at):
-    """Whatever stands around it, an answer without headings comes back from the notes."""
+    """Whatever surrounds it, an answer without headings is read back unchanged."""
     notes = "\n\n".join([*lines[:at], "## zeta_b", *lines[at:]])
     try:
         new = with_answer(notes, "level", answer)

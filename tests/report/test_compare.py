@@ -1,4 +1,4 @@
-"""Two drafts side by side: what moved, and which checks fail now."""
+"""Two drafts side by side: the numbers that moved, and the checks that fail now."""
 
 import json
 from dataclasses import replace
@@ -40,7 +40,7 @@ def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
 
 
 def test_a_draft_does_not_differ_from_itself():
-    """The same analysis, written and read, has no changes at all."""
+    """The same analysis, written and read back, has no changes."""
     analysis = make_analysis(3)
     changes = compare_drafts(draft_of(analysis), analysis)
     assert not changes.numbers
@@ -75,7 +75,7 @@ def test_a_number_that_moved_is_told_in_combined_standard_errors():
 
 
 def test_checks_that_fail_now_are_named():
-    """A check that failed before, or passes now, is no news; one that fails now is."""
+    """A check that failed before, or passes now, is not listed; one that fails now is."""
     analysis = make_analysis(2)
     passing = tuple(replace(check, outcome="pass") for check in analysis.checks)
     first, *others = passing
@@ -89,7 +89,7 @@ def test_checks_that_fail_now_are_named():
 
 
 def test_the_report_has_a_section_on_the_changes():
-    """It has both values; without an earlier draft there is none."""
+    """It has both values; without an earlier draft there is no such section."""
     before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
     changes = compare_drafts(draft_of(before), after)
     blocks = change_blocks(Page(after), changes)
@@ -110,7 +110,7 @@ def test_the_report_has_a_section_on_the_changes():
     ],
 )
 def test_what_is_no_results_json_is_refused_in_one_line(tmp_path, text, expected):
-    """Anything but a results file of cartlab is named, with what is wrong in it."""
+    """Anything but a results file of cartlab is named, with its fault."""
     path = tmp_path / "results.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"results\.json: ") as error:
@@ -136,7 +136,7 @@ def test_other_benches_are_not_compared():
     [("carts", 3), ("units", {"position": "mm", "input": "V"})],
 )
 def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
-    """The units and carts stand in submission.toml: nobody waits for an analysis to hear it."""
+    """Units and carts are in submission.toml, so the refusal needs no analysis."""
 
     def analysed_after_all(*_, **__):
         pytest.fail("the analysis ran")
@@ -154,7 +154,7 @@ def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkey
 
 
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
-    """`--compare` with a results.json whose gain was edited says so, in the page and on stderr."""
+    """`--compare` with an edited gain reports it on the page and on stderr."""
     earlier = json.loads(json_text(analysed("one-cart")))
     earlier["parameters"][0]["final"] *= 0.9
     path = tmp_path / "earlier.json"

@@ -36,7 +36,7 @@ def test_json_is_for_programs():
 
 
 def test_a_wrong_name_is_one_line_with_the_nearest():
-    """A misspelt effect ends with status 2 and the name that was meant."""
+    """A misspelt effect ends with status 2 and the nearest name."""
     done = cartlab_here("effects", "back_lash")
 
     assert (done.returncode, done.stdout) == (2, "")
@@ -65,7 +65,7 @@ PICTURED = [*FIRST.values(), find_effect("sensor_gain")]
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """The gallery of a few effects."""
+    """A page with a few effects."""
     out = tmp_path_factory.mktemp("gallery")
     render_effects(PICTURED, out)
     return out

@@ -1,4 +1,4 @@
-"""The diary of an exploration: what each turn says, and how its explanations are told apart."""
+"""The diary of an exploration: its turns, and how it marks their explanations."""
 
 import json
 import re
@@ -36,7 +36,7 @@ def make_turn(*weights: float) -> Turn:
 
 
 def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tmp_path):
-    """One that the criterion gives next to nothing has under 1 %; of one alone none is told."""
+    """One far behind by the criterion has under 1 %; a single one has no weight."""
     turns = [make_turn(1e-7, 1.0), make_turn(1.0)]
     page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")
     page = page.replace("\u00a0", " ")
@@ -45,7 +45,7 @@ def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tm
 
 
 def test_effects_are_called_what_they_are_called_elsewhere():
-    """Names of people keep their capitals, and what is on a cart is not on it twice."""
+    """Names of people keep their capitals, and the cart is named once."""
     chain = PRESETS["throne-1dof"]
     mass, friction = (
         EffectTerm(effect=effect, place=1, values=tuple(1.0 for _ in effect.names))

@@ -1,4 +1,4 @@
-"""Figures: what is drawn, at which ticks, and that the same data give the same bytes."""
+"""Figures: their content and ticks, and the same bytes from the same data."""
 
 import subprocess
 import sys
@@ -74,12 +74,12 @@ def test_a_figure_is_well_formed_and_says_what_it_shows():
 
 
 def test_the_same_data_give_the_same_bytes():
-    """Neither a date, nor a random id, nor the order of drawing gets in."""
+    """No date, random id or order of drawing changes a byte."""
     assert bode_svg() == bode_svg()
 
 
 def test_every_dwell_is_drawn_as_a_diamond():
-    """Three panels of 24 measured points each, and the one in the legend."""
+    """Three panels of 24 measured points each, and one in the legend."""
     root = ElementTree.fromstring(bode_svg())
     marks = [use for use in root.iter(f"{SVG}use")]
     assert len(marks) == 3 * 24 + 1
@@ -102,7 +102,7 @@ def test_measured_phase_lies_on_the_branch_of_the_fit():
 
 
 def test_a_peak_without_end_does_not_hide_the_measurement():
-    """The curve of carts without damping is cut above what was measured."""
+    """The curve of undamped carts is cut above the measured points."""
     chain = Chain(m=np.array([1.0]), c=np.zeros(1), k=np.array([4.0, 0.0]))
     omega = np.array([0.5, 1.0, 3.0, 4.0])
     magnitude = np.abs(chain.frequency_response(omega)[0])
@@ -122,7 +122,7 @@ def test_a_peak_without_end_does_not_hide_the_measurement():
 
 
 def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
-    """The axis of an input without a model's line reaches as far as its samples."""
+    """The axis of an input without a model's line covers its samples."""
     with drawing():
         _, (ax,) = panels(1.0)
         plot_points(ax, np.linspace(0, 1, 5), np.array([-4.0, 0, 3, 0, 0]))
@@ -157,7 +157,7 @@ def test_an_unstable_model_does_not_hide_the_measurement():
 
 
 def test_a_zero_in_a_table_of_ratios_is_left_out():
-    """A logarithmic axis has no place for zero; the other points are drawn."""
+    """A logarithmic axis cannot show zero; the other points are drawn."""
     (response,) = make_analysis(1).frequency_responses
     magnitude = response.magnitude.copy()
     magnitude[3] = 0.0
@@ -187,7 +187,7 @@ def test_a_dwell_shades_the_transient():
 
 @given(st.integers(10, 3000), st.integers(0, 2**32 - 1))
 def test_thinning_keeps_the_envelope(n, seed):
-    """The largest and smallest value stay, times ascend, and few points are left."""
+    """The largest and smallest value stay, times ascend, and few points remain."""
     rng = np.random.default_rng(seed)
     t, y = np.sort(rng.uniform(0, 1, n)), rng.normal(size=n)
     thin_t, thin_y = thin(t, y)
@@ -232,7 +232,7 @@ def test_the_user_s_own_settings_do_not_matter(monkeypatch):
 
 
 def test_the_report_imports_only_what_it_needs():
-    """No pyplot, no pandas, no control: they would cost a second before the first number."""
+    """No pyplot, pandas or control: they would cost a second before the first number."""
     code = (
         "import sys, pipeline.report.render.write; "
         "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
@@ -318,7 +318,7 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
 
 
 def test_every_series_carries_all_its_data():
-    """A page gets what was measured whole, however few points are drawn; files and print do not."""
+    """A page gets all measured points, however few are drawn; files and print do not."""
     rng = np.random.default_rng(3)
     t = np.linspace(0.0, 9.0, 5001)
     y = rng.normal(size=t.size)
@@ -346,7 +346,7 @@ def unpacked(text: str) -> np.ndarray:
 
 
 def test_repeats_stand_on_one_time_axis():
-    """Small multiples share time; a panel is titled once, the axis below each column."""
+    """Small multiples share time; each panel has one title, each column one axis."""
     with drawing():
         figure, axes = small_multiples(list("abcde"), height=1.0, share_y=True)
         axes[0].set_xlim(0, 3)
@@ -358,7 +358,7 @@ def test_repeats_stand_on_one_time_axis():
 
 
 def test_phases_are_read_against_right_angles():
-    """Ticks of a phase that turns by more than a right angle are multiples of 90 degrees."""
+    """A phase that turns by more than a right angle has ticks at multiples of 90 degrees."""
     response = make_analysis(2).frequency_responses[1]
     figure, (ax,) = panels(1.0)
     with drawing():
@@ -370,7 +370,7 @@ def test_phases_are_read_against_right_angles():
 
 
 def test_labels_of_a_phase_that_turns_far_do_not_touch():
-    """Of six right angles or more every second one is labelled, of four all are."""
+    """With six right angles or more every second one is labelled, with four all are."""
     for least, step in ((-360.0, 90.0), (-540.0, 180.0)):
         response = make_analysis(2).frequency_responses[1]
         phase = np.radians(np.linspace(0.0, least, response.omega.size))
@@ -384,7 +384,7 @@ def test_labels_of_a_phase_that_turns_far_do_not_touch():
 
 
 def test_carts_of_a_step_are_told_apart_without_colour():
-    """Each has a mark of its own, in the panel, in the legend and in the caption."""
+    """Each has its own mark, in the panel, in the legend and in the caption."""
     analysis = make_analysis(3)
     run = analysis.step_gains[0].experiment
     gains = [gain for gain in analysis.step_gains if gain.experiment == run]
@@ -400,7 +400,7 @@ def test_carts_of_a_step_are_told_apart_without_colour():
 
 @pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])
 def test_submissions_are_counted_in_whole_numbers(points):
-    """No axis of a histogram speaks of half a submission."""
+    """No axis of a histogram has half a submission."""
     with drawing():
         figure = distribution_figure(points, out_of=10.0)
         to_svg(figure, name="x", alt="")
@@ -411,7 +411,7 @@ def test_submissions_are_counted_in_whole_numbers(points):
 
 
 def test_long_titles_lose_what_they_share():
-    """Of long names with one beginning the rest is shown, where the difference is."""
+    """Long names with a common beginning are shortened to their differing end."""
     names = [f"DOF1_en1_input1_trial_of_monday_{i}" for i in range(6)]
     with drawing():
         _, axes = small_multiples(names, height=1.0, share_y=True)

@@ -90,7 +90,7 @@ RESIDUAL = Residual(
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
-    """Return what the workflow could find on the two-cart bench; the first cart's runs drawn."""
+    """Return a possible gap of the two-cart bench, with the first cart's runs drawn."""
     terms: list[EffectTerm] = []
     for key in keys:
         effect = find_effect(key)
@@ -188,7 +188,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
 
 
 def two_cart_analysis():
-    """Return an analysis whose records are those of the gaps made by hand."""
+    """Return an analysis whose records belong to those gaps."""
     analysis = make_analysis(2)
     step = next(record for record in analysis.records if record.id == "step-a")
     return replace(analysis, records=(step, replace(step, id="step-b")))
@@ -209,7 +209,7 @@ def test_a_name_stands_on_top_with_its_numbers():
 
 
 def test_each_size_has_its_cart_and_each_sentence_is_said_once():
-    """Dry friction on both carts: which force is whose, and what dry friction is."""
+    """Dry friction on both carts: which force belongs to which, and what dry friction is."""
     gap = make_gap()
     (one,) = gap.effects
     said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
@@ -220,7 +220,7 @@ def test_each_size_has_its_cart_and_each_sentence_is_said_once():
 
 
 def test_a_stretch_without_a_phase_is_told_in_words():
-    """No phase of the motion stands out: the sentence and the table say so."""
+    """If no phase of the motion stands out, the sentence and the table say so."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     (window,) = gap.left
     text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
@@ -230,7 +230,7 @@ def test_a_stretch_without_a_phase_is_told_in_words():
 
 
 def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
-    """No model is asked to be closer to a run than the next repeat of it."""
+    """A model need not be closer to a run than the next repeat of it."""
     gap = replace(make_gap(), repeatability=0.035)
     text = page_of(gap).text
 
@@ -238,7 +238,7 @@ def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
 
 
 def test_suspects_are_listed_as_such():
-    """Verdict unexplained: no name, and who is suspected with what each would leave."""
+    """Verdict unexplained: no name, but the suspects, with the error that each would leave."""
     suspect = Rival(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
     gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
     text = page_of(gap).text
@@ -248,7 +248,7 @@ def test_suspects_are_listed_as_such():
 
 
 def test_nothing_to_name_is_said():
-    """Verdict none: no effects, no equations, and the reader is told that none is needed."""
+    """Verdict none: no effects, no equations, and a sentence that no effect is needed."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031)
     text = page_of(gap).text
 
@@ -258,7 +258,7 @@ def test_nothing_to_name_is_said():
 
 
 def test_the_page_of_none_speaks_of_no_effects():
-    """Verdict none: one model is drawn and named; the result, what it covers, what comes next."""
+    """Verdict none: one model is drawn; the result, what it covers, what comes next."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
     page = page_of(gap)
 
@@ -275,14 +275,17 @@ def test_the_page_of_none_speaks_of_no_effects():
     assert "Error of every run beside its noise" in page.text
     assert "cart 1 up to" in page.text
     assert "the input up to 0.0500 V" in page.text
-    # Of the noise's 3 %: the root of 1.15 - 1, which is where a search begins.
+    # Of the noise's 3 %: the root of 1.15 - 1, where a search begins.
     assert "by more than about 1.2 % of their motion" in page.text
     assert page.text.index("What to do next") < page.text.rindex("Error of every run")
     assert "What to do next." in terminal_verdict(gap)
 
 
 def test_what_no_effect_explains_is_drawn_without_effects():
-    """Verdict unexplained: one model where nothing is suspected; else the suspects', called so."""
+    """Verdict unexplained:
+
+    one model without suspects; else that of the suspects, marked as such.
+    """
     alone = make_gap("unexplained", ())
     assert "with the effects" not in html_of(alone)
     assert "With no effect" not in page_of(alone).text
@@ -294,7 +297,7 @@ def test_what_no_effect_explains_is_drawn_without_effects():
 
 
 def test_two_explanations_are_neither_right_nor_wrong():
-    """Verdict ambiguous: the error that both leave is marked neither as good nor as bad."""
+    """Verdict ambiguous: the remaining error is marked neither as good nor as bad."""
     assert tones(make_gap("ambiguous")) == ["", "", ""]
     assert (
         "One explanation: dry (Coulomb) friction on cart 2" in page_of(make_gap("ambiguous")).text
@@ -304,7 +307,7 @@ def test_two_explanations_are_neither_right_nor_wrong():
 
 
 def html_of(gap: Gap) -> str:
-    """Return the page of a gap report, its figures' own texts in it."""
+    """Return the page of a gap report, with the texts of its figures."""
     return render_html(build_gap_document(gap, two_cart_analysis()))
 
 
@@ -314,7 +317,7 @@ def tones(gap: Gap) -> list[str]:
 
 
 def test_two_explanations_are_both_told():
-    """Verdict ambiguous: both are described, and what would tell them apart."""
+    """Verdict ambiguous: both are described, and the experiment that would decide."""
     text = page_of(make_gap("ambiguous")).text
 
     assert "Dry (Coulomb) friction on cart 2, or quadratic drag on cart 2" in text
@@ -326,7 +329,7 @@ def test_two_explanations_are_both_told():
 
 @pytest.mark.parametrize("keys", [(), ("coulomb_friction",)])
 def test_what_stays_unexplained_has_suspects_only(keys):
-    """Verdict unexplained: suspects, if any, are called so; nothing is said to explain."""
+    """Verdict unexplained: the suspects, if any, are marked as such and explain nothing."""
     text = page_of(make_gap("unexplained", keys)).text
 
     assert "nothing in the catalogue explains" in text
@@ -348,7 +351,7 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained"])
 def test_the_force_left_has_a_picture_and_its_formula(verdict):
-    """What no effect explains is drawn cart by cart, with a formula that is no effect's."""
+    """The unexplained force is drawn for each cart, with a formula that is not an effect."""
     page = page_of(make_gap(verdict))
 
     assert "What force is left" in page.text
@@ -361,7 +364,7 @@ def test_the_force_left_has_a_picture_and_its_formula(verdict):
 
 
 def test_an_answer_so_far_is_said_to_be_one():
-    """What the time allowed has ended is told on top, and no page promises it again."""
+    """A search cut short by its budget says so at the top, and no page promises it again."""
     text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
 
     assert "best answer so far" in text
@@ -371,7 +374,7 @@ def test_an_answer_so_far_is_said_to_be_one():
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_page(effect):
-    """Any effect of the catalogue gets a figure, a typeset law and its entry's texts."""
+    """Any effect of the catalogue has a figure, a typeset law and its entry's texts."""
     page = page_of(make_gap("named", (effect.key,)))
 
     assert effect.fingerprint in page.text
@@ -396,7 +399,7 @@ def test_two_effects_share_the_equations():
 
 
 def test_a_spring_pulls_both_its_carts():
-    """The extra force of spring 2 acts on cart 2 and, the other way, on cart 1."""
+    """The extra force of spring 2 acts on cart 2 and, reversed, on cart 1."""
     terms = (
         make_term(find_effect("cubic_spring"), place=2, values={"coefficient": 1.0}, chain=CHAIN),
     )
@@ -408,7 +411,7 @@ def test_a_spring_pulls_both_its_carts():
 
 
 def test_pdf_and_files_are_the_same_each_time(tmp_path):
-    """Two renderings are equal byte for byte, and the PDF has the verdict on its first page."""
+    """Two renderings are equal byte for byte; the PDF's first page has the verdict."""
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         render_gap(make_gap(), two_cart_analysis(), tmp_path / name)
@@ -425,7 +428,7 @@ def test_pdf_and_files_are_the_same_each_time(tmp_path):
 
 
 def test_residual_force_of_a_constant_force_is_that_force():
-    """A constant push on cart 2 shows as such, whatever the carts do."""
+    """A constant push on cart 2 is found, whatever the carts do."""
     pushed = make_term(find_effect("force_offset"), place=2, values={"force": 0.004}, chain=CHAIN)
     model = AugmentedChain(chain=CHAIN, terms=(pushed,))
     x = simulate_augmented(model, T, U)
@@ -447,7 +450,7 @@ def test_residual_force_of_a_constant_force_is_that_force():
 
 
 def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
-    """The neighbour's spring force is not known, so nothing is made up."""
+    """The neighbour's spring force is unknown, so there is no estimate."""
     gap = make_gap()
     alone = replace(gap, traces=tuple(t for t in gap.traces if t.cart == 1))
 
@@ -460,7 +463,7 @@ def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
 
 @pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_the_file_is_read_back_as_it_was(verdict):
-    """What is read from `gap.json` writes the same file again, and tells the same verdict."""
+    """A `gap.json` that is read and written again is the same, with the same verdict."""
     keys = () if verdict == "none" else ("end_stop", "input_delay")
     gap = make_gap(verdict, keys)
     text = json_text(gap)
@@ -486,7 +489,7 @@ def test_the_file_is_read_back_as_it_was(verdict):
     ],
 )
 def test_what_is_no_gap_file_is_refused_in_one_line(text):
-    """Broken or foreign JSON is one error, never a traceback."""
+    """Broken or foreign JSON gives one error, never a traceback."""
     with pytest.raises(ConfigError, match=r"cartlab gap|cartlab-gap/1"):
         read_gap(text)
 
@@ -523,7 +526,7 @@ def bench(tmp_path_factory):
 
 
 def test_command_writes_everything_and_names_the_friction(bench):
-    """Exit status 0, the files, JSON on stdout, and the friction that was put in."""
+    """Exit status 0, the files, JSON on stdout, and the friction that was hidden."""
     assert bench.done.returncode == 0, bench.done.stderr
     out = bench.folder / "gap"
     text = (out / "gap.json").read_text(encoding="utf-8")
@@ -548,7 +551,7 @@ def test_command_writes_everything_and_names_the_friction(bench):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_report_shows_the_verdict_and_the_better_simulation(bench):
-    """Beside a gap analysis of its data, the report tells it and simulates with the effects."""
+    """With a gap analysis of its data, the report quotes it and simulates with the effects."""
     analysis, gap = with_gap(analyse(load_submission(bench.folder)), bench.folder)
     assert gap is not None
     assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
@@ -568,7 +571,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
 
 
 def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
-    """One changed byte in the data: the verdict is not shown, and the reader is told why."""
+    """After one changed byte in the data the verdict is not shown, and the report says why."""
     analysis = analyse(load_submission(bench.folder))
     changed = replace(analysis, files=analysis.files | {"data/step-a.csv": "0" * 64})
 
@@ -583,7 +586,7 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
 
 
 def test_hostile_words_in_a_gap_file_stay_words(bench):
-    """Texts of a `gap.json` that somebody wrote are shown, never obeyed."""
+    """Texts of a foreign `gap.json` are shown as text."""
     analysis = analyse(load_submission(bench.folder))
     text = (bench.folder / "gap" / "gap.json").read_text(encoding="utf-8")
     document = json.loads(text) | {"next_experiment": HOSTILE}
@@ -605,7 +608,7 @@ def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
 
 
 def test_every_law_in_a_report_has_a_reading():
-    """Formulas carry their reading in words for those who cannot see them."""
+    """Formulas have a text alternative for readers who cannot see them."""
     document = build_gap_document(make_gap("named", ("extra_mode",)), two_cart_analysis())
     formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]
 

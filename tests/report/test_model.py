@@ -1,4 +1,4 @@
-"""The model's formulas are evaluated and compared with the chain they stand for."""
+"""The model's formulas are evaluated and compared with their chain."""
 
 from math import prod
 from xml.etree import ElementTree
@@ -26,7 +26,7 @@ FOUR = Chain(
 
 
 def evaluate(term: Term, values: dict[str, complex]) -> complex:
-    """Return what a formula says: side by side is a product, a missing name an error."""
+    """Return the value of a formula: side by side is a product, a missing name is an error."""
     if isinstance(term, str):
         return complex(values[term] if term in values else float(term))
     parts = term.parts
@@ -58,7 +58,7 @@ def kinds(term: Term, kind: str) -> list[Math]:
 
 
 def physical_values(chain: Chain) -> dict[str, complex]:
-    """Return m_1, c_1, k_1 … as the formulas call them; a lone cart's have no index."""
+    """Return m_1, c_1, k_1 … as the formulas name them; those of a single cart have no index."""
     if chain.n == 1:
         return {"m": chain.m[0], "c": chain.c[0], "k": chain.k.sum()}
     named = {"m": chain.m, "c": chain.c, "k": chain.k}
@@ -89,7 +89,7 @@ def test_symbolic_matrices_are_those_of_the_chain(chain):
 
 @pytest.mark.parametrize("chain", CHAINS[:3], ids=lambda chain: f"{chain.n}-carts")
 def test_symbolic_transfer_functions_are_those_of_the_chain(chain):
-    """With the named parameters put in, each line gives that cart's response at any s."""
+    """With the named parameters inserted, each line gives that cart's response at any s."""
     formula = symbolic_transfer_functions(springs_of(chain))
     assert formula is not None
     names = {"zeta": "ζ", "omega": "ω", "K": "K"}
@@ -130,7 +130,7 @@ def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
 
 
 def test_a_missing_spring_is_not_in_the_equations():
-    """No k_1 where no spring ties cart 1 to the wall; one sum for a lone cart's springs."""
+    """No k_1 without a spring from cart 1 to the wall; one sum for a single cart's springs."""
     assert "k_1" not in to_text(equations_of_motion((False, True, True)).math)
     assert "k_1" in to_text(equations_of_motion((True, True, True)).math)
     assert to_text(equations_of_motion((True, True)).math) == "mx″_1 + cx′_1 + kx_1 = u"
@@ -138,7 +138,7 @@ def test_a_missing_spring_is_not_in_the_equations():
 
 
 def test_a_chain_without_walls_is_shown_as_polynomials():
-    """No static gain, so no factors of the paper's form: a ratio of polynomials instead."""
+    """Without a static gain there are no factors as in the paper, but a ratio of polynomials."""
     rigid = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     text = to_text(numeric_transfer_functions(rigid).math)
     assert text == "(X_1(s))/(U(s)) = (5000)/(s^2 + 2.500s)"

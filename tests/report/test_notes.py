@@ -97,7 +97,7 @@ def test_hostile_markdown_stays_text(markdown):
 
 
 def test_web_and_mail_links_stay():
-    """A plain link keeps its address, marked so that it passes nothing on."""
+    """A plain link keeps its address, marked so that it passes no information on."""
     (block,) = note_blocks("[paper](https://example.org/a?b=1&c=2) <mailto:a@example.org>")
     assert isinstance(block, Paragraph)
     assert [span.url for span in block.text if span.url] == [
@@ -115,7 +115,7 @@ def test_control_characters_are_replaced():
 
 @given(st.text(alphabet=st.sampled_from("ab<>&\"'`*_[]()!#-|\n \\$:/h1.{}%~+="), max_size=80))
 def test_any_text_gives_a_page_without_foreign_tags(markdown):
-    """Whatever is written, the page's tags are those of its template."""
+    """Whatever is written, the page has only the tags of its template."""
     html = page(note_blocks(markdown)).split("<main>")[1].split("<script>")[0]
     names = set(re.findall(r"<\s*/?\s*([a-zA-Z][\w-]*)", html))
     ours = "section h2 h3 h4 h5 h6 p ul ol li em strong code pre blockquote a div table thead tbody"
@@ -125,14 +125,14 @@ def test_any_text_gives_a_page_without_foreign_tags(markdown):
 @settings(max_examples=20)
 @given(st.text(alphabet=st.sampled_from("ab#->*1._`|\n "), max_size=60))
 def test_any_notes_give_an_accessible_pdf(markdown):
-    """Whatever headings, lists and tables there are, the outline has no gap: PDF/UA is kept."""
+    """Whatever headings, lists and tables there are, the outline has no gap, as PDF/UA demands."""
     blocks = even_headings(note_blocks(markdown))
 
     assert render_pdf(document_of(blocks)).startswith(b"%PDF")
 
 
 def test_headings_go_down_one_level_at_a_time():
-    """A heading that skips levels is raised to the next one; those beside it stay beside it."""
+    """A heading that skips levels is raised; headings of one level stay together."""
     blocks = even_headings(note_blocks("### a\n\n###### b\n\n###### c\n\n# d\n\n## e"))
 
     levels = [block.level for block in blocks if isinstance(block, Heading)]
@@ -141,7 +141,7 @@ def test_headings_go_down_one_level_at_a_time():
 
 @pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])
 def test_deep_nesting_is_set_flat(nest):
-    """However deep a quotation or list is nested, both the page and the PDF can be made."""
+    """However deep a quotation or list is nested, page and PDF can be made."""
     blocks = note_blocks(f"{nest}deep")
     assert "deep" in str(blocks)
     assert str(blocks).count("kind='quote'") <= 6
@@ -149,5 +149,5 @@ def test_deep_nesting_is_set_flat(nest):
 
 @pytest.mark.parametrize("nest", ["> " * 3000, "*" * 5000 + "x" + "*" * 5000, "[" * 3000])
 def test_nesting_beyond_sense_is_survived(nest):
-    """What only a machine would write does not end in a crash."""
+    """Notes that only a machine would write do not cause a crash."""
     assert isinstance(note_blocks(nest), tuple)

@@ -1,4 +1,4 @@
-"""The page of plots: what it holds is what was measured and simulated, in few bytes."""
+"""The page of plots holds what was measured and simulated, in few bytes."""
 
 import json
 import re
@@ -33,7 +33,7 @@ def unpacked(packed: list[Any]) -> Array:
 
 
 def data_of(page: str) -> dict[str, Any]:
-    """Return what a page holds."""
+    """Return the data of a page."""
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.DOTALL)
     assert found
     return json.loads(found[1])
@@ -46,7 +46,7 @@ def page_of(analysis: Analysis) -> str:
 
 @pytest.fixture(scope="module")
 def runs() -> tuple[ComparedRun, ...]:
-    """All of the shipped two-cart submission."""
+    """All runs of the shipped two-cart submission."""
     return compare_runs(analysed("two-cart"), gap=None, progress=silent)
 
 
@@ -79,7 +79,7 @@ def test_the_loop_is_as_the_report_has_it(runs):
 
 
 def test_a_page_holds_what_was_measured_and_simulated(runs):
-    """Each number to half a level of sixteen bits, a model by what it leaves."""
+    """Each number to half a level of sixteen bits; a model by its residual."""
     for run in runs:
         packed = pack_run(run)
         for cart, held in zip(run.carts, packed["carts"], strict=True):
@@ -97,7 +97,7 @@ def test_a_page_holds_what_was_measured_and_simulated(runs):
 
 
 def test_a_decay_is_simulated_from_its_release(runs):
-    """Before the hand lets go there is no model, behind it the error is the noise."""
+    """Before the release there is no model; after it the error is noise."""
     for run in runs:
         if run.kind == "decay":
             (cart,) = run.carts
@@ -114,7 +114,7 @@ def test_a_decay_is_simulated_from_its_release(runs):
 
 
 def test_thinning_keeps_every_peak():
-    """A single sample far off stays, and two thousand points or more of each line."""
+    """A single outlying sample stays, and each line has two thousand points or more."""
     t = np.linspace(0.0, 60.0, 36_000)
     y, residual = np.sin(t), np.full(t.size, np.nan)
     y[17_321], residual[20_000:] = 5.0, 0.0
@@ -138,7 +138,7 @@ def test_numbers_that_are_none_or_all_the_same_survive():
 
 
 def test_a_sine_has_its_amplitude_in_the_spectrum():
-    """At its frequency, on a grid with jitter too, and behind the thinning."""
+    """At its frequency, also on a jittered grid, and after thinning."""
     rng = np.random.default_rng(4)
     t = 0.002 * np.arange(8_000, dtype=np.float64)
     t[1:-1] += rng.uniform(-2e-5, 2e-5, t.size - 2)
@@ -175,7 +175,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
 
 
 def test_what_a_stranger_wrote_is_text():
-    """Titles, ids and units end no element and run no script."""
+    """Titles, ids and units close no element and run no script."""
     analysis = make_analysis(2)
     hostile = '</script><script>alert(1)</script><!--"&\x00\u2028'
     records = tuple(replace(r, id=f"{r.id}{hostile}") for r in analysis.records)
@@ -191,7 +191,7 @@ def test_what_a_stranger_wrote_is_text():
 
 
 def test_without_carts_the_measured_motion_is_there():
-    """A bench that was not identified has no model, and every run says so."""
+    """An unidentified bench has no model, and every run says so."""
     page = page_of(replace(make_analysis(1), fit=None, hardware=()))
 
     runs = data_of(page)["runs"]

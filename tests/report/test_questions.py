@@ -1,4 +1,4 @@
-"""The report asks what this data raises, and sets each answer beside its question."""
+"""The report asks questions that this data raises, and shows each answer beside its question."""
 
 import re
 from dataclasses import replace
@@ -64,7 +64,7 @@ def off(name: str, percent: float, **initial) -> Analysis:
 
 
 def test_nothing_is_asked_where_all_is_well():
-    """Data that agree throughout raise no question, and the report has no place for one."""
+    """Consistent data raise no question, and the report has no section for them."""
     analysis = well()
     assert ask(analysis) == ()
     assert questions_of(analysis) == []
@@ -72,7 +72,7 @@ def test_nothing_is_asked_where_all_is_well():
 
 
 def test_a_damping_that_changed_asks_for_the_amplitudes():
-    """The change and both methods are named as they are in the table."""
+    """The change and both methods have the names of the table."""
     (question,) = ask(off("zeta_b", 65.0))
     assert (question.id, question.section) == ("zeta_b", "parameters")
     assert question.text.startswith(
@@ -86,14 +86,14 @@ def test_a_damping_that_changed_asks_for_the_amplitudes():
     [("K_1", "stops short of where its springs"), ("omega_1", "which masses and which springs")],
 )
 def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
-    """A gain asks for sticking, a frequency for what was free to move."""
+    """A gain asks about sticking, a frequency about the carts that were free."""
     (question,) = ask(off(name, 40.0))
     assert question.id == name
     assert expected in question.text
 
 
 def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
-    """A damping assumed three times too large: its peak is sharper; one too small: flatter."""
+    """A damping assumed three times too large: its peak is sharper; too small: flatter."""
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
     assert "is sharper than that" in question.text
@@ -104,7 +104,7 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
 
 
 def test_points_are_not_asked_for_where_the_fit_had_none():
-    """A guess that a fit in time moved: no point of a Bode plot shows it."""
+    """After a fit in time no point of a Bode plot shows it."""
     analysis = off("zeta_a", 148.0, source="assumed")
     rows = tuple(
         replace(row, final=row.final and replace(row.final, source="time_fit"))
@@ -134,7 +134,7 @@ def test_bench_against_model_asks_level_overshoot_and_shape_apart():
 
 
 def test_a_cart_that_sticks_is_asked_about_with_its_interval():
-    """The two ends of the gain's interval stand in the question."""
+    """The question has both ends of the gain's interval."""
     analysis = well()
     stuck = replace(analysis.step_gains[0], interval=(23.1, 26.4))
     assert isinstance(stuck, StepGain)
@@ -160,7 +160,7 @@ def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
 
 
 def questions_of(analysis: Analysis) -> list[tuple[str, Question]]:
-    """Return the questions that a report would have, each with the section it stands in."""
+    """Return the questions of a report, each with its section."""
     asked = ask(analysis)
     answers, _ = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     sections = [Section(id=id_, title=id_, blocks=()) for id_ in SECTIONS]
@@ -194,7 +194,7 @@ Oil it.
 
 
 def test_an_answer_stands_beside_its_question():
-    """It is in the question's section; the rest stays the discussion."""
+    """It is in the question's section; other notes stay in the discussion."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
     ((section, question),) = questions_of(analysis)
     assert section == "parameters"
@@ -208,7 +208,7 @@ def test_an_answer_stands_beside_its_question():
     "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
 )
 def test_any_spelling_of_an_id_will_do(heading):
-    """The answer is out of the discussion, and nothing is left to answer."""
+    """The answer leaves the discussion, and no question stays open."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
     answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
     assert {name: len(blocks) for name, blocks in answers.items()} == {"zeta_b": 4}
@@ -218,14 +218,14 @@ def test_any_spelling_of_an_id_will_do(heading):
 
 
 def test_an_answer_to_nothing_that_is_asked_stays_in_the_discussion():
-    """Notes lose no word when new data no longer raise the question."""
+    """No note is lost when new data no longer raise its question."""
     analysis = replace(well(), discussion=NOTES.format(heading="zeta_b"))
     _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
     assert len(rest) == len(discussion_blocks(analysis.discussion or ""))
 
 
 def test_an_empty_heading_is_no_answer():
-    """A heading with nothing under it leaves the marked place."""
+    """A heading with nothing below it keeps the placeholder."""
     analysis = replace(off("zeta_b", 65.0), discussion="## zeta_b\n\n## Rest\n\nText.\n")
     ((_, question),) = questions_of(analysis)
     assert question.answer == ()
@@ -233,7 +233,7 @@ def test_an_empty_heading_is_no_answer():
 
 
 def test_page_and_print_mark_the_place_and_show_the_answer():
-    """Unanswered, both say under which heading to write; answered, both show the words, inert."""
+    """Unanswered, both name the heading to write under; answered, both show the text, inert."""
     analysis = off("zeta_b", 65.0)
     pages, prints = {}, {}
     for name, discussion in (("open", None), ("done", "## zeta_b\n\n<b>Ours</b> & *more*\n")):
@@ -256,7 +256,7 @@ def test_page_and_print_mark_the_place_and_show_the_answer():
 
 @pytest.mark.parametrize("answered", [False, True])
 def test_a_question_is_printed_with_what_answers_it(answered):
-    """Wherever on a page it comes to stand."""
+    """Wherever the page breaks."""
     answer = (paragraph("Our answer. " + "It sticks. " * 40),) if answered else ()
     question = Question(id="q", text=spans("Why so? " * 30), answer=answer)
     line = paragraph("A line.")
@@ -271,7 +271,7 @@ def test_a_question_is_printed_with_what_answers_it(answered):
 
 
 def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
-    """The template's own example is a comment: it answers nothing and is in no report."""
+    """The template's example is a comment: it answers nothing and is in no report."""
     new_submission(tmp_path / "team", carts=2)
     notes = tmp_path / "team" / "notes.md"
     assert "## zeta_b" in notes.read_text(encoding="utf-8")
@@ -285,7 +285,7 @@ def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
 
 
 def test_the_three_cart_example_answers_what_it_is_asked():
-    """The shipped example's one question is answered in its notes."""
+    """The one question of the shipped example is answered in its notes."""
     analysis = analysed("three-cart")
     ((section, question),) = questions_of(analysis)
     assert (section, question.id) == ("frequency-response", "zeta_a")
@@ -293,7 +293,7 @@ def test_the_three_cart_example_answers_what_it_is_asked():
 
 
 def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
-    """The real two-cart data ask about dampings, dry friction and the bench, six at most."""
+    """The real two-cart data raise at most six, on dampings, dry friction and the bench."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(2, 3, 4, 5))
     ids = [question.id for question in ask(analyse(load_submission(folder)))]
     assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]

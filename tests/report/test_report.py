@@ -1,4 +1,4 @@
-"""The whole report: both files complete, inert, self-contained, the same bytes each time."""
+"""The whole report: both files complete, inert, self-contained, with the same bytes each time."""
 
 import base64
 import hashlib
@@ -32,7 +32,7 @@ VOID = {"meta", "link", "br", "img", "hr", "input"}
 
 
 class Page(HTMLParser):
-    """Collects what the tests ask of a page, and checks that tags are closed in order."""
+    """A parser that collects what the tests need, and checks that tags are closed in order."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class Page(HTMLParser):
 
 
 def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, str]:
-    """Render, and return the parsed page and the PDF's text."""
+    """Render; return the parsed page and the PDF's text."""
     render_report(analysis, out, files=Files(pdf=pdf))
     return read(out)
 
@@ -83,7 +83,7 @@ def folders(tmp_path_factory) -> dict[int, Path]:
 
 
 def read(folder: Path) -> tuple[Page, str]:
-    """Return the parsed page and the PDF's text, "" where there is no PDF."""
+    """Return the parsed page and the PDF's text, "" without a PDF."""
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
     if not (folder / "report.pdf").exists():
         return page, ""
@@ -117,7 +117,7 @@ def test_every_part_is_there(carts, folders):
 
 
 def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
-    """No figure stands before the heading it belongs to, or after the next one."""
+    """Every figure lies between the heading it belongs to and the next one."""
     html = (folders[3] / "report.html").read_text(encoding="utf-8")
     _, pdf = read(folders[3])
     marks = re.findall(r"<h2[^>]*>([^<]+)</h2>|<b>(Figure \d+)\.|<b>(Question\.)", html)
@@ -131,7 +131,7 @@ def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
 
 
 def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
-    """A long list of files is cut into parts of like length, each on one page."""
+    """A long list of files is split into similar parts, each on one page."""
     # One more than a page has room for:
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
     analysis = replace(make_analysis(1), files=files)
@@ -147,7 +147,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
 
 @pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
 def test_figures_in_a_row_fill_pages(number, tall, pages):
-    """Of 58 or 40 % of a page's height each: one more a page, a little smaller; a few as drawn."""
+    """Of 58 or 40 % of a page's height: a little smaller, one more fits; a few stay as drawn."""
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
     row = tuple(
         Picture(
@@ -159,14 +159,14 @@ def test_figures_in_a_row_fill_pages(number, tall, pages):
 
 
 def printed(*sections: Section) -> list[str]:
-    """Return the text of each page that sections are printed on."""
+    """Return the text of each page on which sections are printed."""
     document = Document("A", "", (), sections, "the footer")
     return [page.extract_text() for page in pypdf.PdfReader(io.BytesIO(render_pdf(document))).pages]
 
 
 @pytest.mark.parametrize("rows", [12, 20, 30])
 def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
-    """However few its rows: it is their height that fills the page."""
+    """Even with few rows: their height fills the page."""
     text = "Dry friction holds the cart. " * 20
     body = tuple((cell(f"row-{i:02d}"), cell(text)) for i in range(rows))
     table = Table(1, spans("All checks."), (cell("Check"), cell("Found")), body, "ll")
@@ -180,7 +180,7 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
 
 
 def test_the_list_of_files_does_not_stand_alone_on_a_page():
-    """Wherever a page ends, its heading and its sentence go with it."""
+    """Wherever a page ends, its heading and sentence move with it."""
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
     shown = Shown(replace(make_analysis(1), files=files))
     blocks = tuple(provenance_blocks(shown, "Made by the program."))
@@ -193,7 +193,7 @@ def test_the_list_of_files_does_not_stand_alone_on_a_page():
 
 
 def test_the_page_stands_alone(folders):
-    """Nothing is loaded from anywhere, nothing runs but the page's own script, says the policy."""
+    """Nothing is loaded, and the policy lets only the page's own script run."""
     page, _ = read(folders[2])
 
     (policy,) = (
@@ -214,7 +214,7 @@ def test_the_page_stands_alone(folders):
 
 
 def test_the_page_can_be_found_and_heard(folders):
-    """Every section is linked, every figure is described, every formula is mathematics."""
+    """Every section is linked, every figure described, every formula is mathematics."""
     page, _ = read(folders[3])
 
     ids = set(page.values("id"))
@@ -234,7 +234,7 @@ def test_the_page_can_be_found_and_heard(folders):
 
 
 def test_a_report_without_a_title_says_what_it_is_once():
-    """What it is about is its title then, and stands nowhere above it."""
+    """Its subject is then its title, and is not repeated above it."""
     analysis = make_analysis(2)
     named = build_document(analysis)
     bare = build_document(replace(analysis, title=" "))
@@ -287,7 +287,7 @@ HOSTILE = '#import "/etc/passwd": * $x^2$ <script>alert(1)</script> {{ 7*7 }} `#
 
 
 def test_hostile_text_stays_text(tmp_path):
-    """Markup of typst, HTML, Jinja and Markdown in every field is shown, never obeyed."""
+    """Markup of typst, HTML, Jinja and Markdown in every field is shown as text."""
     analysis = make_analysis(2)
     evil = replace(
         analysis,
@@ -314,7 +314,7 @@ def test_hostile_text_stays_text(tmp_path):
 
 
 def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
-    """Chinese and emoji show in the page; the PDF shows boxes, and both say so."""
+    """Chinese and emoji appear on the page; the PDF has boxes, and both say so."""
     said = []
     analysis = replace(make_analysis(1), authors=(("s1", "李雷 😀"), ("s2", "Žofie Ελένη Иван")))
     render_report(analysis, tmp_path, progress=said.append)
@@ -372,7 +372,7 @@ def bare(analysis: Analysis, **parts) -> Analysis:
 
 
 def test_without_anything_the_reasons_are_told(tmp_path):
-    """No data at all still gives a report, which says what could not be done and why."""
+    """No data at all still gives a report, with the reason for each missing result."""
     page, pdf = render(bare(make_analysis(2)), tmp_path)
     for text in (page.text, pdf):
         assert "No model of the chain of 2 carts could be identified" in text
@@ -382,7 +382,7 @@ def test_without_anything_the_reasons_are_told(tmp_path):
 
 
 def test_without_anything_and_without_reasons_there_is_still_a_report(tmp_path):
-    """No link leads to a section that is not there."""
+    """No link leads to a missing section."""
     page, pdf = render(bare(make_analysis(1), skipped=()), tmp_path)
     assert "No model of the single cart could be identified" in pdf
     assert {href[1:] for href in page.values("href")} <= set(page.values("id"))
@@ -417,7 +417,7 @@ def test_any_part_may_stand_alone(part, tmp_path):
 
 
 def test_a_table_of_ratios_has_no_phase(tmp_path):
-    """Without phase the Bode figure has magnitude and residual only, and the source is said."""
+    """The Bode figure has magnitude and residual only, and names its source."""
     analysis = make_analysis(1)
     (response,) = analysis.frequency_responses
     table = replace(response, phase=None, phase_std=None, source="table")
@@ -472,7 +472,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
 
 
 def test_a_poor_result_is_called_so(tmp_path):
-    """What disagrees, fails or does not converge stands in the summary, with what to do."""
+    """The summary lists disagreements, failures and unconverged fits, with what to do."""
     analysis = make_analysis(2)
     assert analysis.fit is not None
     fit = replace(analysis.fit, converged=False, message="k_1 at its bound", chi_square_per_dof=9.0)
@@ -487,7 +487,7 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "The fit that failed ended at K_1" in text
     assert "It has" not in text
     assert "more than the stated noise is left" in text
-    assert "±" in terminal_summary(analysis)  # which rests on noise alone being left
+    assert "±" in terminal_summary(analysis)  # which needs that only noise is left
     assert "±" not in text
     assert "K_1 (+23.4 %)" in text
     assert "1 of 2 checks failed" in text
@@ -496,7 +496,7 @@ def test_a_poor_result_is_called_so(tmp_path):
 
 
 def test_a_cart_that_a_step_set_swinging_was_not_let_go():
-    """Where no decay was recorded, the ring-down of a step of the cart alone stands for one."""
+    """Without a decay, the ring-down of a step of the single cart is used."""
     analysis = make_analysis(1)
     ringing = {decay.experiment for decay in analysis.log_decrements}
     records = tuple(replace(r, kind="step") if r.id in ringing else r for r in analysis.records)
@@ -511,7 +511,7 @@ def test_a_cart_that_a_step_set_swinging_was_not_let_go():
 
 
 def test_what_was_not_used_is_not_said_to_be():
-    """A record left out is no source of the model; a file that is not there is asked for."""
+    """A record left out is not a source of the model; a missing file is asked for."""
     analysis = make_analysis(2)
     dwells = [record.id for record in analysis.records if record.kind == "sine"]
     left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
@@ -536,7 +536,7 @@ def test_what_was_not_used_is_not_said_to_be():
 
 
 def test_a_file_that_cannot_be_read_asks_for_no_experiment():
-    """What is asked for is that file; only other stages that were skipped ask for more."""
+    """The summary asks for that file; only other skipped stages ask for more."""
     unread = Skipped(stage=Stage.READING, run="step-1", reason="empty")
     reason = "no closed-loop run was recorded"
     other = Skipped(stage=Stage.HARDWARE_CHECK, reason=reason, missing="a closed-loop run")
@@ -549,7 +549,7 @@ def test_a_file_that_cannot_be_read_asks_for_no_experiment():
 
 
 def test_skipped_stages_are_told_apart():
-    """The names of stages have commas in them, so what parts them is another sign."""
+    """Names of stages contain commas, so another sign separates them."""
     skipped = tuple(
         Skipped(stage=Stage.LOG_DECREMENT, run=f"decay-{i}", cart=1, reason="too short")
         for i in range(5)
@@ -561,7 +561,7 @@ def test_skipped_stages_are_told_apart():
 
 
 def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
-    """In the summary, on the terminal and in the list, as it stands in submission.toml."""
+    """In the summary, on the terminal and in the list, as in submission.toml."""
     decay = Skipped(stage=Stage.LOG_DECREMENT, run="my_decay_1", cart=1, reason="too short")
     skipped = (decay,)
     analysis = replace(make_analysis(1), skipped=skipped)
@@ -571,7 +571,7 @@ def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
 
 
 def test_a_good_result_is_called_so():
-    """Nothing to complain of: the summary says so in a few lines."""
+    """Without any problem the summary says so in a few lines."""
     analysis = make_analysis(1, repeats=1)
     rows = tuple(replace(row, consistent=True) for row in analysis.rows)
     checks = tuple(check for check in analysis.checks if check.outcome == "pass")
@@ -588,7 +588,7 @@ def test_a_good_result_is_called_so():
 
 
 def test_one_swing_shows_no_rise_of_the_damping():
-    """The figure of damping against swing stands where a record has two of them."""
+    """The figure of damping against swing needs a record with two of them."""
     analysis = make_analysis(1)
     one = tuple(
         replace(decay, zeta_at_amplitude=decay.zeta_at_amplitude[:, :1])
@@ -600,7 +600,7 @@ def test_one_swing_shows_no_rise_of_the_damping():
 
 
 def test_what_may_be_either_of_two_values_is_said_with_both():
-    """A gain of the fit that may be that of the steps, or not, does not stand alone."""
+    """If a gain of the fit may differ from that of the steps, both are shown."""
     analysis = make_analysis(1)
     (first, *others) = analysis.rows
     initial, final = Estimate(value=29.0, std=0.1, source="step"), first.final
@@ -613,7 +613,10 @@ def test_what_may_be_either_of_two_values_is_said_with_both():
 
 
 def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
-    """Steps against a fit of fewer springs than may be there; dry friction is told on its own."""
+    """If steps contradict a fit with too few springs, springs are named;
+
+    dry friction comes apart.
+    """
     analysis = make_analysis(2)
     assert analysis.fit is not None
     smooth = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
@@ -632,7 +635,7 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
 
 
 def test_a_wrong_sign_is_said_first():
-    """A stated sign that the data contradict comes first; what else fails may follow from it."""
+    """A sign that the data contradict comes first, as it may cause the other failures."""
     analysis = make_analysis(1, repeats=1)
     wrong = Check(
         kind="input",

@@ -1,4 +1,4 @@
-"""How pages come to be full: what is tried, and what is kept of it."""
+"""How pages are filled: the layouts tried, and the one kept."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ TOP, BOTTOM = 50.0, 750.0
 
 
 def figures(*heights: float) -> Callable[[Choices], Pages]:
-    """Return how figures of such heights are laid out, one after the other."""
+    """Return the layout of figures with these heights, one after the other."""
 
     def lay_out(choices: Choices) -> Pages:
         ends, page, y = [], 1, TOP
@@ -25,14 +25,14 @@ def figures(*heights: float) -> Callable[[Choices], Pages]:
 
 
 def test_a_figure_that_nearly_fits_comes_up():
-    """It and the one above it are drawn smaller, alike."""
+    """It and the one above it are drawn smaller by the same factor."""
     shares = fill_pages(figures(400.0, 350.0, 100.0)).shares
     assert shares == {1: shares[1], 2: shares[1]}
     assert (BOTTOM - TOP) * 0.9 < shares[1] * 750.0 <= BOTTOM - TOP
 
 
 def test_no_figure_becomes_too_small_to_read():
-    """Of one that does not fit by far, the page stays white."""
+    """If it does not fit by far, the page keeps its white space."""
     assert fill_pages(figures(400.0, 600.0, 100.0)) == Choices()
 
 
@@ -49,7 +49,7 @@ def test_full_pages_are_left_as_they_are():
 
 
 def test_a_table_stays_whole_where_less_is_white_then():
-    """It stood in two parts, and the page of the second one was half empty."""
+    """It was split in two, and the page of the second part was half empty."""
 
     def lay_out(choices: Choices) -> Pages:
         begun = 2 if choices.whole == (7,) else 1

@@ -1,4 +1,4 @@
-"""The worked reference: every formula it prints is a true one, and its numbers are the model's."""
+"""The worked reference: every printed formula is true, and its numbers are the model's."""
 
 import json
 from collections.abc import Mapping
@@ -82,7 +82,7 @@ class Truth:
         return sympy.expand(det / sympy.prod(self.m[first - 1 :]))
 
     def names(self) -> dict[str, Any]:
-        """Return what every name of the derivation stands for, in masses, dampings, springs."""
+        """Return each name of the derivation in terms of masses, dampings and springs."""
         n, m, k = self.n, self.m, self.k
         found: dict[str, Any] = {"s": s, "U": sympy.Integer(1), "u": sympy.Integer(1)}
         for i in range(1, n + 1):
@@ -114,7 +114,7 @@ class Truth:
 
 
 def is_zero(text: str, names: dict[str, Any]) -> bool:
-    """Say whether an expression vanishes identically once all its names are put in."""
+    """Return whether an expression vanishes identically once all its names are inserted."""
     return sympy.fraction(sympy.together(parsed(text, names)))[0].expand() == 0
 
 
@@ -128,7 +128,7 @@ def truth(request):
 
 
 def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
-    """Newton's laws, their transforms and every step of the elimination hold identically."""
+    """Newton's laws, their transforms and every step of the elimination are identities."""
     springs, chain = truth
     n = len(springs) - 1
     equations = [*derivation.newton(springs), *derivation.laplace(springs)]
@@ -143,7 +143,7 @@ def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
 
 
 def test_the_way_back_is_true_of_the_impedance_matrix(truth):
-    """Each step from coefficients to single carts, couplings, masses and springs is an identity."""
+    """Every step from coefficients to carts, couplings, masses and springs is an identity."""
     springs, chain = truth
     n = len(springs) - 1
     names = chain.names()
@@ -186,7 +186,7 @@ def test_the_redundancies_are_as_many_as_the_checks():
 
 @given(chains())
 def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
-    """Worked out from the named parameters, the entries are those of the chain's own matrices."""
+    """Computed from the named parameters, the entries equal those of the chain's matrices."""
     values = work_state_model(chain)
     n = chain.n
     A, B, _, _ = chain.state_space()
@@ -198,7 +198,7 @@ def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
     assert_allclose([evaluate(text, values) for text in column], B[:, 0], rtol=1e-9)
 
 
-# ----------------------------------------------------------- what is shown is what is true
+# --------------------------------------------------------- what is displayed is true
 
 WRITTEN = {
     "ω": "omega", "ζ": "zeta", "κ": "kappa", "Δ": "Delta", "·": "*",
@@ -206,7 +206,7 @@ WRITTEN = {
 
 
 def read_back(term) -> str:
-    """Return mathematics as a reader takes it: what stands side by side is multiplied."""
+    """Return mathematics as a reader takes it: side by side is a product."""
     if isinstance(term, str):
         return WRITTEN.get(term, term.replace("−", "-"))
     parts = [read_back(part) for part in term.parts]
@@ -233,7 +233,7 @@ def side_by_side(parts):
 
 @pytest.mark.parametrize("springs", SPRINGS, ids=numbered)
 def test_a_formula_reads_as_the_text_it_is_made_from(springs):
-    """Brackets stand where they must: read back, every formula shown is the expression tested."""
+    """Read back with its brackets, every displayed formula is the expression tested."""
     n = len(springs) - 1
     equations = [*derivation.newton(springs), *derivation.laplace(springs)]
     equations += [*derivation.couplings(n), *derivation.physical(springs)]
@@ -260,7 +260,7 @@ def test_a_formula_reads_as_the_text_it_is_made_from(springs):
 
 
 def test_numbers_put_in_are_worked_out_as_written():
-    """With numbers for names, signs and powers of ten included, the shown line gives the result."""
+    """With numbers for names, signs and powers of ten, the displayed line gives the result."""
     values = {"a": -2.0, "b": 3e-7, "c": 0.5}
     for text in ("a*b-c", "(a-b)/c", "c-a*(b+a)", "-a**2+c", "a-(b-c)", "a/b*c"):
         seen = parsed(read_back(shown_with(text, values)))
@@ -273,7 +273,7 @@ def test_numbers_put_in_are_worked_out_as_written():
 @pytest.mark.parametrize("method", ["lqr", "poles"])
 @pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
 def test_the_worked_gains_are_the_designed_ones(preset, method):
-    """Riccati's equation and Ackermann's formula give the gains that the design stage found."""
+    """Riccati's equation and Ackermann's formula give the gains of the design stage."""
     chain = PRESETS[preset]
     design = design_feedback(
         chain,
@@ -296,7 +296,7 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
 
 
 def test_ackermann_is_exact_in_symbols():
-    """For any two-state plant the formula gives phi - gamma G the polynomial asked for."""
+    """For any plant of two states the formula gives phi - gamma G the desired polynomial."""
     a, b, c, d, e, f, p, q = sympy.symbols("a:f p q")
     phi, gamma, z = sympy.Matrix([[a, b], [c, d]]), sympy.Matrix([e, f]), sympy.Symbol("z")
     reach = sympy.Matrix.hstack(gamma, phi * gamma)
@@ -305,11 +305,11 @@ def test_ackermann_is_exact_in_symbols():
     assert sympy.simplify(loop - (z**2 + p * z + q)) == 0
 
 
-# ---------------------------------------------------------------------- what is expected
+# ------------------------------------------------------------------- expected values
 
 
 def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
-    """Every expected value lies within, a frequency in Hz or a doubled gain far outside."""
+    """Every expected value passes; a frequency in Hz or a doubled gain is far outside."""
     analysis = make_analysis(3)
     for p in expected_parameters(analysis, default_rubric(analysis)):
         assert p.tolerance is not None
@@ -326,7 +326,7 @@ def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
     ("carts", "hide"), [(1, ()), (2, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
 )
 def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide):
-    """Each bound, handed in by a student with these recordings, earns all; beyond it, less."""
+    """A student at a bound earns all points, and beyond it fewer."""
     one = student(carts, hide=hide)
     expected = expected_parameters(one.analysis, one.rubric)
     assert len(expected) == len(one.rubric.names)
@@ -346,7 +346,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
 
 
 def test_another_rubric_has_other_bounds(tmp_path):
-    """What `--rubric` names is what the page and the file accept, and what they are called by."""
+    """The rubric of `--rubric` decides what the page and the file accept, and is named there."""
     analysis = make_analysis(2)
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
     text = text.replace(
@@ -368,7 +368,7 @@ def test_another_rubric_has_other_bounds(tmp_path):
 @given(chains(min_carts=2, max_carts=3), st.integers(0, 2**32 - 1))
 @settings(max_examples=20)
 def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
-    """A table off by a third of its tolerances, at random, moves most entries within theirs."""
+    """A table off by a third of its tolerances, at random, keeps most entries within theirs."""
     rng = np.random.default_rng(seed)
     table = derivation.given(chain)
     tolerances = {name: 1e-3 * value for name, value in table.items()}
@@ -391,7 +391,7 @@ def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_the_document_works_everything_out(carts):
-    """Each worked section is there, and the model's numbers stand in it."""
+    """Each worked section is there, with the model's numbers."""
     analysis = make_analysis(carts)
     document = build_solution(analysis)
     ids = [section.id for section in document.sections]
@@ -426,14 +426,14 @@ def test_nothing_that_students_wrote_stands_in_the_solution(carts):
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_every_kind_of_question_has_a_model_answer(kind):
-    """There is one to read for each, and it is no question itself."""
+    """Each has a text, which is not itself a question."""
     answer = model_answer(Asked(kind=kind, id="x", section="x", text="x"))
     assert len(plain(answer.text)) > 100
     assert "?" not in plain(answer.text)
 
 
 def test_what_has_no_table_is_left_out():
-    """Without a fit only the derivation stands; a rigid cart has its own, short one."""
+    """Without a fit there is only the derivation; a rigid cart has its own, short one."""
     bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
     ids = [section.id for section in build_solution(bare).sections]
     assert ids[1:3] == ["motion", "transfer-functions"]
@@ -454,7 +454,7 @@ def analyse_rigid():
 
 
 def test_solution_json_is_the_reference_for_programs():
-    """All parameters with tolerances, A and B with theirs, and the gains; the same text twice."""
+    """All parameters with tolerances, A and B with theirs, the gains; the same bytes twice."""
     analysis = make_analysis(2)
     text = solution_text(analysis)
     assert text == solution_text(analysis)
@@ -466,7 +466,7 @@ def test_solution_json_is_the_reference_for_programs():
 
 
 def test_a_reference_that_failed_a_check_says_so_where_its_numbers_stand():
-    """In the file, under the title and before the table of what is expected; else nothing."""
+    """In the file, under the title and before the table of expected values; nowhere else."""
     doubtful = make_analysis(2)
     (failed,) = doubtful.failed_checks
     sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))

@@ -1,4 +1,4 @@
-"""Sentences of the summary are made from the evidence; every failed check has its action."""
+"""The summary's sentences follow from the evidence; every failed check has its action."""
 
 import json
 import shutil
@@ -28,7 +28,7 @@ needs_real = pytest.mark.skipif(
 
 
 def next_part(analysis: Analysis) -> list[str]:
-    """Return what to do next, a line each."""
+    """Return what to do next, one line each."""
     _, _, advice = terminal_summary(analysis).partition("What to do next.")
     return [line.removeprefix("- ") for line in advice.splitlines() if line]
 
@@ -41,7 +41,7 @@ def every_failed_check_is_named(analysis: Analysis) -> bool:
 
 @needs_real
 def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
-    """Five steps give both estimates, and no decay was recorded in which friction could show."""
+    """Five steps give both estimates, and without a decay friction cannot show."""
     analysis = analyse(load_submission(write_one_cart_submission(tmp_path / "s", REAL_DATA)))
     text = terminal_summary(analysis)
     assert "identified from 5 steps" in text
@@ -77,7 +77,7 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
 
 
 def test_an_independent_check_is_not_called_the_same():
-    """Decays and steps beside dwells are two ways; peaks read off the dwells are not."""
+    """Decays and steps beside dwells are two methods; peaks read off the dwells are not."""
     analysis = analysed("two-cart")
     said = {row.name: row.independent for row in analysis.rows if row.independent is not None}
     assert said == {
@@ -92,7 +92,7 @@ def test_an_independent_check_is_not_called_the_same():
 
 
 def plain_of(blocks) -> str:
-    """Return the lists and paragraphs among blocks as text."""
+    """Return lists and paragraphs among blocks as text."""
     found = []
     for block in blocks:
         if block.kind == "paragraph":
@@ -103,7 +103,7 @@ def plain_of(blocks) -> str:
 
 
 def test_the_sources_of_the_table_are_those_there_are():
-    """Without a decay no sentence speaks of one."""
+    """Without a decay no sentence mentions one."""
     analysis = make_analysis(1)
     without = tuple(
         replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
@@ -114,7 +114,7 @@ def test_the_sources_of_the_table_are_those_there_are():
 
 
 def test_a_check_that_nobody_foresaw_is_named_too():
-    """By its id and its message, before what the linear carts leave out."""
+    """By its id and message, before the error of the linear carts."""
     odd = Check(
         kind="order", run="run-1", outcome="fail", value=1.0, limit=0.5, message="run-1: odd."
     )
@@ -134,7 +134,7 @@ def test_a_check_that_nobody_foresaw_is_named_too():
 
 @pytest.mark.parametrize("drop", ["step", "step sine sweep"])
 def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
-    """Not the reason why nothing could be done, nor a table that nobody could give."""
+    """It does not repeat the reason of the failure, nor ask for an impossible table."""
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
     head, *tables = toml.read_text(encoding="utf-8").split("[[experiments]]")
@@ -156,7 +156,7 @@ def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
 
 
 def test_nothing_failed_is_named_in_no_list():
-    """A good report has neither failed checks in its summary nor in its section."""
+    """A good report lists no failed checks, in the summary or in its section."""
     analysis = analysed("one-cart")
     assert not any("Failed:" in line for line in next_part(analysis))
     blocks = check_blocks(Page(analysis))
@@ -165,7 +165,7 @@ def test_nothing_failed_is_named_in_no_list():
 
 
 def test_a_question_about_one_recording_does_not_ask_of_two():
-    """Where both estimates use the same recordings no two methods saw two amplitudes."""
+    """If both estimates use the same recordings, the question does not speak of two amplitudes."""
     analysis = make_analysis(1)
     rows = tuple(
         replace(row, consistent=False, change_percent=80.0, independent=False)

@@ -12,12 +12,12 @@ from tests.helpers.analysis_factory import make_analysis
 
 
 def page(rows, reported=None) -> Page:
-    """Return a page of one cart with other rows, and with what is claimed."""
+    """Return a page of one cart with changed rows and reported numbers."""
     return Page(replace(make_analysis(1), rows=tuple(rows), reported=reported or {}))
 
 
 def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
-    """Off by a factor of 2 pi: the frequency says so; what is only rounded says nothing."""
+    """A factor of 2π names the likely slip; a rounded number gets no hint."""
     rows = make_analysis(1).rows
     true = {row.name: row.final.value for row in rows if row.final}
     mine = {"K": f"{true['K']:.3g}", "omega_n": f"{true['omega_n'] / 6.2832:.3g}"}
@@ -33,7 +33,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
 
 
 def test_what_was_assumed_says_nothing_of_a_number():
-    """A guess is no measurement to hold a student's number against."""
+    """A guess is not a measurement that a student's number could contradict."""
     row = make_analysis(1).rows[0]
     assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
@@ -42,7 +42,7 @@ def test_what_was_assumed_says_nothing_of_a_number():
 
 
 def test_nothing_found_and_no_known_slip_say_nothing():
-    """A number without an estimate stands beside a dash; a wrong mass gets no hint of another."""
+    """A number without an estimate is beside a dash; a wrong mass gets no hint."""
     row = make_analysis(1).rows[0]
     mine = {row.name: Decimal("3.0")}
     table = reported_table(page([replace(row, final=None)], {"final": mine}))

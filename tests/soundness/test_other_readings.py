@@ -1,4 +1,4 @@
-"""A factor is a unit where all records of a kind share it, and else no mistake of anybody's."""
+"""A factor shared by all records of a kind is a unit; else it is nobody's mistake."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ def record(name: str, *, size: float = 1.0, step: float = 0.01) -> Record:
 
 
 def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, float]) -> set[str]:
-    """Return what stays a mistake; the others follow as they are."""
+    """Return the mistakes that remain; the other records fit as they are."""
     records = [*(record(name, size=size) for name, size in sizes.items()), *others]
     follows = {r.id: 1.0 if r.id in found else 0.0 for r in records}
     fits = {
@@ -55,13 +55,13 @@ def kept(found: Mapping[str, Misread], *others: Record, sizes: Mapping[str, floa
     ],
 )
 def test_a_unit_is_that_of_all_records_of_a_kind(misread, sizes, others, unit):
-    """And where they move less, no limit of the amplifier explains them."""
+    """If they move less, no limit of the amplifier explains that."""
     found = {name: misread for name in sizes}
     assert kept(found, *others, sizes=sizes) == (set(sizes) if unit else set())
 
 
 def test_one_record_with_another_clock_is_sampled_otherwise():
-    """A dwell at the sampling of the others has their clock, whatever it follows."""
+    """A dwell with the same sampling has the same clock, whatever fits it."""
     others = [record("sine-2"), record("sine-3")]
     assert kept({"sine-1": SLOW}, *others, sizes={"sine-1": 1.0}) == set()
     slow = replace(record("sine-1"), t=np.linspace(0.0, 1.98, 100))
@@ -73,5 +73,5 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
 
 
 def test_a_turned_channel_is_one_record_s_own():
-    """No limit, and no friction, turns a channel round."""
+    """Neither a limit nor friction reverses a channel."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

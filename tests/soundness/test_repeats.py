@@ -1,4 +1,4 @@
-"""The repeat that does not belong with the others is named, and no other."""
+"""A repeat that differs from the others is named, and no other."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def strange(record, rng):
 
 @pytest.mark.parametrize("count", [3, 4, 5, 8])
 def test_a_repeat_with_another_mass_is_named(count):
-    """A weight left on cart 1 makes one repeat stand off three or more."""
+    """A weight left on cart 1 makes one repeat differ from three or more."""
     rng = np.random.default_rng(count)
     records = repeats(count, rng=rng)
     records[1] = strange(records[1], rng)
@@ -46,7 +46,7 @@ def test_a_repeat_with_another_mass_is_named(count):
 
 
 def test_one_of_two_is_never_named():
-    """Two repeats that differ do not tell which of them is wrong."""
+    """From two repeats that differ, nobody can tell which one is wrong."""
     rng = np.random.default_rng(0)
     records = repeats(2, rng=rng)
     assert find_outlier_repeats([records[0], strange(records[1], rng)], unit="cm") == {}
@@ -63,7 +63,7 @@ def test_repeats_that_differ_by_noise_alone_are_left_alone():
 
 
 def test_other_experiments_are_not_repeats():
-    """Another size of step, another free cart or kind is no repeat, however it moves."""
+    """Another step size, free cart or kind is not a repeat, however it moves."""
     rng = np.random.default_rng(2)
     others = [
         *repeats(2, rng=rng, swing=2.0),
@@ -75,7 +75,7 @@ def test_other_experiments_are_not_repeats():
 
 
 def test_a_motor_switched_off_later_is_no_outlier():
-    """A response that differs because the input does is not held against the repeat."""
+    """A response that differs because its input differs is not an outlier."""
     rng = np.random.default_rng(4)
     records = [step_record(CHAIN, rng=rng, id=f"{i}") for i in range(4)]
     # Off at half time: the last runs 0.1 s longer.
@@ -84,7 +84,7 @@ def test_a_motor_switched_off_later_is_no_outlier():
 
 
 def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
-    """Positions count from where the record starts."""
+    """Positions count from the start of the record."""
     rng = np.random.default_rng(3)
     records = repeats(5, rng=rng)
     records[2] = replace(records[2], y=records[2].y + 3.0)
@@ -92,7 +92,7 @@ def test_an_encoder_that_was_not_zeroed_makes_no_outlier():
 
 
 def test_the_first_real_repeat_is_named_and_no_other(real_data, tmp_path):
-    """Of the five real two-cart repeats the first stands off, of the single-cart ones none."""
+    """Of five real two-cart repeats the first is odd; of the single-cart ones, no run is."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1, 2, 3, 4, 5))
     records = read_data(load_submission(folder)).records
     (outlier,) = find_outlier_repeats(records, unit="cm").values()

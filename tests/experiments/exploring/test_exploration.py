@@ -1,4 +1,4 @@
-"""A bench that investigates itself, on the emulator's carts and over a real line."""
+"""A bench explores itself, on the emulator's carts and over a real line."""
 
 import json
 from dataclasses import replace
@@ -52,7 +52,7 @@ def test_durations_are_read_as_one_says_them():
     "text", ["zeta", "zeta 1", "zeta omega 1%", "1.5", "0%", "200%", "%", "zeta 1% K 2%"]
 )
 def test_what_is_no_wish_is_refused(text):
-    """With an example of one."""
+    """The message has an example."""
     with pytest.raises(ConfigError, match="expected a name and a percentage"):
         read_error_goal(text)
 
@@ -61,14 +61,14 @@ def test_what_is_no_wish_is_refused(text):
     "text", ["20", "min", "-3s", "20 parsec", "inf s", "1e999s", "1e308h", "nan s"]
 )
 def test_what_is_no_duration_is_refused(text):
-    """With an example of one."""
+    """The message has an example."""
     with pytest.raises(ConfigError, match="expected a duration"):
         read_time(text)
 
 
 @pytest.fixture(scope="module")
 def explored(tmp_path_factory):
-    """A stop far out to one side, where no step goes, explored until all is known well."""
+    """A bench with a stop far out to one side, where no step goes, explored to the end."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["end_stop:position=-1.7"])
     folder = tmp_path_factory.mktemp("explored") / "work"
     said: list[str] = []
@@ -84,12 +84,12 @@ def explored(tmp_path_factory):
 
 
 def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
-    """The stop is named on its cart, every parameter is known, and as it is."""
+    """The stop is named on its cart, and every parameter is known and right."""
     folder, turns, said, bench = explored
     last = turns[-1]
     assert last.verdict == "named"
     assert last.reached
-    assert last.recorded == ("sweep-2",)  # one that swings the cart out shows what acts there
+    assert last.recorded == ("sweep-2",)  # a run that swings the cart out shows the effect there
     assert "the worst of all to ±" in last.said
     (explanation,) = last.explanations
     assert "cart 1" in explanation.name
@@ -102,7 +102,7 @@ def test_an_exploration_names_what_acts_and_knows_the_carts(explored):
 
 
 def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
-    """Every record stands in submission.toml and plan.toml; each turn in the diary."""
+    """Every record is in submission.toml and plan.toml; each turn is in the diary."""
     folder, turns, _, _ = explored
     recorded = [name for turn in turns for name in turn.recorded]
     submission = load_submission(folder)
@@ -115,7 +115,7 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
 
 @pytest.fixture
 def no_gap(monkeypatch):
-    """Only the carts are identified: where the gap is of no concern, or cannot be looked for."""
+    """Only the carts are identified, if the gap does not matter or cannot be searched."""
 
     def none(analysis, **other):
         raise DataError("no run can be held out")
@@ -125,10 +125,9 @@ def no_gap(monkeypatch):
 
 @pytest.mark.usefixtures("no_gap")
 def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
-    """No recording is begun that would go beyond; what it would have been is said.
+    """No recording begins that would last too long; the diary says which it would have been.
 
-    Where the gap cannot be looked for the carts are identified, and no word says that nothing
-    else acts.
+    If the gap cannot be searched, the carts are identified and no claim is made about effects.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
@@ -146,7 +145,7 @@ def test_time_that_is_up_ends_it_before_the_next_recording(tmp_path):
 
 
 def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
-    """Nothing is recorded, and what it would take is said."""
+    """Nothing is recorded, and the message says how much time is needed."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     virtual = VirtualBench(bench, seed=1)
     session = VirtualSession(tmp_path / "work", virtual)
@@ -162,7 +161,7 @@ def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
 
 
 def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored, tmp_path):
-    """With the name that is nearest; nothing is recorded, nothing is claimed."""
+    """The message has the nearest name; nothing is recorded."""
     asked: list[str] = []
 
     def record(ids):
@@ -179,7 +178,7 @@ def test_a_wish_that_meets_no_parameter_is_refused_before_a_cart_moves(explored,
 
 
 def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
-    """Nobody has said yet whether springs hold the carts: the first sweep is made."""
+    """Nobody knows yet whether springs hold the carts, so the first sweep is made."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
     with pytest.raises(ConfigError, match="the first sweep takes"):
@@ -194,7 +193,7 @@ def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
 
 @pytest.mark.usefixtures("no_gap")
 def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
-    """Each time another recording is chosen; the diary says what did not come off, and why."""
+    """Each time another recording is chosen; the diary says what failed, and why."""
     asked = []
 
     def record(ids):
@@ -216,9 +215,9 @@ def test_a_bench_on_which_nothing_comes_off_is_left_after_three_tries(tmp_path):
 
 
 def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
-    """Another is chosen than what is vetoed; what is added comes next; the diary says both.
+    """A vetoed recording is replaced, an added one comes next, and the diary shows both.
 
-    gap.json is written anew, with what decides if not what was vetoed: then and from then on.
+    gap.json is written again; it proposes what decides apart from the vetoed recording.
     """
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     folder, offered, said = tmp_path / "work", [], []
@@ -262,7 +261,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
 
 
 def test_what_is_added_counts_whatever_it_is_called(tmp_path):
-    """An id that the program would give its own first step, where the plan had none at first."""
+    """Even with an id that the program would give its own first step, in an empty plan."""
     bench = VirtualBench(prepare_bench(preset="throne-1dof", model=None, hide=[]), seed=1)
     folder = new_folder(tmp_path / "work", bench, springs=[True, True])
     submission = load_submission(folder)
@@ -295,7 +294,7 @@ def test_what_is_added_counts_whatever_it_is_called(tmp_path):
 
 
 def test_where_all_that_tells_more_was_refused_the_large_step_is_left(tmp_path):
-    """Carts that were driven gently only may hide what acts far out."""
+    """Carts that were driven only gently may hide effects far out."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
     analysis = analyse(submission)
     plan = propose_plan(submission)
@@ -311,7 +310,7 @@ def test_where_all_that_tells_more_was_refused_the_large_step_is_left(tmp_path):
 
 
 def test_thinking_can_be_ended(tmp_path):
-    """What watches the progress raises; what is recorded stays."""
+    """An exception in the progress display ends it; the recordings stay."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
 
@@ -331,9 +330,9 @@ def test_thinking_can_be_ended(tmp_path):
 
 
 def test_the_command_explores_a_bench_over_its_line(tmp_path):
-    """From no folder at all to a submission with its diary, over a socket, faster than real.
+    """From no folder at all to a submission with its diary, over a socket, faster than real time.
 
-    Time bounds the first recordings too: the sweep fits and the steps do not.
+    The time limit holds for the first recordings too: the sweep fits and the steps do not.
     """
     folder = tmp_path / "work"
     with emulator("--speed", "8", "--port", "socket://127.0.0.1:0", preset="throne-1dof") as bench:
@@ -348,7 +347,7 @@ def test_the_command_explores_a_bench_over_its_line(tmp_path):
 
 @pytest.mark.slow
 def test_one_large_step_shows_what_acts_far_out(tmp_path):
-    """Carts that drag holds back do not reach the distance wanted: the step is made once."""
+    """Carts held back by drag do not reach the distance wanted; the step is made once."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=["quadratic_drag"])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=13))
     turns = Exploration(
