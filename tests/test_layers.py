@@ -55,6 +55,7 @@ LEVELS = (
     ("experiments.exploring", "grading.judge", "grading.gradebook"),
     ("grading.publish", "grading.self_check"),
     ("grading.batch",),
+    ("grading.autograder",),
     ("desk",),
     ("desk.student", "desk.bench", "desk.grades", "desk.instructor"),
     ("desk.app",),

@@ -243,11 +243,23 @@ class Platform(StrEnum):
 
 @app.command("export")
 def export_grades(
-    grades: Grades,
-    lms: Annotated[Platform, typer.Option(help="The learning platform.")],
+    grades: Annotated[
+        str | None,
+        typer.Argument(metavar="GRADES", help="The --out folder of `cartlab grade`, or a URL."),
+    ] = None,
+    lms: Annotated[Platform | None, typer.Option(help="The learning platform.")] = None,
+    autograder: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="RUBRIC", help="In place of grades: a zip by which Gradescope grades itself."
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="A folder, or FILE.csv for the table alone; default: GRADES."),
+        typer.Option(
+            help="A folder, or FILE.csv for the table alone; default: GRADES. "
+            "With --autograder: the zip; default: autograder.zip."
+        ),
     ] = None,
     roster: Annotated[
         Path | None, typer.Option(metavar="CSV", help="The platform's own table, to be filled in.")
@@ -257,7 +269,13 @@ def export_grades(
     ] = None,
     assignment: Lab = None,
 ) -> None:
-    """Write the class grades for import into a learning platform."""
+    """Write the class grades for import into a learning platform, or Gradescope's autograder."""
+    if autograder is not None:
+        if grades or lms or roster or title or assignment:
+            raise typer.BadParameter("--autograder takes a rubric and --out, nothing else")
+        return _export_autograder(autograder, out or Path("autograder.zip"))
+    if grades is None or lms is None:
+        raise typer.BadParameter("name GRADES and --lms, or a rubric with --autograder")
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.export import export
 
@@ -271,6 +289,14 @@ def export_grades(
     say(f"wrote {first}" + (f" and {len(more)} more" if more else ""))
     if any(remark.left_out for remark in done.remarks):
         raise typer.Exit(1)
+
+
+def _export_autograder(rubric: Path, out: Path) -> None:
+    from pipeline.grading.autograder.pack import write_autograder
+
+    for task in write_autograder(rubric, out):
+        say(task)
+    say(f"wrote {out}")
 
 
 @app.command()

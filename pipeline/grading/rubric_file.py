@@ -50,13 +50,24 @@ def load_rubric(path: Path) -> Rubric:
     ------
     ConfigError : one line for every mistake, with file, line, key and what was expected.
     """
+    path = find_rubric(path)
+    return parse_rubric(rubric_source(path), where=path.name)
+
+
+def find_rubric(path: Path) -> Path:
+    """Return the file of a rubric, given that or the name of one that is shipped.
+
+    Raises
+    ------
+    ConfigError : there is none.
+    """
     path = Path(path)
     if not path.exists() and path.suffix == "" and (RUBRICS / f"{path.name}.toml").is_file():
         path = RUBRICS / f"{path.name}.toml"
     if not path.exists():
         shipped = nearest(path.stem, sorted(p.stem for p in RUBRICS.glob("*.toml")))
         raise ConfigError(f"{path}: there is no such rubric{shipped}")
-    return parse_rubric(rubric_source(path), where=path.name)
+    return path
 
 
 def shipped_rubric(carts: int) -> Rubric | None:

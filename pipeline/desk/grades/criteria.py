@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from itertools import count
 from typing import Any
 
-from pipeline.desk.evidence import is_about, show_message, show_numbers
+from pipeline.desk.evidence import show_message, show_numbers
 from pipeline.grading.grade import Criterion, Flag, Grade
 from pipeline.grading.gradebook.open_book import TeamNow
 from pipeline.grading.gradebook.override import HandPoints
+from pipeline.grading.judge.costs import is_about
 from pipeline.grading.publish.feedback import (
     TONES,
     alternative,

@@ -9,7 +9,6 @@ from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
 from pipeline.desk.books import Class
-from pipeline.desk.evidence import find_remarks
 from pipeline.desk.grades.class_table import (
     find_signature,
     find_team,
@@ -32,6 +31,7 @@ from pipeline.grading.grade import Flag, Grade
 from pipeline.grading.gradebook.history import event_words, to_the_second
 from pipeline.grading.gradebook.open_book import Conflict, Listing, TeamNow
 from pipeline.grading.gradebook.override import read_points
+from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise, renamed_events
 from pipeline.grading.publish.class_page import feedback_link
 from pipeline.grading.rubric import Rubric

@@ -6,7 +6,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
-from pipeline.desk.evidence import find_remarks, show_evidence
+from pipeline.desk.evidence import show_evidence
 from pipeline.desk.request_steps import describe_steps
 from pipeline.desk.seeing import REFUSED, hides_values
 from pipeline.desk.served_files import show_own_page
@@ -15,6 +15,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import Criterion, Grade
 from pipeline.grading.gradebook.request_book import OwnFeedback, RequestBook, points_lost
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.publish.anonymous import anonymise
 from pipeline.grading.publish.feedback import TONES, feedback_page, sentence
 from pipeline.grading.rubric import Criterion as Asked

@@ -5,7 +5,7 @@ from dataclasses import replace
 from fractions import Fraction
 
 from pipeline.grading import rubric as asked
-from pipeline.grading.grade import Code, Flag
+from pipeline.grading.grade import Code, Flag, Grade
 from pipeline.grading.judge.earned import ALL
 from pipeline.grading.judge.work import Verdict
 from pipeline.grading.references.tolerance import exact
@@ -57,3 +57,13 @@ def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> boo
     if not isinstance(criterion, asked.Parameters) or criterion.check not in tables:
         return False
     return not set(flag.parameters).isdisjoint(matching(criterion.parameters, names))
+
+
+def find_remarks(grade: Grade, criterion: asked.Criterion, rubric: Rubric) -> list[Flag]:
+    """Return the remarks of a grade that are about a criterion."""
+    return [flag for flag in grade.flags if is_about(flag, criterion, rubric)]
+
+
+def is_about(flag: Flag, criterion: asked.Criterion, rubric: Rubric) -> bool:
+    """Whether a remark is about a criterion; shared recordings are about none."""
+    return flag.code != "shared_data" and concerns(flag, criterion, names=rubric.names)

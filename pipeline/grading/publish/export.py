@@ -12,7 +12,6 @@ Each form is a table with a row for every student. Given the table that the plat
 """
 
 import html
-import json
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,12 +20,12 @@ from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
+from pipeline.grading.publish.gradescope import results_text, told_flags
 from pipeline.grading.publish.platforms import FORMS, WORKSHEET
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import told
-from pipeline.grading.words import WORDS, on_one_line, points_text
+from pipeline.grading.words import on_one_line, points_text
 from pipeline.output import csv_text, named_folder, own_folder, write_file
 from pipeline.words.text import with_symbols
 
@@ -88,7 +87,7 @@ def export(
     files = [table or folder / f"{platform}.csv"]
     write_file(files[0], text)
     if platform == "gradescope" and not table:
-        files += _write_results(entries, own_folder(folder, "gradescope"))
+        files += _write_results(entries, own_folder(folder, "gradescope"), rubric=rubric)
     return Exported(files=tuple(files), remarks=tuple(remarks))
 
 
@@ -178,11 +177,7 @@ def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
         if c.points < c.out_of or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *_told(grade), *late]
-
-
-def _told(grade: Grade) -> list[str]:
-    return [with_symbols(told(flag)) for flag in grade.flags]
+    return [*lost, *told_flags(grade), *late]
 
 
 def _clock(days: float) -> str:
@@ -190,44 +185,12 @@ def _clock(days: float) -> str:
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 
-def _write_results(entries: Iterable[Entry], folder: Path) -> list[Path]:
+def _write_results(entries: Iterable[Entry], folder: Path, *, rubric: Rubric) -> list[Path]:
     files = []
     for entry in entries:
         own = own_folder(folder, entry.submission)
         own.mkdir(parents=True, exist_ok=True)
-        write_file(own / "results.json", results_text(entry.grade, by_hand=bool(entry.overrides)))
+        text = results_text(entry.grade, rubric=rubric, by_hand=bool(entry.overrides))
+        write_file(own / "results.json", text)
         files.append(own / "results.json")
     return files
-
-
-def results_text(grade: Grade, *, by_hand: bool = False) -> str:
-    """Return a grade as the `results.json` of a Gradescope autograder."""
-    how = " automatically, points were given by hand" if by_hand else ""
-    failed = grade.status == "failed"
-    output = [f"Could not be graded{how}: {grade.reason}"] if failed else []
-    output += _told(grade)
-    if grade.deducted:
-        output.append(f"Late: {points_text(grade.deducted)} points off.")
-    document = {
-        "score": grade.points,
-        "output": "\n".join(output),
-        "output_format": "text",
-        "test_output_format": "text",
-        "test_name_format": "text",
-        "stdout_visibility": "hidden",
-        "tests": [
-            {
-                "score": c.points,
-                "max_score": c.out_of,
-                "status": "passed" if c.outcome == "pass" else "failed",
-                "name": c.title or c.id,
-                "number": str(i),
-                "output": f"{WORDS.text(f'outcome_{c.outcome}')}: {with_symbols(c.message)}",
-                "tags": [c.id],
-                "visibility": "visible",
-            }
-            for i, c in enumerate(grade.criteria, start=1)
-        ],
-        "extra_data": {"flags": [flag.code for flag in grade.flags]},
-    }
-    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -1,0 +1,1 @@
+"""A zip that makes Gradescope grade each submission when it is uploaded."""

@@ -1,0 +1,54 @@
+"""The installed versions of everything that cartlab needs, as a `requirements.txt` for Linux."""
+
+import importlib.metadata as installed
+
+from packaging.markers import Marker, default_environment
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
+
+from pipeline.errors import ConfigError
+
+# Gradescope's machines, whatever this computer is.
+_LINUX = {
+    "os_name": "posix",
+    "sys_platform": "linux",
+    "platform_system": "Linux",
+    "platform_machine": "x86_64",
+}
+
+
+def pin_requirements(package: str = "cartlab") -> list[str]:
+    """Return `name==version` of all packages that a package needs on Linux, sorted.
+
+    A package that only Linux needs is left out if this computer does not have it; pip then finds
+    one by itself.
+
+    Raises
+    ------
+    ConfigError : the package itself is not installed.
+    """
+    pinned: dict[str, str] = {}
+    seen: set[tuple[str, str]] = set()
+    waiting = [(package, "")]
+    while waiting:
+        name, extra = one = waiting.pop()
+        if one in seen:
+            continue
+        seen.add(one)
+        try:
+            found = installed.distribution(name)
+        except installed.PackageNotFoundError:
+            if name == package:
+                raise ConfigError(f"{package} is not installed here: run `pip install .`") from None
+            continue
+        if name != package:
+            pinned[canonicalize_name(name)] = Version(found.version).public
+        for needed in map(Requirement, found.requires or ()):
+            if _applies(needed.marker, extra):
+                waiting += [(needed.name, more) for more in ("", *needed.extras)]
+    return [f"{name}=={version}" for name, version in sorted(pinned.items())]
+
+
+def _applies(marker: Marker | None, extra: str) -> bool:
+    return marker is None or marker.evaluate({**default_environment(), **_LINUX, "extra": extra})

@@ -1,0 +1,79 @@
+"""A grade as the `results.json` of a Gradescope autograder.
+
+Keys and values are those of Gradescope's *Autograder Specifications*. Students who must find the
+numbers themselves (`see = "check"`) read no computed number in it. Partial points tell how far a
+number is off, and anybody may submit again, so these students see points only after the due date.
+"""
+
+import json
+from collections.abc import Collection
+
+from pipeline.grading.grade import CODES, Code, Criterion, Grade
+from pipeline.grading.judge.costs import find_remarks
+from pipeline.grading.rubric import Rubric
+from pipeline.grading.similarity.shared import told
+from pipeline.grading.words import WORDS, points_text
+from pipeline.words.text import with_symbols
+
+_WITHOUT_NUMBERS: tuple[Code, ...] = ("missing", "shared_data")  # remarks that tell none to find
+
+
+def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
+    """Return a grade as `results.json`; same grade, same bytes."""
+    hidden = rubric.students.see == "check"
+    document = {
+        "score": grade.points,
+        "output": "\n".join(_say_of_all(grade, by_hand=by_hand, hidden=hidden)),
+        "output_format": "text",
+        "test_output_format": "text",
+        "test_name_format": "text",
+        "stdout_visibility": "hidden",
+        "tests": [
+            {
+                "score": judged.points,
+                "max_score": judged.out_of,
+                "status": "passed" if judged.outcome == "pass" else "failed",
+                "name": judged.title or judged.id,
+                "number": str(number),
+                "output": _say_of(judged, grade, rubric, hidden=hidden),
+                "tags": [judged.id],
+                "visibility": "after_due_date" if hidden else "visible",
+            }
+            for number, judged in enumerate(grade.criteria, start=1)
+        ],
+        "extra_data": {"flags": [flag.code for flag in grade.flags]},
+    }
+    return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def told_flags(grade: Grade, *, codes: Collection[Code] = CODES) -> list[str]:
+    """Return what a student reads of each remark with one of these codes."""
+    return [with_symbols(told(flag)) for flag in grade.flags if flag.code in codes]
+
+
+def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
+    """Return what a student reads of the whole, at once."""
+    how = " automatically, points were given by hand" if by_hand else ""
+    failed = grade.status == "failed"
+    said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
+    if hidden:
+        said += [] if failed else [WORDS.text("gradescope_hidden")]
+    said += told_flags(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
+    if grade.deducted:
+        said.append(f"Late: {points_text(grade.deducted)} points off.")
+    return said
+
+
+def _say_of(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
+    """Return what a student reads of a criterion; hidden: outcome, remarks' titles, reasons."""
+    outcome = WORDS.text(f"outcome_{judged.outcome}")
+    if not hidden:
+        return f"{outcome}: {with_symbols(judged.message)}"
+    said = [
+        WORDS.text(f"title_{flag.code}")
+        for criterion in rubric.criteria
+        if criterion.id == judged.id
+        for flag in find_remarks(grade, criterion, rubric)
+    ]
+    said += [given.why for given in grade.overrides if given.criterion == judged.id]
+    return ": ".join([outcome, "; ".join(said)] if said else [outcome])
