@@ -122,7 +122,9 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
             path.unlink()
             left = _less(left, folder)
     if tomls := _submissions(into):
-        return _the_one(tomls, into)
+        folder = _the_one(tomls, into)
+        _gather_loose(folder)
+        return folder
     raise SubmissionError(_nothing_in(into))
 
 
@@ -206,6 +208,19 @@ def _the_one(tomls: Sequence[Path], into: Path) -> Path:
         more = f" and {len(tomls) - 2} more" if len(tomls) > 2 else ""
         raise SubmissionError(f"which one is to be graded? There are {names}{more}")
     return tomls[0].parent
+
+
+def _gather_loose(folder: Path) -> None:
+    """Put the files beside `submission.toml` into `data/` as well, if there is no such folder.
+
+    A platform to which the files are uploaded one by one does not keep their folders.
+    """
+    data = folder / "data"
+    if not os.path.lexists(data):
+        loose = [path for path in folder.iterdir() if path.is_file() and path.name != NAME]
+        data.mkdir()
+        for path in loose:
+            shutil.copyfile(path, data / path.name)
 
 
 def _nothing_in(into: Path) -> str:

@@ -109,7 +109,8 @@ def test_a_canvas_download(tmp_path):
         "anon_x7Yb2",
     )
     assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later attempt
-    assert opened(tmp_path, found["loose"]) == ["step.csv", "submission.toml"]
+    loose = opened(tmp_path, found["loose"])
+    assert loose == ["data/step.csv", "step.csv", "submission.toml"]
     assert found["roeric-lab3"].days_late == 1.0
     assert found["poeann-lab3"].days_late == 0.0
     assert found["roeric-lab3"].owner == "roeric (canvas 1025)"

@@ -23,8 +23,8 @@ from pipeline.grading.gradebook.override import HandPoints, read_points, with_ov
 from pipeline.grading.gradings import Batch
 from pipeline.grading.publish.anonymous import KEY_FILE, anonymise, pseudonyms
 from pipeline.grading.publish.class_page import class_page
-from pipeline.grading.publish.export import results_text
 from pipeline.grading.publish.feedback import evidence_table, feedback_page, numbers_table
+from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.publish.outputs import grades_csv, write_outputs
 from pipeline.grading.words import WORDS
 from pipeline.set_up import Units
@@ -491,7 +491,7 @@ def test_points_by_hand_are_not_asked_for_again():
     assert "Its points were given by hand." in text
     assert "Set by hand" in text
     assert "hand it in again" not in text
-    told = json.loads(results_text(by_hand, by_hand=True))["output"]
+    told = json.loads(results_text(by_hand, rubric=RUBRIC, by_hand=True))["output"]
     assert told.startswith("Could not be graded automatically, points were given by hand: ")
 
 

@@ -1,0 +1,324 @@
+"""The autograder's zip in Gradescope's folders: set up, run, and what students then read."""
+
+import json
+import os
+import re
+import shutil
+import site
+import stat
+import subprocess
+import sys
+import venv
+import zipfile
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.errors import ConfigError
+from pipeline.grading.autograder import run
+from pipeline.grading.autograder.pack import write_autograder
+from pipeline.grading.autograder.pins import pin_requirements
+from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.grade import Grade, read_grade
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.resources import RUBRICS
+from pipeline.simulated.submission import Students, write_submission
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.hostile import SECRET, write_hostile
+from tests.helpers.waiting import PATIENCE
+
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Gradescope's machines run Linux")
+
+RUBRIC = RUBRICS / "throne-1dof.toml"
+TOP = {"score", "output", "output_format", "test_output_format", "test_name_format",
+       "stdout_visibility", "tests", "extra_data"}  # fmt: skip
+TEST = {"score", "max_score", "status", "name", "number", "output", "tags", "visibility"}
+# A computed number as it would be written: three digits or more, a decimal point among them.
+NUMBER = re.compile(r"\d+\.\d+")
+
+
+@pytest.fixture(scope="module")
+def team(tmp_path_factory) -> Path:
+    """A submission with one wrong number among its reported ones."""
+    folder = tmp_path_factory.mktemp("team") / "lab"
+    write_submission(
+        folder, "throne-1dof", seed=5, compact=True, reported=True,
+        students=Students(authors=("s1",)),
+    )  # fmt: skip
+    toml = folder / "submission.toml"
+    text = toml.read_text(encoding="utf-8")
+    final = text.index("[reported.final]")
+    wrong, n = re.subn(r"(?m)^K = .*$", "K = 12.3", text[final:], count=1)
+    assert n == 1
+    toml.write_text(text[:final] + wrong, encoding="utf-8")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """Gradescope's folders after `setup.sh`; the packages are those installed here."""
+    root = tmp_path_factory.mktemp("autograder")
+    write_autograder(RUBRIC, root / "autograder.zip")
+    source = root / "source"
+    with zipfile.ZipFile(root / "autograder.zip") as archive:
+        archive.extractall(source)
+    # pip finds every pinned version there and downloads nothing.
+    venv.create(source / "venv", with_pip=True, symlinks=True)
+    (own,) = (source / "venv").glob("lib/python*/site-packages")
+    (own / "here.pth").write_text("\n".join(site.getsitepackages()), encoding="utf-8")
+    done = start("bash", source / "setup.sh", PIP_NO_INDEX="1")
+    assert done.returncode == 0, done.stderr
+    shutil.copy(source / "run_autograder", root)
+    (root / "run_autograder").chmod(0o755)
+    return root
+
+
+def start(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a program from elsewhere, with no sight of this checkout."""
+    return subprocess.run(
+        list(map(str, command)),
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        cwd="/",
+        env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"} | environment,
+        timeout=PATIENCE,
+        check=False,
+    )
+
+
+def upload(root: Path, submission: Path, *, rubric: str = "") -> dict[str, Any]:
+    """Put a student's files in place, run the autograder, return its checked result."""
+    shutil.rmtree(root / "submission", ignore_errors=True)
+    shutil.rmtree(root / "results", ignore_errors=True)
+    if submission.is_dir() and not submission.is_symlink():
+        shutil.copytree(submission, root / "submission", symlinks=True)
+    else:
+        (root / "submission").mkdir()
+        shutil.copy(submission, root / "submission", follow_symlinks=False)
+    (root / "submission_metadata.json").write_text(
+        json.dumps({"created_at": "2030-01-09T10:00:00-07:00",
+                    "assignment": {"due_date": "2030-01-01T10:00:00-07:00"}})
+    )  # fmt: skip
+    text = RUBRIC.read_text(encoding="utf-8")
+    (root / "source" / "rubric.toml").write_text(rubric or text, encoding="utf-8")
+    done = start(root / "run_autograder")
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
+    return read_results(root)
+
+
+def read_results(root: Path) -> dict[str, Any]:
+    """Return `results.json`, which has the keys and values of Gradescope's specification only."""
+    results = json.loads((root / "results" / "results.json").read_text(encoding="utf-8"))
+    assert set(results) == TOP
+    assert isinstance(results["score"], float)
+    assert results["stdout_visibility"] == "hidden"
+    for test in results["tests"]:
+        assert set(test) == TEST
+        assert test["status"] in ("passed", "failed")
+        assert test["visibility"] in ("visible", "after_due_date")
+        assert 0 <= test["score"] <= test["max_score"]
+    return results
+
+
+def grade_here(submission: Path, scratch: Path) -> Grade:
+    """Return the grade that `cartlab grade` gives."""
+    task = Task(id="team", key="", sources=(str(submission),))
+    return read_grade(grade_task(task, rubric=load_rubric(RUBRIC), scratch=scratch).grade)
+
+
+def test_a_submission_gets_the_points_of_cartlab_grade(root, team, tmp_path):
+    """Criterion by criterion, each with its message, visible; a late one loses nothing."""
+    results, grade = upload(root, team), grade_here(team, tmp_path)
+
+    assert 0 < grade.points < grade.out_of
+    assert results["score"] == grade.points
+    assert results["score"] == pytest.approx(sum(test["score"] for test in results["tests"]))
+    for test, criterion in zip(results["tests"], grade.criteria, strict=True):
+        assert (test["score"], test["max_score"]) == (criterion.points, criterion.out_of)
+        assert test["name"] == criterion.title
+        assert test["visibility"] == "visible"
+        assert test["output"]
+    (wrong,) = [t for t in results["tests"] if t["tags"] == ["final-gains"]]
+    assert (wrong["status"], wrong["score"]) == ("failed", 0.0)
+    assert "12.3" in wrong["output"]
+    assert "final_off" in results["extra_data"]["flags"]
+
+
+@pytest.mark.parametrize("form", ["one folder", "zip in the folder", "loose files"])
+def test_all_ways_to_upload_have_the_same_result(root, team, tmp_path, form):
+    """Files with their folders, an archive, or files one by one, which lose theirs."""
+    before = upload(root, team)
+    given = tmp_path / "given"
+    given.mkdir()
+    if form == "one folder":
+        shutil.copytree(team, given / "lab")
+    elif form == "zip in the folder":
+        shutil.make_archive(str(given / "lab"), "zip", team)
+    else:
+        for path in team.rglob("*.*"):
+            shutil.copy(path, given)
+    assert upload(root, given) == before
+
+
+def test_students_who_find_the_numbers_read_none(root, team):
+    """With `see = "check"` no computed number is in it, and points wait for the due date."""
+    shown = upload(root, team)
+    hidden = upload(
+        root, team, rubric=RUBRIC.read_text(encoding="utf-8") + '\n[students]\nsee = "check"\n'
+    )
+
+    assert hidden["score"] == shown["score"]
+    assert any(NUMBER.search(test["output"]) for test in shown["tests"])
+    assert not NUMBER.search(hidden["output"])
+    assert not any(NUMBER.search(test["output"]) for test in hidden["tests"])
+    assert {test["visibility"] for test in hidden["tests"]} == {"after_due_date"}
+    assert "cartlab check" in hidden["output"]
+    (wrong,) = [t for t in hidden["tests"] if t["tags"] == ["final-gains"]]
+    assert wrong["output"] == "not passed: a final value that the recordings do not give"
+
+
+HOSTILE = (
+    "zip-00-a link.zip", "zip-05-escape 0.zip", "zip-14-ratio.zip", "zip-17-nested.zip",
+    "zip-20-lying.zip", "zip-32-two.zip", "place-00-linked toml", "place-04-linked folder",
+    "linked.zip",
+)  # fmt: skip
+
+
+def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
+    """Bombs, links, two submissions: each has a result, and nothing outside is read or written."""
+    school = tmp_path / "school"
+    school.mkdir()
+    good = {p.relative_to(team).as_posix(): p.read_bytes() for p in team.rglob("*.*")}
+    assert set(HOSTILE) <= set(write_hostile(school, good, seed=1, every=1))
+    for name in HOSTILE:
+        results = upload(root, school / name)
+        assert results["score"] == 0.0, name
+        assert results["output"].startswith("Could not be graded: "), name
+        assert SECRET not in json.dumps(results), name
+    assert not list(tmp_path.rglob("escaped"))
+    assert sorted(p.name for p in root.iterdir()) == [
+        "autograder.zip", "results", "run_autograder", "source", "submission",
+        "submission_metadata.json",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ((), "no submission.toml in it: it is empty"),
+        (("notes.md", "report.pdf"), "no submission.toml in it, only 'notes.md', 'report.pdf'"),
+        (
+            ("a/submission.toml", "b/submission.toml"),
+            "There are 'a/submission.toml' and 'b/submission.toml'",
+        ),
+    ],
+)
+def test_an_upload_that_is_no_submission_is_told_why(root, tmp_path, files, said):
+    """Without `submission.toml`, and with two."""
+    for name in files:
+        (tmp_path / "given" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "given" / name).touch()
+    (tmp_path / "given").mkdir(exist_ok=True)
+    results = upload(root, tmp_path / "given")
+    assert (results["score"], results["tests"]) == (0.0, [])
+    assert said in results["output"]
+
+
+def test_code_in_an_upload_is_not_run(root, team, tmp_path):
+    """Nor is anything that bears the name of what the grader imports, reads or writes."""
+    given, mark = tmp_path / "given", tmp_path / "was-run"
+    shutil.copytree(team, given)
+    code = f"open({str(mark)!r}, 'w')\n"
+    for name in ("sitecustomize.py", "numpy.py", "pipeline/__init__.py", "conftest.py"):
+        (given / name).parent.mkdir(exist_ok=True)
+        (given / name).write_text(code, encoding="utf-8")
+    for name in ("setup.sh", "run_autograder", "venv/bin/python"):
+        (given / name).parent.mkdir(parents=True, exist_ok=True)
+        (given / name).write_text(f"#!/bin/sh\ntouch {mark}\n", encoding="utf-8")
+        (given / name).chmod(0o755)
+    (given / "results.json").write_text('{"score": 1000}', encoding="utf-8")
+    before = upload(root, team)
+    assert upload(root, given) == before
+    assert not mark.exists()
+
+
+def test_a_grader_that_is_killed_leaves_a_result(root, team):
+    """Here it has no memory even to start in; the points are 0, and the text says what to do."""
+    upload(root, team)
+    done = start("bash", "-c", f"ulimit -v 100000; '{root}/run_autograder'")
+    assert done.returncode != 0
+    results = read_results(root)
+    assert results["score"] == 0.0
+    assert "submit again, or tell your instructor" in results["output"]
+
+
+def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
+    """And its result says so, before Gradescope would end it without one."""
+    upload(root, team)
+    monkeypatch.setattr(run, "_TIME_LIMIT", 0.0)
+    run.grade_upload(root)
+    results = read_results(root)
+    assert (results["score"], results["output"]) == (0.0, "Could not be graded: stopped after 0 s")
+
+
+# -------------------------------------------------------------------------------- the zip
+
+
+def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
+    """Both scripts lie at its top, executable; a shipped rubric's name is enough."""
+    done = cartlab_here("export", "--autograder", "throne-1dof", cwd=tmp_path)
+    assert done.returncode == 0
+    assert done.stderr.splitlines() == [
+        "on Gradescope, set the autograder points to 20",
+        "points for lateness are not deducted: set the late policy on Gradescope",
+        "wrote autograder.zip",
+    ]
+    write_autograder(RUBRIC, tmp_path / "again" / "a.zip")
+    first = (tmp_path / "autograder.zip").read_bytes()
+    assert (tmp_path / "again" / "a.zip").read_bytes() == first
+    with zipfile.ZipFile(tmp_path / "autograder.zip") as archive:
+        modes = {info.filename: info.external_attr >> 16 for info in archive.infolist()}
+        assert archive.read("rubric.toml") == RUBRIC.read_bytes()
+        pins = archive.read("requirements.txt").decode().splitlines()
+        python = archive.read("python-version").decode().strip()
+    for script in ("setup.sh", "run_autograder"):
+        assert stat.S_IMODE(modes[script]) == 0o755
+    assert pins[1:] == pin_requirements()
+    assert python == f"{sys.version_info.major}.{sys.version_info.minor}"
+
+
+def test_all_that_grading_needs_is_pinned_to_what_is_installed():
+    """Also what is needed only by what cartlab needs; nothing of the tests."""
+    pins = dict(pin.split("==") for pin in pin_requirements())
+    for name in ("numpy", "scipy", "h5py", "pydantic-core", "python-dateutil"):
+        assert pins[name] == version(name)
+    assert not {"cartlab", "pytest", "ruff", "colorama"} & set(pins)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((), "name GRADES and --lms, or a rubric with --autograder"),
+        (("grades",), "name GRADES and --lms"),
+        (("grades", "--autograder", "throne-1dof"), "--autograder takes a rubric and --out"),
+        (("--autograder", "throne-1dof", "--lms", "canvas"), "--autograder takes a rubric"),
+        (("--autograder", "throne-9dof"), "there is no such rubric"),
+        (("--autograder", "throne-1dof", "--out", "folder"), "an autograder is one zip file"),
+    ],
+)
+def test_export_says_what_it_needs(tmp_path, arguments, said):
+    """Grades and a platform, or a rubric and perhaps a zip: any other mixture is refused."""
+    done = cartlab_here("export", *arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_package_that_is_not_installed_cannot_be_pinned():
+    """A checkout that nobody installed has no versions to pin."""
+    with pytest.raises(ConfigError, match="not installed here"):
+        pin_requirements("no-such-package-as-this")
