@@ -6,8 +6,8 @@ from html import unescape
 
 import pytest
 
-from pipeline.grading.publish.export import results_text
 from pipeline.grading.publish.feedback import feedback_page
+from pipeline.grading.publish.gradescope import results_text
 from pipeline.report.draft.content import build_document
 from pipeline.report.render.html import render_html
 from pipeline.report.sections.summary import terminal_summary
@@ -43,6 +43,6 @@ def test_grades_write_symbols():
     grade = one.reporting(final=off, initial={"zeta_1": -0.05}, feedback=claims).grade()
     assert len(grade.flags) > 1
     assert raw(feedback_page(grade, rubric=one.rubric, figures=(), name="team-07")) == []
-    shown = results_text(grade)
+    shown = results_text(grade, rubric=one.rubric)
     assert raw("".join(re.findall(r'"output": "(.*)"', shown))) == []
     assert "ζ_b" in shown
