@@ -20,7 +20,7 @@ from pipeline.set_up import Bench
 
 @st.composite
 def chains(draw: st.DrawFn) -> Chain:
-    """Chains of one to four carts, sizes over two decades, both walls tied."""
+    """Chains of one to four carts, sizes over two decades, springs at both walls."""
     n = draw(st.integers(1, 4))
     size = st.floats(0.1, 10.0)
     m, c, k = (
@@ -66,7 +66,7 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
 
 def test_only_a_spring_that_may_be_missing_is_linear():
-    """k_1 enters as it is where the far wall holds the carts, else as a logarithm."""
+    """k_1 enters linearly if the far wall holds the carts, else as a logarithm."""
     both = Parametrisation(bench=Bench(springs=(True, True, True)))
     near = Parametrisation(bench=Bench(springs=(True, True, False)))
 
@@ -87,7 +87,7 @@ def test_zero_parameters_leave_the_vector():
 
 
 def test_one_cart_has_one_stiffness_whichever_springs_hold_it():
-    """One cart on the far spring alone has the same vector as on the near one."""
+    """One cart with only the far spring has the same vector as with only the near one."""
     assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
     assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
 
@@ -152,16 +152,16 @@ def test_a_start_is_a_possible_chain():
 @settings(max_examples=20)
 @given(n=st.integers(1, 4), gain=st.floats(0.1, 1e4), omega=st.floats(0.5, 300.0))
 def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
-    """The stand-in has cart 1's gain, and its lowest mode is the one given."""
+    """The stand-in has cart 1's gain, and the given lowest mode."""
     got = even_chain({"K_1": gain, "omega_a": omega}, bench=Bench(springs=(True,) * (n + 1)))
 
     values = got.parameters()
-    # Exact but for some ten roundings in the solve; the damping put in does not move omega_a.
+    # Exact except for some ten roundings in the solve; the added damping does not move omega_a.
     assert_allclose(values["K" if n == 1 else "K_1"], gain, rtol=1e-12)
     assert_allclose(np.min(np.abs(got.poles)), omega, rtol=1e-6)
 
 
 def test_an_even_chain_needs_something_to_go_by():
-    """Without a gain or without a resonance there is no scale to take."""
+    """Without a gain or a resonance the scale is unknown."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
         even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))

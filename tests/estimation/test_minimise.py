@@ -1,4 +1,4 @@
-"""A model is worked out once for its residual and its derivatives, at a point of its own."""
+"""A model is computed once for its residual and its derivatives, at one point."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from pipeline.estimation.minimise import evaluated_once
 
 
 class _Decay:
-    """exp(-p t), which keeps the rate p it was made for."""
+    """A residual exp(-p t) that keeps the rate p it was made for."""
 
     def __init__(self, t, p):
         self.t, self.p = t, p

@@ -31,14 +31,14 @@ def explain(case, **options) -> Gap:
 
 
 def names(gap: Gap) -> list[tuple[str, int]]:
-    """Return effects and places found, sorted."""
+    """Return the effects and places found, sorted."""
     return sorted((f.effect.key, next(iter(f.where.values()), 0)) for f in gap.effects)
 
 
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("dirt", [False, True])
 def test_nothing_hidden_is_said_to_be_nothing(n, dirt):
-    """A linear bench gets the verdict `none`, also with encoders zeroed anew for every run."""
+    """A linear bench gets the verdict `none`, even if encoders are zeroed before every run."""
     gap = explain(make_case(seed=42, n=n, rate=200.0, dirt=dirt))
 
     assert gap.verdict == "none"
@@ -47,15 +47,15 @@ def test_nothing_hidden_is_said_to_be_nothing(n, dirt):
 
 
 def test_friction_that_varies_from_run_to_run_stays_one_effect():
-    """Run-to-run scatter of the friction is learnt, not explained by further effects."""
+    """Scatter of the friction between runs is learnt, not explained by more effects."""
     case = make_case(seed=43, n=1, effects=["coulomb_friction"], rate=200.0, dirt=True)
 
     gap = explain(case)
 
     assert names(gap) == [("coulomb_friction", 1)]
-    # 4 % was put in; seven runs tell a spread within a factor of two.
+    # 4 % was hidden; seven runs determine a spread within a factor of two.
     assert 0.02 < gap.spread[1] < 0.08
-    # The errors stated are those of the model returned, on the held-out runs as they are drawn.
+    # The stated errors are those of the returned model, on the held-out runs as drawn.
     held_out = [trace for trace in gap.traces if trace.held_out]
     before, after = (
         sum(float(np.sum((trace.measured - model) ** 2)) for trace, model in drawn)
@@ -69,7 +69,7 @@ def test_friction_that_varies_from_run_to_run_stays_one_effect():
 
 
 def test_what_the_catalogue_lacks_is_not_misnamed():
-    """With the true effect struck from the catalogue nothing is named, and suspects are listed."""
+    """Without the true effect in the catalogue nothing is named, and suspects are listed."""
     case = make_case(seed=10700, n=1, effects=["cubic_spring"], rate=113.1)
     known = [e for e in CATALOGUE if e.key not in ("cubic_spring", "slack_spring")]
 
@@ -81,7 +81,7 @@ def test_what_the_catalogue_lacks_is_not_misnamed():
 
 
 def test_a_part_is_called_a_part():
-    """Of two effects the catalogue has one: it is found, and nobody calls that all."""
+    """If the catalogue has one of two effects, it is found, with the verdict `partial`."""
     case = make_case(seed=53, n=1, effects=["coulomb_friction", "saturation"], rate=113.1)
     known = [e for e in CATALOGUE if e.key in ("coulomb_friction", "cubic_spring", "drive_damping")]
 
@@ -97,7 +97,7 @@ def test_a_part_is_called_a_part():
 
 @pytest.mark.parametrize("irregular", [False, True])
 def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
-    """Of 1 kHz every fourth millisecond is fitted, each reading on the curve it was taken from."""
+    """At 1 kHz every fourth millisecond is fitted, each reading on its own curve."""
     t = np.arange(4001) / 1000.0
     if irregular:
         t = t + np.random.default_rng(0).uniform(-2e-4, 2e-4, t.size)
@@ -121,7 +121,7 @@ def test_blocks_of_fast_samples_are_readings_at_their_middle(irregular):
 
 
 def test_the_time_allowed_ends_the_search():
-    """Without any time the linear model is the best answer so far, and that is said."""
+    """Without any time the linear model is the best answer so far, and marked so."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
     gap = explain(case, budget=0.0)
@@ -131,7 +131,7 @@ def test_the_time_allowed_ends_the_search():
 
 
 def test_repeats_are_compared_by_the_edge_of_their_input():
-    """Recordings of the same step differ by their noise, though their clocks began apart."""
+    """Recordings of the same step differ by their noise, though their clocks started apart."""
     case = make_case(seed=49, n=1, rate=113.1)
     first = next(record for record in case.records if record.kind == "step")
     assert first.u is not None
@@ -154,7 +154,7 @@ def test_repeats_are_compared_by_the_edge_of_their_input():
 
 @pytest.mark.parametrize("said", [(1,), (1, 2)])
 def test_a_cart_held_in_all_runs_is_a_wall(said):
-    """Runs of cart 1 alone in a folder of two carts give what one cart would, in its own words."""
+    """Runs of cart 1 alone in a two-cart folder give the result of one cart, in its own terms."""
     hidden = Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0025})
     case = make_case(seed=45, n=2, effects=[hidden], rate=113.1)
     alone = [r for r in case.records if r.id.startswith("decay-1")]
@@ -183,7 +183,7 @@ def one_gap() -> Gap:
 
 
 def test_document_is_what_was_agreed(one_gap):
-    """`gap.json` has the agreed keys, no NaN, and consistent figures."""
+    """`gap.json` has the documented keys, no NaN, and consistent figures."""
     document = json.loads(json.dumps(plain(one_gap), allow_nan=False))
 
     assert document["schema"] == "cartlab-gap/1"
@@ -204,7 +204,7 @@ def test_document_is_what_was_agreed(one_gap):
 
 
 def test_same_records_give_the_same_document(one_gap):
-    """The workflow has no chance in it: same records, same bytes."""
+    """The workflow uses no chance: same records, same bytes."""
     case = make_case(seed=45, n=1, effects=["dead_zone"], rate=113.1)
 
     again = explain(case)
@@ -213,7 +213,7 @@ def test_same_records_give_the_same_document(one_gap):
 
 
 def test_duplicate_files_do_not_judge_their_twin():
-    """A run that is there twice is used once."""
+    """A run that is listed twice is used once."""
     case = make_case(seed=46, n=1, rate=113.1)
     twin = case.records[0]
     copy = Record(**{**vars(twin), "id": "copy-of-a"})
@@ -225,7 +225,7 @@ def test_duplicate_files_do_not_judge_their_twin():
 
 
 def test_single_run_is_cut_in_time():
-    """With one run its last part is held out, and that is said."""
+    """With one run its last part is held out, and the notes say so."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
 
     gap = explain_gap(case.records[:1], Bench(springs=case.springs))
@@ -235,7 +235,7 @@ def test_single_run_is_cut_in_time():
 
 
 def test_no_motion_is_one_clear_error():
-    """Records in which nothing moves are refused in one line."""
+    """Records without motion are refused in one line."""
     t = np.linspace(0.0, 5.0, 500)
     still = Record(
         id="still",
@@ -253,11 +253,10 @@ def test_no_motion_is_one_clear_error():
 
 
 def positioning_stage(*, friction: float, seed: int, reference, push: float = 0.0) -> Record:
-    """Return one run of a cart on no spring under PD feedback, stepped at 80 µs.
+    """Return one run of a cart without springs under PD feedback, stepped at 80 µs.
 
-    `push` is a constant force, V.
-
-    u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c = 5e-4 in V, s, cm.
+    `push` is a constant force, V. u = 0.05 e + 0.004 de/dt (V, cm), sampled at 250 Hz; m = 2e-4, c
+    = 5e-4 in V, s, cm.
     """
     m, c, h, count = 2e-4, 5e-4, 8e-5, 0.00227
     rng = np.random.default_rng(seed)
@@ -296,10 +295,10 @@ REFERENCES = (
 
 @pytest.mark.parametrize("friction", [0.0, 0.003])
 def test_a_rigid_body_under_feedback(friction):
-    """Without any spring friction is found (or not) from feedback runs, each judged as a whole.
+    """Without springs, friction is found (or not) from feedback runs, each judged as a whole.
 
-    One simulation of a whole run, nothing of it fitted, then ends within two encoder counts: the
-    start is read to half a count, and errors of the numbers add up.
+    One simulation of a whole run, with nothing fitted to it, then ends within two encoder counts:
+    the start is known to half a count, and errors of the parameters add up.
     """
     records = [
         positioning_stage(friction=friction, seed=i, reference=r) for i, r in enumerate(REFERENCES)
@@ -318,7 +317,7 @@ def test_a_rigid_body_under_feedback(friction):
 
 
 def test_a_constant_force_without_springs():
-    """A tilted track shows as a drift, which only whole runs have: friction and force are named."""
+    """A tilted track causes a drift that only whole runs show: friction and force are named."""
     records = [
         positioning_stage(friction=0.003, push=0.0008, seed=i, reference=r)
         for i, r in enumerate(REFERENCES)
@@ -334,18 +333,18 @@ def test_a_constant_force_without_springs():
 
 
 def test_a_single_decay_is_cut_where_it_still_moves():
-    """The part held out of one decay is one in which the cart moves."""
+    """The held-out part of a single decay is one in which the cart still moves."""
     case = make_case(seed=47, n=1, effects=["coulomb_friction"], rate=113.1)
     (decay, *_) = (r for r in case.records if r.kind == "decay")
 
     gap = explain_gap([decay], Bench(springs=case.springs))
 
-    assert 0.0 < gap.noise_floor < 0.5  # the motion stands out of the noise
+    assert 0.0 < gap.noise_floor < 0.5  # the motion is above the noise
     assert all(r.noise_floor < 0.5 for r in gap.by_record)
 
 
 def test_carts_that_no_run_shows_do_no_harm():
-    """Decays of the second cart alone explain its own friction; the first keeps its start."""
+    """Decays of the second cart alone reveal its own friction; the first keeps its start."""
     case = make_case(seed=48, n=2, effects=[], rate=113.1)
     decays = [r for r in case.records if r.kind == "decay" and r.free == (2,)]
 
@@ -355,7 +354,7 @@ def test_carts_that_no_run_shows_do_no_harm():
 
 
 def test_a_run_without_its_input_is_left_out_and_said():
-    """A step whose input was not logged explains nothing."""
+    """A step without a logged input explains nothing."""
     case = make_case(seed=49, n=1, rate=113.1)
     first, *others = case.records
     unknown = Record(**{**vars(first), "u": None})
@@ -367,7 +366,7 @@ def test_a_run_without_its_input_is_left_out_and_said():
 
 
 def _late(*, seed: int) -> Record:
-    """A driven cart on a cubic spring, whose last 40 % alone go far enough to show it."""
+    """Return a driven cart on a cubic spring, whose last 40 % alone go far enough to show it."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(
         find_effect("cubic_spring"), place=1, values={"coefficient": 0.004}, chain=chain
@@ -385,7 +384,7 @@ def _late(*, seed: int) -> Record:
 
 
 def test_what_acts_in_the_held_out_data_alone_is_found_there():
-    """Training and held-out data change sides, and it is said."""
+    """Training and held-out data change sides, and the notes say so."""
     gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]
     assert gap.verdict == "named"
@@ -394,7 +393,7 @@ def test_what_acts_in_the_held_out_data_alone_is_found_there():
 
 
 def test_a_slope_that_is_no_number_ends_a_fit(monkeypatch):
-    """Where a parameter lets the simulation run away the fit stays where it is."""
+    """If a parameter makes the simulation diverge, the fit stays where it is."""
     module = "pipeline.gap.fit.levenberg_marquardt.linearise"
     monkeypatch.setattr(
         module,

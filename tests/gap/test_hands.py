@@ -1,4 +1,4 @@
-"""Hands in the recordings: no part of fits and errors, and what follows is used."""
+"""Hands in the recordings are not used in fits and errors; the data after them are."""
 
 import numpy as np
 import pytest
@@ -12,14 +12,14 @@ from tests.truth.cases import Case, make_case
 
 @pytest.fixture(scope="module", params=[1, 2])
 def explained(request) -> tuple[Case, Gap]:
-    """A linear bench on which every decay is plucked, one step nudged, no hold firm."""
+    """The gap of a linear bench: every decay is plucked, one step nudged, and no hold is firm."""
     n = request.param
     case = make_case(seed=8999 + n, n=n, rate=200.0, handled=True)
     return case, explain_gap(case.records, Bench(springs=case.springs))
 
 
 def test_a_linear_bench_with_hands_is_linear(explained):
-    """Neither a hand nor a hold that yields is taken for an effect; only noise is left."""
+    """Neither a hand nor a yielding hold is taken for an effect; only noise is left."""
     _, gap = explained
 
     assert gap.verdict == "none"
@@ -39,7 +39,7 @@ def test_hands_are_reported(explained):
 
 
 def test_what_follows_a_hand_is_used_without_it(explained):
-    """Every plucked record is fitted or judged; no sample in which a hand acts is."""
+    """Every plucked record is fitted or judged, without the samples in which a hand acts."""
     case, gap = explained
 
     assert {*gap.training, *gap.held_out} == {record.id for record in case.records}

@@ -1,4 +1,4 @@
-"""The search knows effects by what they say of themselves, never by their names."""
+"""The search uses the properties of effects, never their names."""
 
 import ast
 from pathlib import Path
@@ -14,7 +14,7 @@ NAMES = {name for effect in CATALOGUE for name in (effect.key, effect.family) if
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_no_effect_is_written_in_the_search(path):
-    """Neither a key nor a family of the catalogue is a string of its own anywhere in it."""
+    """Neither the key nor the family of any effect is a string in the code of the search."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     written = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)}
     assert not NAMES & {text for text in written if isinstance(text, str)}

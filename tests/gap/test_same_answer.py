@@ -11,7 +11,7 @@ from tests.truth.cases import make_case
 
 
 def test_two_busy_processes_change_no_byte():
-    """Friction on two carts, alone and beside two programs that never rest."""
+    """Friction on two carts, first alone, then beside two programs that never rest."""
     case = make_case(seed=61, n=2, effects=("coulomb_friction",), rate=113.1)
 
     def answer() -> str:

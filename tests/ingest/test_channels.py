@@ -1,4 +1,4 @@
-"""What the signals tell by themselves: encoder step, sign of the input, broken channels."""
+"""What signals reveal by themselves: encoder step, sign of the input, broken channels."""
 
 import numpy as np
 import pytest
@@ -60,7 +60,7 @@ def test_a_stuck_encoder_is_found():
 
 
 def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
-    """Of few counts none shows speed; a cart that friction holds goes on where it stands."""
+    """With few counts no reading shows speed; a cart held by friction continues where it is."""
     x = np.rint(12 * np.sin(3 * T))
     assert stuck_spans(x) == []
     held = np.concatenate([x[:240], np.full(60, x[240]), x[240:]])
@@ -88,6 +88,6 @@ def test_a_coarse_encoder_clips_no_crest_of_a_few_samples():
 
 
 def test_steps_and_slow_approaches_are_not_clipped():
-    """Inputs that are at their extreme by design or creep there are sound."""
+    """Inputs with flat extremes by design, and slow approaches, are sound."""
     assert saturation(np.where(T > 1, 1.0, 0.0)) is None
     assert saturation((1 - np.exp(-2 * T)).round(4)) is None

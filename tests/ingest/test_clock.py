@@ -41,7 +41,7 @@ def test_the_ecp_clock_is_found():
 
 
 def test_a_clock_that_missed_beats_is_straightened_in_pieces():
-    """Where a bench skipped samples, each stretch gets its own line within the rounding."""
+    """If a bench skipped samples, each part gets its own line within the rounding."""
     steps = np.full(8000, 0.0011279)
     steps[[1500, 4200, 6100]] += 0.004
     true = np.cumsum(steps)
@@ -66,7 +66,7 @@ def test_true_uneven_times_are_kept_as_they_are(digits):
 
 
 def test_a_jittering_clock_in_rounded_stamps_is_kept():
-    """Where no straight line lies within the rounding, the stamps are the best there is."""
+    """If no straight line fits within the rounding, the stamps are kept."""
     rng = np.random.default_rng(4)
     stamps = np.round(np.cumsum(0.005 + 0.001 * rng.standard_normal(2000)), 3)
     clock = read_clock(stamps)
@@ -82,7 +82,7 @@ def test_an_even_clock_needs_no_straightening():
 
 
 def test_several_samples_to_one_stamp_are_told_apart():
-    """A 2.3-kHz log in whole ms has equal stamps; the clock behind them still runs."""
+    """A 2.3-kHz log in whole ms has equal stamps; the clock behind them is recovered."""
     true = np.arange(2000, dtype=np.float64) / 2300
     clock = read_clock(np.floor(true * 1e3) / 1e3)
     assert clock.stopped is None
@@ -123,7 +123,7 @@ def test_the_decimal_step_of_stamps(values, step):
 
 
 def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.ndarray]:
-    """Return stamps in whole ms of records of 1 s to 15 s, begun at any time."""
+    """Return stamps in whole ms of records of 1 s to 15 s, started at any time."""
     rng = np.random.default_rng(7)
     sizes = np.linspace(1, 15, n) / interval
     true = [rng.uniform(0, 1) + interval * np.arange(int(size)) for size in sizes]
@@ -138,7 +138,7 @@ def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.n
     [(1.00031e-3, 3e-7 / 15), (0.99987e-3, 3e-7 / 15), (1.000047e-3, 2e-3 / 120)],
 )
 def test_the_records_of_a_session_share_one_period(interval, error):
-    """Near 1 kHz a record alone is off by up to a stamp in its length; together they are not."""
+    """Near 1 kHz one record alone is off by up to a stamp in its length; together they are not."""
     stamps = a_session(interval)
 
     clocks = read_clocks(stamps)
@@ -151,7 +151,7 @@ def test_the_records_of_a_session_share_one_period(interval, error):
 
 @pytest.mark.parametrize("interval", [1.00031e-3, 0.99987e-3])
 def test_ticks_that_are_late_at_times_leave_one_period(interval):
-    """Jitter far below the rounding makes stamps flicker and does not tear the session apart."""
+    """Jitter far below the rounding makes stamps flicker and does not split the session."""
     clocks = read_clocks(a_session(interval, jitter=2e-5))
     assert len({clock.period for clock in clocks}) == 1
     # 20 µs of jitter, three deviations of it at either end of the longest record, 15 s.
@@ -172,7 +172,7 @@ def test_clocks_that_differ_stay_apart():
 
 
 def test_a_session_of_even_stamps_is_left_alone():
-    """Where nothing shows a period other than that of the stamps, they are the times."""
+    """If no other period is visible, the stamps are the times."""
     stamps = a_session(1e-3)
     for clock, kept in zip(read_clocks(stamps), stamps, strict=True):
         assert clock.pieces == 0
@@ -180,7 +180,7 @@ def test_a_session_of_even_stamps_is_left_alone():
 
 
 def test_dropped_samples_do_not_bend_the_shared_period():
-    """A record that lost samples is straightened in pieces, each with the session's period."""
+    """A record that lost samples is straightened in parts, each with the session's period."""
     stamps = a_session(0.0011279)
     lost = np.delete(stamps[9], [2000, 2001, 2002, 6000, 6001, 6002, 6003])
 

@@ -1,4 +1,4 @@
-"""`cartlab fill`: what the files in `data/` are, written into `submission.toml` in place."""
+"""`cartlab fill` writes what the files in `data/` are into `submission.toml`, in place."""
 
 import json
 import os
@@ -39,12 +39,12 @@ def put(folder: Path, name: str, **columns: np.ndarray) -> None:
 
 
 def states(folder: Path) -> dict[str, tuple[str, str, str | None]]:
-    """Fill, and return state, id and kind by file."""
+    """Fill; return state, id and kind by file."""
     return {f.file: (f.state, f.experiment, f.kind) for f in fill_submission(folder)}
 
 
 def test_a_folder_of_files_becomes_a_submission(tmp_path):
-    """Carts, units, kinds and which carts moved come from the files; the rest is a comment."""
+    """Carts, units, kinds and the free carts come from the files; the rest is a comment."""
     still = 0 * T
     put(tmp_path, "run 10.csv", time=T, input=SINE, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
     put(tmp_path, "run 2.csv", time=T, input=STEP, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
@@ -70,7 +70,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
 
 
 def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
-    """Free carts and what is unsure, until somebody takes the mark out of the file."""
+    """Free carts and unsure facts, until somebody removes the mark from the file."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
     put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)
@@ -92,7 +92,7 @@ def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
 
 @pytest.mark.parametrize("command", ["inspect", "fill"])
 def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, command):
-    """A spreadsheet in `data/` is named beside the files that were read; alone, too."""
+    """A spreadsheet in `data/` is named beside the files that were read, or alone."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "data" / "b.xlsx").write_bytes(b"PK")
     done = cartlab_here(command, tmp_path)
@@ -105,7 +105,7 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
 
 
 def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
-    """A picture and a script are no recordings, and are told so; of many only the first few."""
+    """A picture and a script are named as not recordings; of many files, the first few."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
@@ -126,7 +126,7 @@ def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
 
 
 def test_fill_says_whether_it_wrote(tmp_path):
-    """A comment for a file that nothing tells of is written, too; the same again is nothing."""
+    """It also writes a comment for an unknown file; a second run changes nothing."""
     said = []
     for name in ("a.csv", "b.csv", "b.csv"):
         put(tmp_path, name, p=RING, q=STEP)
@@ -143,7 +143,7 @@ def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
 
 
 def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
-    """Kinds, ids and comments of the person's stay; a second time nothing changes."""
+    """Kinds, ids and comments of the person stay; a second run changes nothing."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", time=T, input=0 * T, x1=RING)
@@ -167,7 +167,7 @@ def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
 
 
 def test_what_is_no_recording_gets_no_table(tmp_path):
-    """Copies, riddles and texts are said; a riddle stands as a comment, once."""
+    """Copies, unknown files and texts are named; an unknown file gets a comment, once."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "riddle.csv", foo=RING, bar=STEP)
@@ -180,7 +180,7 @@ def test_what_is_no_recording_gets_no_table(tmp_path):
 
 
 def test_the_same_samples_in_another_form_get_one_table(tmp_path):
-    """A recording saved as .csv and as .mat is one; another of the same ranges is its own."""
+    """A recording saved as .csv and .mat is one; another with the same ranges is not a copy."""
     (tmp_path / "data").mkdir()
     whole = {"time": T, "input": STEP, "x1": RING}
     put(tmp_path, "a.csv", **whole)
@@ -191,7 +191,7 @@ def test_the_same_samples_in_another_form_get_one_table(tmp_path):
 
 
 def test_a_bare_matrix_gets_its_columns(tmp_path):
-    """Numbers that the signals tell are written, and said to be guessed."""
+    """The columns that the signals reveal are written, and marked as guessed."""
     (tmp_path / "data").mkdir()
     rows = [f"{t:.5f}\t{x:.0f}\t{u}" for t, x, u in zip(T, RING, STEP, strict=True)]
     (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
@@ -203,7 +203,7 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
 
 
 def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
-    """An encoder that the system has no cart for gets no column; all files get their tables."""
+    """An encoder without a cart gets no column; all files get their tables."""
     new_submission(tmp_path, carts=1)
     rows = [
         f"{t:.5f}\t{x:.0f}\t{y:.0f}\t{u}"
@@ -218,7 +218,10 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
 
 @pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
 def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
-    """Its table stands, without `carts`, and says which column moves against what is stated."""
+    """It gets a table without `carts`;
+
+    the message says which column moves against the statement.
+    """
     new_submission(tmp_path, carts=carts)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=0 * T, x2=0 * T, x3=RING)
     (found,) = fill_submission(tmp_path)
@@ -230,7 +233,7 @@ def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
 
 
 def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
-    """That its cart is written as held is said once; without the table's word it is a question."""
+    """A held cart that is written so is noted once; without the table it is a question."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)
@@ -243,7 +246,7 @@ def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
 
 
 def test_a_table_without_its_file_is_told(tmp_path):
-    """A file that was renamed gets a table of its own, and the old one its hint."""
+    """A renamed file gets a table of its own, and the old table a hint."""
     put(tmp_path, "step-1.csv", time=T, input=STEP, x1=RING)
     fill_submission(tmp_path)
     (tmp_path / "data" / "step-1.csv").rename(tmp_path / "data" / "step1.csv")
@@ -254,7 +257,7 @@ def test_a_table_without_its_file_is_told(tmp_path):
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
-    """A link to somebody else's file is no file of the submission, and is named as refused."""
+    """A link to somebody else's file is not a file of the submission, and is refused by name."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
@@ -269,7 +272,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
 
 
 def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
-    """Where `data` leads out of the submission, nothing of what lies there is named."""
+    """If `data` leads out of the submission, no name inside it is shown."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "theirs" / "data" / "grades.xlsx").write_bytes(b"PK")
     (tmp_path / "mine").mkdir()
@@ -282,7 +285,7 @@ def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
 
 @pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
 def test_a_name_that_does_not_show_is_named(mark, tmp_path):
-    """`fill` says which file it passes over and why, and exits with 1; the others are filled in."""
+    """`fill` names the file it skips and the reason, and exits with 1; the others are filled in."""
     put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, f"step{mark}1.csv", time=T, input=STEP, x1=2 * RING)
     done = cartlab_here("fill", str(tmp_path))
@@ -320,18 +323,18 @@ def test_nothing_to_fill_in_is_one_line(tmp_path):
     ],
 )
 def test_what_is_no_table_is_one_line(old, new, where, tmp_path):
-    """Where a table or a number was to be filled from, the file's own check says what stands."""
+    """A value in place of a table or number gives the file's own error."""
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0.4 * RING)
     typed = "version = 1\n[system]\ncarts = 1\n".replace(old, new).replace("[other]\ncarts = 1", "")
     (tmp_path / "submission.toml").write_text(typed, encoding="utf-8")
     done = CliRunner().invoke(app, ["fill", str(tmp_path)])
-    assert isinstance(done.exception, SubmissionError)  # which the command ends on, status 2
+    assert isinstance(done.exception, SubmissionError)  # on which the command ends with status 2
     assert f"submission.toml: {where}: expected" in str(done.exception)
     assert (tmp_path / "submission.toml").read_text(encoding="utf-8") == typed
 
 
 def test_the_command_says_what_it_did(tmp_path):
-    """A table or JSON on stdout; exit status 1 where a file is of no use yet."""
+    """A table or JSON on stdout; exit status 1 if a file cannot be used yet."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     result = CliRunner().invoke(app, ["fill", str(tmp_path)], catch_exceptions=False)
     assert result.exit_code == 0
@@ -344,7 +347,7 @@ def test_the_command_says_what_it_did(tmp_path):
 
 @pytest.mark.parametrize(("name", "carts"), [("one-cart", 1), ("two-cart", 2), ("three-cart", 3)])
 def test_the_files_of_an_example_are_told_apart(name, carts, tmp_path):
-    """Without its tables, a worked example gets back kinds and free carts of all files."""
+    """Without its tables, a worked example gets kinds and free carts of all files back."""
     true = load_submission(EXAMPLES / name)
     shutil.copytree(true.folder / "data", tmp_path / "bare" / "data")
     found = {f.file: f for f in fill_submission(tmp_path / "bare")}
@@ -353,7 +356,7 @@ def test_the_files_of_an_example_are_told_apart(name, carts, tmp_path):
     assert load_submission(tmp_path / "bare").system.carts == carts
 
 
-# ------------------------------------------------------------------- changes in place
+# ----------------------------------------------------------------- changes in place
 
 _WORDS = st.text(st.characters(codec="utf-8", exclude_categories=["C", "Z"]), max_size=8)
 _COMMENTS = st.lists(_WORDS.map(lambda word: f"# {word}"), min_size=8, max_size=8)
@@ -362,7 +365,7 @@ _TABLES = st.permutations(["system", "experiments", "reported.initial", "design"
 
 @given(_COMMENTS, _TABLES, st.integers(0, 3), st.booleans())
 def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blank):
-    """Every comment, key and digit outlives an added table, in whatever order they stand."""
+    """Every comment, key and digit outlives an added table, in any order."""
     bodies = {
         "system": "[system] {}\ncarts = 1\ninput = {{ unit = 'V' }} {}\n",
         "experiments": "".join(
@@ -391,7 +394,7 @@ def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blan
 
 
 def test_an_outdated_change_is_refused(tmp_path):
-    """Whoever saw another text than stands there now changes nothing, and gets the text."""
+    """A caller that saw an older text changes nothing, and gets the current text."""
     new_submission(tmp_path / "team", carts=1)
     toml = tmp_path / "team" / "submission.toml"
     seen = text_digest(toml.read_text(encoding="utf-8"))
@@ -403,7 +406,7 @@ def test_an_outdated_change_is_refused(tmp_path):
 
 
 def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
-    """Under `[system]` for all files that have them, in an experiment's table for its own."""
+    """Under `[system]` for all files with such columns, in an experiment's table for its own."""
     put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)
@@ -422,7 +425,7 @@ def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
 
 
 def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
-    """Sheets, links to nowhere, tables of another ending or place: a state and an advice each."""
+    """Sheets, broken links, tables of another ending or place: each has a state and advice."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     text = (data / "a.csv").read_text(encoding="utf-8")
@@ -448,7 +451,7 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
 @pytest.mark.parametrize("name", ["run\u200b1.csv", "run\u202f1.csv", os.fsdecode(b"run\xff.csv")])
 def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
-    """A recording whose name cannot be printed is no longer passed over without a word."""
+    """A recording whose name cannot be printed is reported."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     shutil.copy(tmp_path / "data" / "a.csv", tmp_path / "data" / name)
     for command in (["fill"], ["fill", "--json"], ["inspect"], ["inspect", "--json"]):
@@ -462,7 +465,7 @@ def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
 
 
 def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
-    """Ranges of the columns are told, and the commented table has the keys to be filled in."""
+    """The ranges of the columns are listed, and the commented table has the keys to fill in."""
     (tmp_path / "data").mkdir()
     scipy.io.savemat(tmp_path / "data" / "m.mat", {"log": np.column_stack([RING, STEP]), "K": 3.0})
     (found,) = fill_submission(tmp_path)

@@ -26,7 +26,7 @@ ROWS = [
 
 
 def table(content: str | bytes) -> FileTable:
-    """Parse what a file would hold."""
+    """Parse the content of a file."""
     return parse_table(content.encode() if isinstance(content, str) else content, source="f")
 
 
@@ -66,7 +66,7 @@ def test_an_ecp_export_is_read_in_every_dialect(content):
 
 @pytest.mark.parametrize("keep", [(0, 1, 3, 5), (1, 2, 3, 4), (0, 1, 2, 4, 5), (0, 1, 2, 3, 4, 5)])
 def test_an_ecp_export_may_hold_any_of_its_columns(keep):
-    """The columns a student ticked, in the order of the export."""
+    """The columns that a student ticked, in the order of the export."""
     names = ("Sample", "Time", "Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
     values = (np.arange(N), TIME, 0 * TIME, X1, X2, U)
     rows = [" ".join(f"{values[k][i]:.4f}" for k in keep) for i in range(N)]
@@ -85,7 +85,7 @@ def test_lines_are_counted_as_an_editor_counts_them():
 
 
 def test_text_after_an_ecp_export_is_mentioned():
-    """A script that goes on after its data loses nothing in silence."""
+    """A script that goes on after its data is mentioned."""
     got = table(ECP["a MATLAB script"] + "plot(data)\n")
     assert got.notes == (f"text after line {N + 2} is not data and was not read",)
 
@@ -186,7 +186,7 @@ def mat(compress: bool = False, **variables: object) -> bytes:
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
 def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
-    """Short and unsigned integers come back as they were saved, as scipy's own reader says."""
+    """Short and unsigned integers come back as saved, as in scipy's reader."""
     values = np.arange(0, 100, 2).astype(dtype)
     raw = mat(compress=compress, time=TIME[None, :], enc1=values, duty=values[:, None])
 
@@ -199,7 +199,7 @@ def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
 
 
 def test_a_big_endian_mat_file_is_read():
-    """A file of another processor: the same bytes turned round."""
+    """A file of another processor has the same bytes in reverse."""
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
     values = np.arange(9.0).astype(">f8").tobytes()
     body = b"".join(
@@ -217,7 +217,7 @@ def test_a_big_endian_mat_file_is_read():
 
 
 def test_a_bare_matrix_has_numbered_columns():
-    """One matrix: its columns by number; one that lies on its side is turned, and said."""
+    """Columns of one matrix have numbers; a transposed one is turned, with a note."""
     matrix = np.column_stack([np.arange(N), TIME, X1, U])
     upright, lying = table(mat(data=matrix)), table(mat(data=matrix.T))
     assert upright.form == "matrix"
@@ -229,7 +229,7 @@ def test_a_bare_matrix_has_numbered_columns():
 
 
 def test_what_a_mat_file_holds_besides_is_mentioned():
-    """Structs, text and single numbers are left out, and named."""
+    """Structs, text and single numbers are left out and named."""
     got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
     assert got.names == ("time", "x1")
     said = "not read: run (1 × 1, struct), name (1 × 7, text), rate (1 × 1, float64)"
@@ -238,7 +238,7 @@ def test_what_a_mat_file_holds_besides_is_mentioned():
 
 
 def test_a_counter_that_ran_over_is_made_continuous():
-    """A 16-bit encoder count that passes its end goes on, and the record says so."""
+    """A 16-bit encoder count that overflows goes on, and the record says so."""
     true = 65_500 + 3 * np.arange(N)
     got = table(mat(time=TIME, enc1=(true % 65_536).astype("u2"), duty=np.zeros(N, "i2")))
     assert_allclose(np.diff(column(got, "enc1")), 3, rtol=0, atol=0)
@@ -246,20 +246,20 @@ def test_a_counter_that_ran_over_is_made_continuous():
 
 
 def test_the_hash_is_of_the_bytes(tmp_path):
-    """The provenance names exactly the bytes that were read."""
+    """The hash is of exactly the bytes that were read."""
     (tmp_path / "a.csv").write_bytes(b"time,x1\n0,1\n1,2\n")
     digest = hashlib.sha256(b"time,x1\n0,1\n1,2\n").hexdigest()
     assert read_table(tmp_path, "a.csv")[1] == digest
 
 
 def test_a_file_of_blanks_of_any_sort_is_empty():
-    """A next-line mark alone, as some mainframes end lines, is no row without columns."""
+    """A next-line mark alone, as some mainframes end lines, is not a row."""
     with pytest.raises(SubmissionError, match="the file is empty"):
         table(b"\x85")
 
 
 def test_the_recording_is_the_matrix_whatever_lies_beside_it():
-    """Twelve settings and a list of gains hide no matrix; none of them is taken for a recording."""
+    """Twelve settings and a list of gains hide no matrix, and are not taken for recordings."""
     matrix = np.column_stack([TIME, X1, U])
     stream = BytesIO()
     settings = {f"p{i}": float(i) for i in range(12)}
@@ -273,14 +273,14 @@ def test_the_recording_is_the_matrix_whatever_lies_beside_it():
 
 
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
-    """What `[y, t] = lsim(…)` gives: t is a column, and so is each one of y, by its number."""
+    """In the result of `[y, t] = lsim(…)`, t is a column, and so is each one of y, by number."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))
     assert set(got.names) == {"t", "y column 1", "y column 2"}
     assert_array_equal(column(got, "y column 2"), U)
 
 
 def test_what_may_hold_another_recording_is_told_with_what_to_do():
-    """A further matrix, and a struct as large as the recording, say how they would be read."""
+    """The note says how to read a further matrix, or a struct as large as the recording."""
     further = mat(time=TIME, x1=X1, log=np.ones((90, 70)), raw={"t": TIME, "x": X1, "u": U})
     notes = {v.name: v.advice for v in table(further).variables if not v.read}
     assert "save('new.mat', '-struct', 'raw')" in notes["raw"]
@@ -292,7 +292,7 @@ def test_what_may_hold_another_recording_is_told_with_what_to_do():
 
 
 def test_a_matlab_table_is_told_by_its_name():
-    """An object has no size where others have one; what MATLAB keeps for it has no name."""
+    """An object has no size where others have one; MATLAB's own data for it have no name."""
     flags, name = np.array([6, 8, 17, 0], dtype="<u4").tobytes(), b"run7".ljust(8, b"\0")
     body = flags + np.array([1, 4], dtype="<u4").tobytes() + name
     kept = scipy_element(np.zeros((1, 400), "u1"), name="")
@@ -302,7 +302,7 @@ def test_a_matlab_table_is_told_by_its_name():
 
 
 def mat73(**variables: np.ndarray) -> bytes:
-    """Write a version 7.3 file as MATLAB would: HDF5 behind a block of text, arrays turned."""
+    """Write a version 7.3 file as MATLAB would: HDF5 behind a block of text, arrays transposed."""
     stream = BytesIO()
     with h5py.File(stream, "w", userblock_size=512) as file:
         for name, values in variables.items():
@@ -316,7 +316,7 @@ def mat73(**variables: np.ndarray) -> bytes:
 
 
 def test_a_matlab_7_3_log_is_read_like_any_other():
-    """The same variables as version 5 and as version 7.3 make the same table."""
+    """Version 5 and version 7.3 of the same variables make the same table."""
     log = {
         "time": TIME,
         "enc1": (65_500 + 3 * np.arange(N)).astype("u2"),
@@ -331,7 +331,7 @@ def test_a_matlab_7_3_log_is_read_like_any_other():
 
 
 def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
-    """A struct, text and an empty array are left out, and named."""
+    """A struct, text and an empty array are left out and named."""
     stream = BytesIO(mat73(time=TIME, x1=X1))
     with h5py.File(stream, "r+") as file:
         file.create_group("run")["P"] = 1.0
@@ -347,7 +347,7 @@ def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
 
 @pytest.mark.parametrize("spoil", ["huge", "elsewhere", "link", "cut"])
 def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
-    """Terabytes that are not there, the numbers of another file, half a file: one short error."""
+    """Terabytes that do not exist, links to other files, half a file: one short error."""
     stream = BytesIO(mat73(time=TIME, x1=X1))
     (tmp_path / "secret").write_bytes(bytes(8 * N))
     with h5py.File(stream, "r+") as file:
@@ -364,7 +364,7 @@ def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
 
 
 def scipy_element(values: np.ndarray, *, name: str) -> bytes:
-    """Return a variable's bytes as they stand in a file, under a name of the same length."""
+    """Return the bytes of a variable in a file, under a name of the same length."""
     stream = BytesIO()
     scipy.io.savemat(stream, {name or "x": values})
     raw = stream.getvalue()[128:]
@@ -401,7 +401,7 @@ def test_a_mat_file_of_names_alone_is_refused():
     ids=["text", "record", "texts"],
 )
 def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
-    """An attribute says double, the data say otherwise: it is named as not read."""
+    """An attribute says double, but the data differ: the variable is named as not read."""
     stream = BytesIO()
     with h5py.File(stream, "w", userblock_size=512) as file:
         file["time"], file["x1"] = np.arange(5.0)[None], np.arange(5.0)[None] ** 2

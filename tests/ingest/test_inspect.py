@@ -1,4 +1,4 @@
-"""What `inspect` says of a file: form, columns, clock, kind, problems."""
+"""What `inspect` shows of a file: form, columns, clock, kind, problems."""
 
 import json
 import os
@@ -56,7 +56,7 @@ KINDS = {
 
 @pytest.mark.parametrize(("kind", "signals"), KINDS.items(), ids=KINDS.keys())
 def test_the_kind_is_guessed(kind, signals, tmp_path):
-    """The input's shape and a reference tell what was done."""
+    """The input's shape and a reference reveal the kind of experiment."""
     got = inspect(tmp_path, time=T, x1=X, **signals)
     assert got.kind == kind
     if kind == "sine":
@@ -101,13 +101,13 @@ PROBLEMS = {
 
 @pytest.mark.parametrize(("columns", "problem"), PROBLEMS.values(), ids=PROBLEMS.keys())
 def test_problems_are_named(columns, problem, tmp_path):
-    """What would spoil a report is said before it is made."""
+    """Problems that would spoil a report are listed in advance."""
     got = inspect(tmp_path, **columns)
     assert any(problem in said for said in got.problems), got.problems
 
 
 def test_a_cut_file_is_inspected_all_the_same(tmp_path):
-    """A half last line is a problem named by its line, not the end of the inspection."""
+    """Half a last line is a problem with its line, not the end of the inspection."""
     inspect(tmp_path, time=T, x1=X)
     text = (tmp_path / "a.csv").read_text().rstrip("\n")
     (tmp_path / "a.csv").write_text(text + "\n10.0")
@@ -119,20 +119,20 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
 
 
 def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
-    """A column without a role is left out; the rest of the file is taken."""
+    """A column without a role is left out; the rest of the file is used."""
     got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
     assert got.problems
     assert got.unusable == ()
 
 
 def test_a_clock_that_goes_back_keeps_a_file_from_being_used(tmp_path):
-    """As in a report: two records pasted together are none."""
+    """As in a report, two records pasted together are not used."""
     got = inspect(tmp_path, time=np.r_[T, T], x1=np.r_[X, X])
     assert any("goes back" in said for said in got.unusable)
 
 
 def test_the_text_and_the_json_say_the_same(tmp_path):
-    """Every problem and column stands in both; the JSON has no NaN."""
+    """Every problem and column is in both; the JSON has no NaN."""
     got = inspect(tmp_path, time=np.round(T * 1.013, 3), input=0.3 * np.sin(25 * T), x1=_frozen())
     text, plain = format_inspection(got), json.loads(json.dumps(got.to_dict(), allow_nan=False))
     assert plain["kind"] == "sine"
@@ -143,7 +143,7 @@ def test_the_text_and_the_json_say_the_same(tmp_path):
 
 
 def test_columns_without_names_get_a_line_to_use(tmp_path):
-    """A bare matrix in the order of an ECP export: the clock, encoders and effort are guessed."""
+    """A bare matrix in the order of an ECP export: clock, encoders and effort are guessed."""
     counts = np.round(300 * np.sin(8 * T))
     copy = np.round(0.5 * counts + 0.5 * np.r_[0.0, counts[:-1]])
     matrix = np.column_stack([np.arange(T.size), T, copy, counts, -counts, -0.5 * STEP])
@@ -157,7 +157,7 @@ def test_columns_without_names_get_a_line_to_use(tmp_path):
 
 
 def test_columns_without_a_clock_get_no_suggestion(tmp_path):
-    """Where no column advances as time does, it is said how to name them, and their rate."""
+    """If no column is a clock, the message says how to name columns and rate."""
     scipy.io.savemat(tmp_path / "a.mat", {"data": np.column_stack([X, STEP, np.sin(9 * T)])})
     got = inspect_file(tmp_path / "a.mat")
     assert got.needs == ("columns", "sample_rate")
@@ -168,7 +168,7 @@ def test_columns_without_a_clock_get_no_suggestion(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 def test_a_link_may_be_inspected(tmp_path):
-    """Looking at one's own file through a link is no harm."""
+    """A link to one's own file is allowed."""
     inspect(tmp_path, time=T, x1=X)
     (tmp_path / "link").symlink_to(tmp_path / "a.csv")
     assert inspect_file(tmp_path / "link").samples == 2000
@@ -189,7 +189,7 @@ def test_what_is_no_data_file_is_one_line(tmp_path):
 
 
 def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
-    """Its `data` are looked into, what else lies there is not; problems stand below."""
+    """Its `data` folder is read, other files are not; problems are listed below."""
     (tmp_path / "data").mkdir()
     inspect(tmp_path / "data", time=T, input=STEP, x1=X)
     (tmp_path / "data" / "photo.jpg").write_bytes(b"no data")
@@ -202,7 +202,7 @@ def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
 
 
 def test_what_is_wrong_with_many_files_is_said_once(tmp_path):
-    """A clock rounded in each of six files is one line under the table of them."""
+    """A clock rounded in each of six files is one line under their table."""
     (tmp_path / "data").mkdir()
     for number in range(6):
         inspect(tmp_path / "data", time=np.round(T, 2), input=STEP, x1=X)

@@ -1,4 +1,4 @@
-"""Recordings of real benches are read: every file of every form at hand."""
+"""Recordings of real benches are read: every file of every form that is available."""
 
 import tomllib
 from pathlib import Path
@@ -17,7 +17,7 @@ KINDS = {"DOF1_en1": "step", "DOF1_en2": "decay", "DOF2": "step", "test_3": "ste
 
 
 def read(folder: Path, toml: str, tmp_path: Path) -> Ingested:
-    """Read recordings where they are, described by a submission written elsewhere."""
+    """Read recordings in place, described by a submission written elsewhere."""
     (tmp_path / "submission.toml").write_text(
         "version = 1\n[system]\ncarts = 2\nsprings = [true, true, false]\n"
     )
@@ -35,14 +35,14 @@ def experiment(name: str, kind: str, more: str = "") -> str:
 
 
 def test_every_text_export_is_recognised(real_data):
-    """The kind of each recording is what its authors named it."""
+    """The kind of each recording is the one in its name."""
     for path in sorted((real_data / "ecp210-ucsd").glob("*.csv")):
         got = inspect_file(path)
         expected = next((k for start, k in KINDS.items() if path.name.startswith(start)), None)
         assert got.kind == (expected or "closed_loop"), path.name
         assert got.samples == 677
         assert got.rate == pytest.approx(112.941, abs=1e-3)
-        assert len(got.problems) == 1, got.problems  # the rounded clock, nothing else
+        assert len(got.problems) == 1, got.problems  # only the rounded clock
         assert "rounded to 0.001 s" in got.problems[0]
 
 
@@ -56,7 +56,7 @@ def test_the_servo_exports_are_recognised(real_data):
 
 
 def test_the_signs_of_the_real_bench_are_found(real_data, tmp_path):
-    """Open loop +0.5 V moves cart 1 to negative counts; the controller counts the other way."""
+    """In open loop +0.5 V moves cart 1 to negative counts; the controller counts the other way."""
     folder = real_data / "ecp210-ucsd"
     opened = [f"DOF1_en1_input1_test{i}.csv" for i in range(1, 6)]
     opened += [f"DOF2_en12_input1_test{i}.csv" for i in range(1, 6)]
@@ -87,7 +87,7 @@ def test_the_exported_matrix_is_the_export(real_data, tmp_path):
 
 
 def test_the_serial_bench_logs_are_read(real_data, tmp_path):
-    """Both layouts; the edited copy is the end of the other, its clock straightened alike."""
+    """Both layouts; the edited copy is the end of the other, with its clock straightened too."""
     toml = experiment("Jan281500.mat", "closed_loop")
     toml += experiment("Modified_Jan281500.mat", "closed_loop")
     whole, part = read(real_data / "teensy-torsional", toml, tmp_path).records
@@ -105,7 +105,7 @@ def test_the_serial_bench_logs_are_read(real_data, tmp_path):
 
 
 def test_the_silverbox_is_read(real_data, tmp_path):
-    """No time column: a sample rate and column names make it a record."""
+    """A sample rate and column names replace the missing time column."""
     more = (
         f"sample_rate = {1e7 / 2**14}\ncarts = [1]\nhold = 'band_limited'\n"
         'columns = { input = "V1", x1 = "V2" }'
@@ -119,7 +119,7 @@ def test_the_silverbox_is_read(real_data, tmp_path):
 
 
 def test_the_bench_mat_log_agrees_with_scipy(real_data):
-    """The numbers of every variable are those scipy's reader gives."""
+    """Every variable has the numbers of scipy's reader."""
     for path in sorted(real_data.rglob("*.mat")):
         table, _ = read_table(path.parent, path.name)
         oracle = scipy.io.loadmat(path)

@@ -55,7 +55,7 @@ CM = 'position = { unit = "cm", per_count = 0.00227 }'
 
 
 def test_counts_become_position_units_once(tmp_path):
-    """An ECP's encoder columns are multiplied by per_count; the step is one count."""
+    """An ECP's encoder columns are multiplied by per_count; the encoder step is one count."""
     record = read(tmp_path, CM, STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
     assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
     assert record.encoder_step(1) == 0.00227
@@ -72,7 +72,7 @@ def test_positions_of_a_csv_are_in_the_unit_already(tmp_path):
 
 
 def test_an_encoder_heading_in_a_csv_means_counts(tmp_path):
-    """A CSV that says it holds an encoder's counts is converted like an export."""
+    """A CSV whose heading names encoder counts is converted like an export."""
     content = csv(time=T, input=U, x1=X1).replace("x1", "Encoder 1 Pos")
     record = read(tmp_path, CM, STEP, content).records[0]
     assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
@@ -101,7 +101,7 @@ def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
     ],
 )
 def test_the_usual_headings_are_understood(headings, tmp_path):
-    """Time, input and positions under the names that students give them."""
+    """Time, input and positions under headings that students use."""
     record = read(
         tmp_path, CM, STEP, csv(a=T, b=U, c=X1, d=X2).replace("a,b,c,d", ",".join(headings))
     ).records[0]
@@ -114,7 +114,7 @@ def test_the_usual_headings_are_understood(headings, tmp_path):
 
 
 def test_a_copied_file_is_no_repeat(tmp_path):
-    """Two experiments with the same bytes are pointed out."""
+    """Two experiments with the same bytes are reported."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     for name in ("one", "two"):
         toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
@@ -131,7 +131,7 @@ def test_time_in_other_units_is_suspected(tmp_path):
 
 
 def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
-    """Which cart a nameless column belongs to is not guessed."""
+    """Nobody guesses the cart of a column without a number."""
     content = csv(**{"Time__us": np.round(1e6 * T), "Displacement__mm": X1})
     with pytest.raises(
         SubmissionError, match=r"no column is a cart's position; it has Time \[us\]"
@@ -157,7 +157,7 @@ def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
     ],
 )
 def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
-    """Whoever forgets the unit is asked for it: an encoder has no fractions of a count."""
+    """Without a unit it is asked for, since an encoder has no fractions of a count."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -178,7 +178,7 @@ def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
     ],
 )
 def test_a_unit_that_nobody_knows_is_asked_about(system, ids, tmp_path):
-    """What benches are measured in is known; anything else is no unit in silence."""
+    """Known units of benches pass; any other unit raises a question."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -189,7 +189,7 @@ def test_a_unit_that_nobody_knows_is_asked_about(system, ids, tmp_path):
 
 
 def test_a_heading_in_another_unit_is_asked_about(tmp_path):
-    """Centimetres by their heading and counts by the file: somebody has to say which."""
+    """Centimetres by the heading and counts by the file: a question asks which."""
     folder = tmp_path / "s"
     data = read(folder, "", STEP, csv(time=T, input__N=U, x1__cm=Y[0] / 440, x2=X2))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -226,7 +226,7 @@ PER_COUNT = 'input = { unit = "V", sign = 1, per_count = 1e-4 }'
 
 @pytest.mark.parametrize("written", ["512", "512.0"])
 def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
-    """Whole numbers no voltage reaches are counts where the submission says what one is."""
+    """Whole numbers that no voltage reaches are counts, if the submission states their scale."""
     duty = np.round(51_200 * U)
     content = csv(time=T, input=duty, x1=X1).replace(",512,", f",{written},")
     assert f",{written}," in content
@@ -248,7 +248,7 @@ def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
     ids=["a step of one volt", "fractions", "a heading in volts"],
 )
 def test_a_scale_that_no_input_needs_is_said(content, tmp_path):
-    """Volts stay volts, and a per_count that nothing uses is named."""
+    """Volts stay volts, and an unused per_count is named."""
     data = read(tmp_path, PER_COUNT, STEP, content)
     assert data.records[0].input_scale == 1.0
     (said,) = data.warnings
@@ -256,7 +256,7 @@ def test_a_scale_that_no_input_needs_is_said(content, tmp_path):
 
 
 def test_an_effort_with_fractions_is_no_duty_count(tmp_path):
-    """The same log with volts in it stays in volts."""
+    """The same log with volts stays in volts."""
     record = read(tmp_path, "", STEP, bench_log(U)).records[0]
     assert record.u is not None
     assert_array_equal(record.u, U)
@@ -288,7 +288,7 @@ def test_the_bench_mat_layouts_agree_with_its_log(tmp_path):
 
 
 def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
-    """`columns` gives a bare matrix its meaning; whole positions are counts."""
+    """`columns` names the columns of a bare matrix; whole positions are counts."""
     stream = BytesIO()
     scipy.io.savemat(stream, {"data": np.column_stack([np.arange(N), T, X1, X2, U])})
     columns = STEP + "\ncolumns = { time = 2, x1 = 3, x2 = 4, input = 5 }"
@@ -298,7 +298,7 @@ def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
 
 
 def test_the_system_names_the_columns_of_all_its_recordings(tmp_path):
-    """Those that a file has; an experiment's own go before them."""
+    """For all files with such columns; those of an experiment go first."""
     named = CM + '\ncolumns = { x1 = "first", x2 = "second", reference = "goal" }'
     content = csv(time=T, input=U, first=X1, second=X2)
     record = read(tmp_path, named, STEP, content).records[0]
@@ -316,14 +316,14 @@ def test_a_sample_rate_stands_in_for_a_time_column(tmp_path):
 
 
 def test_a_sample_rate_against_the_time_column_is_mentioned(tmp_path):
-    """Measured time goes before a stated rate."""
+    """Measured time wins over a stated rate."""
     record = read(tmp_path, "", STEP + "\nsample_rate = 200.0", csv(t=T, u=U, x1=X1)).records[0]
     assert_allclose(record.t, T, atol=1e-6)
     assert any("sample_rate = 200 Hz is not used" in note for note in record.notes)
 
 
 def test_a_window_keeps_its_part_of_the_times(tmp_path):
-    """Times stay the file's own; both ends are included; the end may be rounded up a little."""
+    """Times stay as in the file; both ends are included; the end may be rounded up a little."""
     record = read(tmp_path, "", STEP + "\nwindow = [1.0, 2.0]", csv(time=T, u=U, x1=X1)).records[0]
     inside = (T >= 1.0) & (T <= 2.0)
     assert_allclose(record.t, T[inside], atol=1e-6)
@@ -333,7 +333,7 @@ def test_a_window_keeps_its_part_of_the_times(tmp_path):
 
 
 def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
-    """A log that paused keeps all its samples, and the record says where it paused."""
+    """A log that paused keeps all its samples, and a note says where."""
     late = T + np.where(T > 2.0, 0.7, 0.0)
     record = read(tmp_path, "", STEP, csv(time=late, input=U, x1=X1)).records[0]
     assert record.t.size == N
@@ -348,7 +348,7 @@ def test_columns_that_are_not_used_are_mentioned(tmp_path):
 
 
 def test_a_broken_channel_is_noted(tmp_path):
-    """A stuck encoder and a clipped input stand in the record's notes."""
+    """A stuck encoder and a clipped input are in the record's notes."""
     sweep = np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0)
     x = np.round(440 * 5 * np.sin(6 * T))
     x[200:240] = x[199]
@@ -361,7 +361,7 @@ def test_a_broken_channel_is_noted(tmp_path):
 
 
 def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
-    """In a closed loop it is the set point, in position units; elsewhere there is none."""
+    """In a closed loop it is the set point, in position units; in open loop it is ignored."""
     content = ecp(reference=np.where(T > 0.5, 1000.0, 0.0), x1=X1, effort=U)
     closed = read(tmp_path, CM, LOOP, content).records[0]
     assert closed.reference is not None
@@ -370,7 +370,7 @@ def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
 
 
 def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
-    """What an ECP logs in open loop is a copy of encoder 1."""
+    """In open loop an ECP logs a copy of encoder 1."""
     copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
     record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
     assert record.reference is None
@@ -396,7 +396,7 @@ def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
 
 
 def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
-    """What the students say goes before what the data say; a contradiction is told."""
+    """The stated sign wins over the data, and a contradiction is reported."""
     content = csv(time=T, input=U, x1=X1)
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
     assert_array_equal(data.records[0].u, -U)
@@ -411,7 +411,7 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
 
 
 def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
-    """Every record that contradicts the stated sign is named in one check, with the remedy."""
+    """One check names every record that contradicts the stated sign, with the remedy."""
     toml = 'version = 1\n[system]\ncarts = 2\ninput = { unit = "V", sign = 1 }\n'
     for name, scale in {"one": -1, "two": -2, "right": 1}.items():
         toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
@@ -424,7 +424,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """A log that counts the other way is found; one that tells nothing follows its own sort."""
+    """A log that counts the other way is found; an unclear one follows its own kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),
@@ -449,14 +449,14 @@ def test_signs_may_differ_between_experiments(tmp_path):
 
 
 def test_data_that_do_not_tell_the_sign_are_said_to(tmp_path):
-    """Where cart 1 is not measured the sign is taken as +1, and said."""
+    """If cart 1 is not measured, the sign is taken as +1, with a note."""
     data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
     assert_array_equal(data.records[0].u, U)
     assert "the data do not tell the sign of the input" in data.warnings[0]
 
 
 def test_a_dwell_carries_its_frequency(tmp_path):
-    """Hz in the submission, rad/s inside; left out it is left to the fit."""
+    """Hz in the submission, rad/s inside; a missing frequency is left to the fit."""
     content = csv(time=T, input=np.sin(10 * T), x1=X1)
     with_f = read(tmp_path, "", 'kind = "sine"\nfrequency = 4.0', content).records[0]
     assert with_f.omega == pytest.approx(8 * np.pi)
@@ -467,7 +467,7 @@ def test_a_dwell_carries_its_frequency(tmp_path):
 
 
 def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
-    """Frequencies in Hz, ascending; without repeats 1 % is taken, and said."""
+    """Frequencies in Hz, ascending; without repeats 1 % is assumed, with a note."""
     f = np.array([4.0, 1.0, 2.0])
     data = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=f + 1, x2=f + 2))
     first, second = data.tables
@@ -499,7 +499,7 @@ def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):
 
 
 def test_a_bode_table_with_held_carts_is_left_out_and_said(tmp_path):
-    """A response of some carts only is another plant's."""
+    """A response of only some carts belongs to another plant."""
     content = csv(frequency=np.array([1.0, 2.0]), x1=np.array([1.0, 2.0]))
     data = read(tmp_path, "", 'kind = "bode"\ncarts = [1]', content)
     assert data.tables == ()

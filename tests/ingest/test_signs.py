@@ -1,4 +1,4 @@
-"""The sign of the input: one for a bench, decided by all its records together."""
+"""The sign of the input is one for a bench, decided by all its records together."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -63,7 +63,7 @@ CASES = {
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_the_sign_of_a_single_record_is_found(case, sign, preset):
-    """Whatever moves the cart from rest tells the direction in which the motor pushes."""
+    """Any motion from rest shows the direction in which the motor pushes."""
     assert find_signs(one(case, respond(preset, case, sign)), stated={}) == {"a": sign}
 
 
@@ -79,7 +79,7 @@ def test_the_sign_is_never_wrong_on_a_late_log(frequency):
 
 
 def test_without_motion_or_input_there_is_no_sign():
-    """A decay, a locked cart or a few samples tell nothing."""
+    """A decay, a held cart or a few samples do not show it."""
     decay: Array = np.rint(440 * np.exp(-T) * np.cos(13 * T))
     assert find_signs(one(np.zeros_like(T), decay), stated={}) == {}
     assert find_signs(one(np.sin(T), np.full_like(T, 3.0)), stated={}) == {}
@@ -88,7 +88,7 @@ def test_without_motion_or_input_there_is_no_sign():
 
 @pytest.mark.parametrize("size", [1e-320, 1e-160, 1e-9, 1e9, 1e160, 1e305])
 def test_numbers_of_any_size_do_no_harm(size):
-    """Units do not matter; where a float has no more room the record tells nothing, in silence."""
+    """Units do not matter; near the limits of floats the record says nothing."""
     u = CASES["sweep"]
     x = respond("throne-1dof", u, 1)
     for records in (one(size * u, x), one(u, size * x), one(size * u, size * x)):
@@ -101,7 +101,7 @@ def test_numbers_of_any_size_do_no_harm(size):
 
 @pytest.fixture(scope="module", params=[(1, LATE[0]), (2, LATE[0]), (2, LATE[1]), (3, LATE[1])])
 def bench(request, tmp_path_factory) -> Path:
-    """The submission of a bench whose input reaches the carts late; it states no sign."""
+    """Return a bench whose input reaches the carts late; its submission states no sign."""
     carts, late = request.param
     hidden = prepare_bench(preset=f"throne-{carts}dof", hide=(late,))
     folder = tmp_path_factory.mktemp("late") / "bench"
@@ -125,7 +125,7 @@ def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Recor
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
-    """Above the resonance each alone may seem to have the other sign; all together have one."""
+    """Above the resonance each alone may seem reversed; together they give one sign."""
     records = driven(bench)
     names = {record.id for record in records}
     found = find_signs(reversed_in(records, names if sign < 0 else ()), stated={})
@@ -134,7 +134,7 @@ def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
 
 @pytest.mark.parametrize(("sign", "said"), [(1, False), (-1, True)])
 def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, said):
-    """Right, nothing is said; wrong, every record says so in one sentence."""
+    """A right sign needs no word; for a wrong one every record says so in one sentence."""
     submission = load_submission(bench)
     drive = submission.system.input.model_copy(update={"sign": sign})
     system = submission.system.model_copy(update={"input": drive})
@@ -148,9 +148,9 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
 
 
 def test_a_record_that_counts_the_other_way_is_found(bench):
-    """Each by itself, all dwells together, or every second record.
+    """One alone, all dwells, or every second record.
 
-    But dwells so far up that a delay may do it tell nothing.
+    Dwells so far up that a delay explains them do not count.
     """
     records = driven(bench)
     names = [record.id for record in records]
@@ -171,7 +171,7 @@ def test_a_record_that_counts_the_other_way_is_found(bench):
 
 
 def test_the_report_asks_why_a_record_was_turned(tmp_path):
-    """One step logged the other way round: it is turned, said, and asked about."""
+    """One step logged the other way is reversed, reported, and asked about."""
     folder = tmp_path / "bench"
     write_submission(folder, "throne-1dof", seed=5, compact=True)
     toml, step = folder / "submission.toml", folder / "data" / "step-1.csv"

@@ -1,4 +1,4 @@
-"""Damaged files: whatever the damage, a clear error or a record, never a crash, never a hang."""
+"""Damaged files give a clear error or a record, never a crash or a hang."""
 
 import time
 from contextlib import contextmanager
@@ -130,7 +130,7 @@ def damaged(raw: bytes, hits: list[tuple[str, float, bytes]]) -> bytes:
 
 @pytest.fixture(scope="module")
 def submission(tmp_path_factory) -> Submission:
-    """One experiment of each kind of reading, all on the same file."""
+    """Return a submission with one experiment of each kind of reading, all on the same file."""
     folder = tmp_path_factory.mktemp("fuzz")
     kinds = ('kind = "step"', 'kind = "closed_loop"', 'kind = "bode"', 'kind = "decay"')
     matrix = "columns = { time = 1, input = 2, x1 = 3 }\n"
@@ -144,7 +144,7 @@ def submission(tmp_path_factory) -> Submission:
 
 @contextmanager
 def few_lines_at_most(most=1):
-    """Let a complaint pass if it has few lines; anything else that is raised is a failure."""
+    """Accept an error of few lines; anything else that is raised is a failure."""
     message = ""
     began = time.process_time()
     try:
@@ -158,7 +158,7 @@ def few_lines_at_most(most=1):
 
 
 def try_everything(submission: Submission, raw: bytes) -> None:
-    """Read the bytes as every kind of experiment and inspect them."""
+    """Read the bytes as every kind of experiment, and inspect them."""
     path = submission.folder / "a.dat"
     path.write_bytes(raw)
     for experiment in submission.experiments:
@@ -173,7 +173,7 @@ def try_everything(submission: Submission, raw: bytes) -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_undamaged_file_is_read(name, submission):
-    """What is damaged below is sound before."""
+    """The file is sound before it is damaged below."""
     assert parse_table(FILES[name], source="a.dat").values.shape[1] >= N - 1
 
 
@@ -184,7 +184,7 @@ def test_the_undamaged_file_is_read(name, submission):
 )
 @given(hits=st.lists(damage, min_size=1, max_size=4))
 def test_a_damaged_file_is_an_error_or_a_record(name, hits, submission):
-    """Cuts, flipped bits, junk and repeats: one line of complaint, or finite data in time."""
+    """Cuts, flipped bits, junk and repeats: one line of error, or finite data in time."""
     try_everything(submission, damaged(FILES[name], hits))
 
 

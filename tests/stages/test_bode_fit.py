@@ -155,7 +155,7 @@ def test_intervals_cover_the_truth(preset, phases):
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """With k_1 = 0 half the noisy sets want it negative: it is held at zero, and said."""
+    """With k_1 = 0 half the noisy sets want it negative: it is held at zero, with a note."""
     fits = [
         fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
         for seed in range(20)
@@ -180,13 +180,13 @@ def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
     assert_allclose(got.parameters["K_1"].value, got.parameters["K_2"].value, rtol=1e-4)
 
 
-# Beside a peak so sharp that none of six points sees its damping.
+# Beside a peak so sharp that the six points do not show its damping.
 SHARP = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
 BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """Held at zero, it says so and has no standard error; gain and frequency are known."""
+    """A damping held at zero is noted and has no standard error; gain and frequency are known."""
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
 
     assert got.at_bound == ("c_1",)
@@ -197,7 +197,7 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
-    """One of two dampings at zero: the modes keep an error that allows for it on both sides."""
+    """With one of two dampings at zero, the errors of the modes allow for it on both sides."""
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
     got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
 
@@ -212,7 +212,7 @@ def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
 
 
 def test_the_decay_tells_a_damping_that_the_response_leaves_open():
-    """Six points beside a sharp peak allow any small damping, so the decay's is the answer."""
+    """Six points beside a sharp peak allow any small damping, so the decay's value is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
 
@@ -224,7 +224,7 @@ def test_the_decay_tells_a_damping_that_the_response_leaves_open():
 
 
 def test_where_one_damping_is_open_all_decays_are_fitted_along():
-    """The response alone puts one of two dampings at zero: both decays tell."""
+    """The response alone puts one of two dampings at zero; both decays decide."""
     chain = PRESETS["throne-2dof"]
     decays = {
         cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
@@ -377,7 +377,7 @@ def test_one_measured_cart_may_do():
 
 
 def test_the_last_cart_alone_does_not_determine_two():
-    """X_2/U has five coefficients, two carts have seven parameters: this is said."""
+    """X_2/U has five coefficients, two carts have seven parameters: the error says so."""
     with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
         fit_bode(noisy("throne-2dof")[1:], bench=Bench(springs=(True,) * 3))
 
@@ -398,7 +398,7 @@ def test_few_points_are_refused():
     ],
 )
 def test_impossible_responses_are_refused(change, message):
-    """Numbers that are none, negative frequencies and carts that do not exist are named."""
+    """Values that are not finite, negative frequencies and carts that do not exist are named."""
     (response,) = noisy("throne-1dof")
     with pytest.raises(DataError, match=message):
         fit_bode([replace(response, **change)], bench=Bench(springs=(True, True)))

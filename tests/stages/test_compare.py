@@ -74,7 +74,7 @@ def test_a_wide_error_makes_no_agreement(std, outcome):
 
 
 def test_a_final_value_at_its_bound_is_none():
-    """A damping that the fit holds at zero is no number for the table, and nothing is judged."""
+    """A damping held at zero is not a number for the table, and nothing is judged."""
     final = Estimate(value=0.0, std=None, source="bode_fit", at_bound=True)
     (row,) = compare(
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
@@ -98,7 +98,7 @@ def test_a_final_value_known_no_better_than_the_limit_is_none(name, std, there):
 
 
 def test_an_estimate_is_not_compared_with_itself():
-    """Where the final damping rests on the decay too, there are not two ways to compare."""
+    """If the final damping rests on the decay too, there are not two methods to compare."""
     (row,) = compare(
         {"zeta": _estimate(0.017, 1e-4, "log_decrement")},
         final={"zeta": _estimate(0.017, 1e-4, "log_decrement")},

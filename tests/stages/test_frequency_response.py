@@ -103,7 +103,7 @@ def test_repeats_that_agree_halve_the_variance():
 
 
 def test_repeats_that_scatter_say_so():
-    """Two dwells 0.1 apart have an error of 0.05, whatever theirs claim."""
+    """Two dwells that differ by 0.1 have an error of 0.05, whatever they claim."""
     (got,) = collect_dwells([dwell(omega=5.0, gain=1.95), dwell(omega=5.0, gain=2.05)])
 
     assert_allclose(got.magnitude, 2.0, rtol=1e-12)
@@ -199,9 +199,9 @@ def test_errors_of_a_record_are_honest(preset, drive):
     assert [r.cart for r in responses] == list(range(1, chain.n + 1))
     for response in responses:
         z = errors(chain, response)
-        # 100 and more values of unit size: their rms is within 1 ± 0.2; up to 1.4 is left for
-        # what the local polynomials miss at a resonance. Too cautious is no fault, by the half
-        # count that a rest is allowed; a tenth would be no error at all.
+        # 100 and more values of unit size: their rms is within 1 ± 0.2; up to 1.4 is allowed for
+        # the error of the local polynomials at a resonance. Caution is accepted, because of the
+        # half count allowed at rest; a tenth would mean no error estimate at all.
         assert 0.1 < np.sqrt(np.mean(z**2)) < 1.4
         assert response.omega.size > 50
 
@@ -249,7 +249,7 @@ def test_records_without_an_input_are_refused():
 
 
 def test_a_record_of_nothing_but_noise_is_refused():
-    """Where no frequency stands out, there is no response to report."""
+    """If no frequency stands out, there is no response to report."""
     t = np.arange(0, 5, 0.01)
     still = record(PRESETS["throne-1dof"], t, 1e-7 * pulse(t + 0.4), noise=COUNT_NOISE)
     with pytest.raises(DataError, match="step-0 stand out of its noise"):
@@ -333,5 +333,5 @@ def test_noise_makes_no_resonance():
 
 
 def test_no_response_gives_no_estimates():
-    """Nothing in, nothing out: not even assumed dampings."""
+    """Without a response there are no estimates, not even assumed dampings."""
     assert find_resonances([], n=2) == {}

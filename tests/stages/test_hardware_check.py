@@ -113,7 +113,7 @@ def bench(
 
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 def test_a_true_model_leaves_the_noise(name, cart):
-    """Both simulations of a run come down to the noise, and agree on the step's figures."""
+    """Both simulations of a run leave only the noise, and agree on the figures of the step."""
     chain = PLANTS[name]
     design = designed(chain, cart)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
@@ -146,7 +146,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 @pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
 def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
-    """The factor the log wants is recovered, said, and used in both simulations."""
+    """The factor of the log is found, reported, and used in both simulations."""
     chain = PLANTS[name]
     design = designed(chain, cart)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
@@ -166,7 +166,7 @@ def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
 
 
 def test_an_input_a_little_off_is_the_models_error():
-    """A gain 20 % off is reported as such and not mended."""
+    """A gain that is 20 % off is reported and not corrected."""
     y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -182,7 +182,7 @@ def test_an_input_a_little_off_is_the_models_error():
 
 
 def test_a_stated_sign_that_the_log_contradicts_is_said():
-    """Where the log has the opposite sign of the stated law, the loop is closed the log's way."""
+    """If the log has the opposite sign of the stated law, the loop is closed as logged."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -195,7 +195,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_said():
 
 
 def test_a_stated_scale_that_the_log_contradicts_is_said():
-    """A PID whose scale was left out is closed with the factor the log shows."""
+    """A PID whose scale was left out is closed with the factor found in the log."""
     law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
     run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
     y = encoder(run.x)
@@ -214,7 +214,7 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
 
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
 def test_what_contradicts_the_run_fails_a_check(wrong):
-    """A tenfold column, exchanged gains or another cart: what is stated is not what ran."""
+    """A tenfold column, swapped gains or another cart: the statement is not what ran."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -322,7 +322,7 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
 
 
 def test_only_the_cart_that_is_steered_has_the_set_point():
-    """The others have nowhere to be; where nothing says which it is, none has."""
+    """The other carts have no set point; if the cart is not stated, none of them has one."""
     y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
     run = record(y, u=u, reference=STEPS)
     unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
@@ -345,7 +345,7 @@ def test_a_pid_acts_on_the_files_own_counts():
 
 
 def test_a_displaced_rest_is_no_error_of_the_model():
-    """Encoders zeroed off the rest leave the open check at the noise."""
+    """Encoders zeroed away from the rest leave the open check at the noise."""
     y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -375,7 +375,7 @@ def test_a_record_that_begins_in_motion_has_its_start_fitted():
 
 @pytest.mark.parametrize("start", [0, 30, 57, 90, 240])
 def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
-    """At rest, just after the step, or settled on it: the start is seen for what it is."""
+    """At rest, just after the step, or settled on it: the start is found."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -385,7 +385,7 @@ def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
     opened = of(check_hardware(run, TWO, controller=stated(design)), "open")[2]
 
     assert_allclose(known(opened.input_scale), 1.0, atol=0.01)
-    # A rest known from one reading is off by up to a count, all along.
+    # A rest known from one reading is off by up to a count throughout.
     assert opened.nrmse < 1.35 * whole + COUNT / np.sqrt(np.mean(y[1] ** 2))
 
 
@@ -443,7 +443,7 @@ def test_without_gains_the_measured_input_alone_is_checked(controller):
 
 
 def test_an_unstable_statement_is_said():
-    """Gains that cannot have run are said to be unstable, and the open check goes on."""
+    """Gains that cannot have run are called unstable, and the open check goes on."""
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     wild = submission.StateFeedbackController(
         type="state_feedback", gains=(-1.0, -0.5, 0.0, 0.0), prefilter=1.0
@@ -523,7 +523,7 @@ UCSD = Chain(  # V, count, s; damping of about a tenth
     ],
 )
 def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_limit, sign):
-    """The closed-loop logs want two to four times the input, of the sign opposite to open loop."""
+    """The closed-loop logs need two to four times the input, with the sign reversed."""
     run = ucsd(real_data / "ecp210-ucsd", name, sign=sign)
 
     checks = check_hardware(

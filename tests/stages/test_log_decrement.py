@@ -24,8 +24,8 @@ OMEGA, RELEASE = 20.0, 0.4  # rad/s, s
 def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0):
     """Hold a cart at `start`, release it: exact, half cycle by half cycle, dry friction d = F/k.
 
-    While the cart moves one way it swings about d to the other side; where it turns within d of
-    its rest point it stays.
+    While the cart moves one way it swings about d on the other side; once it turns within d of its
+    rest point it stays.
     """
     omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
     half = np.pi / omega_d
@@ -152,7 +152,7 @@ def test_the_hold_before_the_release_is_left_out():
 
 
 def test_a_record_may_begin_at_the_release():
-    """Where the first sample is already free, all of it counts."""
+    """If the first sample is already free, the whole record counts."""
     t = np.arange(0, 4, 1 / FS)
     got = fit_log_decrement(record(t, held_then_free(t, zeta=0.05, release=-0.1)), cart=1)
     assert got.release == 0.0
@@ -161,7 +161,7 @@ def test_a_record_may_begin_at_the_release():
 
 @pytest.mark.parametrize("hand", [12.0, 18.0, 20.0, 25.0])
 def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
-    """Shaken ever further at some rhythm, let go in mid-swing: only the decay is fitted."""
+    """Shaken ever further in some rhythm, released in mid-swing: only the decay is fitted."""
     t, zeta, release = np.arange(0, 6, 1 / FS), 0.04, 1.9
     decay, omega_d = zeta * OMEGA, OMEGA * np.sqrt(1 - zeta**2)
     x0 = 0.8 * np.sin(hand * release)
@@ -186,7 +186,7 @@ def test_a_touch_after_the_decay_is_left_out():
 @pytest.mark.parametrize("on_off", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
-    """After an edge the cart swings about its new rest point; without input where that is seen."""
+    """After an edge the cart swings about its new rest point, also without a logged input."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = sign * 0.03 * ((t > 0.5) & ((t < 4.0) | (not on_off)))
     run = record(t, simulate_linear(chain, t, u)[0], u=u, kind="step")
@@ -198,7 +198,7 @@ def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
 
 
 def test_the_driven_part_of_a_decay_is_left_out():
-    """A cart set going by the motor decays once the input is zero."""
+    """A cart started by the motor decays once the input is zero."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = 0.03 * np.sin(14 * t) * (t < 3.0)
     got = fit_log_decrement(record(t, simulate_linear(chain, t, u)[0], u=u), cart=1)
@@ -284,7 +284,7 @@ def test_damping_that_grows_with_amplitude_is_no_friction():
 
 
 def flags(seeds, *, d):
-    """Of so many decays with friction band d: how many are called friction."""
+    """Return how many of these decays with friction band d are said to have friction."""
     found = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -303,7 +303,7 @@ def flags(seeds, *, d):
 
 
 def test_friction_is_told_from_none():
-    """In twenty decays each, none is seen where there is none, all where d = 0.01 cm."""
+    """In twenty decays each: never without friction, always at d = 0.01 cm."""
     assert not flags(20, d=0.0).any()
     assert flags(20, d=0.01).all()
 
@@ -362,7 +362,7 @@ def test_a_motion_that_does_not_decay_is_refused():
 
 
 def test_a_hold_without_release_is_refused():
-    """A hand that never lets go leaves noise."""
+    """If the hand never lets go, only noise is left to fit."""
     run = released(zeta=0.05)
     held = run.t < RELEASE
     with pytest.raises(DataError, match="needs 3 turning points"):
@@ -411,7 +411,7 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
 
 
 def test_a_crest_of_equal_readings_turns_in_its_middle():
-    """Where an encoder is too coarse for a crest to curve, the turning point is still right."""
+    """If an encoder is too coarse for a crest to curve, the turning point is still right."""
     zeta = 0.05
     run = released(zeta=zeta, count=0.03)
     got = fit_log_decrement(run, cart=1)
@@ -425,7 +425,7 @@ def test_a_crest_of_equal_readings_turns_in_its_middle():
 
 
 def test_a_fit_of_spikes_is_finite_before_its_start():
-    """A fit to values of 1e12 is no decay; carried back over those before it, nothing overflows."""
+    """A fit to values of 1e12 is no decay; extended backwards, nothing overflows."""
     fit = Ringing(
         t0=1.25,
         level=0.0,

@@ -100,7 +100,7 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
 
 
 def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
-    """Fitted one after another, in any order, carts have the numbers they have alone."""
+    """Fitted one after another, in any order, carts have the numbers of a fit alone."""
     run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     together = Dwell(run)
     for cart in (3, 1, 2):
@@ -170,7 +170,7 @@ def test_a_noisy_input_leaves_the_stated_frequency():
 
 
 def test_an_input_that_stops_ends_the_dwell():
-    """What follows the input's end, or precedes its start, is no part of the steady state."""
+    """Samples after the input's end, or before its start, are not steady state."""
     t = sampled(14.0)
     omega = 2 * np.pi * 3.0
     truth = CHAIN.frequency_response(np.array([omega]))[0, 0]
@@ -183,7 +183,7 @@ def test_an_input_that_stops_ends_the_dwell():
 
 
 def test_a_dwell_cut_short_is_said_not_to_be_settled():
-    """Where the transient still runs the estimate is given, marked, and its error is large."""
+    """If the transient still runs, the estimate is marked and has a large error."""
     run, truth = dwell(sampled(1.6), hertz=2.4)
     got = fit_sine(run, cart=1)
     assert not got.settled
@@ -201,7 +201,7 @@ def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
 
 
 def test_few_counts_are_mentioned():
-    """An amplitude below twenty encoder counts is worth a word."""
+    """An amplitude below twenty encoder counts is noted."""
     run, _ = dwell(sampled(9.0), amplitude=10 * COUNT)
     got = fit_sine(run, cart=1)
     assert "10.0 encoder counts" in got.note

@@ -277,7 +277,7 @@ def test_the_input_limit_is_kept(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
-    """Where the limit cannot even hold the step, the message says how far it can."""
+    """If the limit cannot even hold the step, the message says how far it can."""
     chain = PRESETS["throne-2dof"]
     got = design(chain, cart=2, limit=0.05, method=method)
 
@@ -322,7 +322,7 @@ def test_a_fast_plant_is_sampled_faster():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("speed", [0.1, 10.0])
 def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, speed):
-    """What the result says of its goal is what its own step shows, whatever the time scales."""
+    """The result's statement about its goal follows from its own step, at any time scale."""
     chain = PRESETS["throne-2dof"]
     other = Chain(m=chain.m / speed**2, c=chain.c / speed, k=chain.k)
     got = design(other, cart=2, settling=3.0, method=method)
@@ -357,6 +357,6 @@ def test_no_overshoot_at_all_can_be_asked_for():
     ],
 )
 def test_impossible_tasks_are_refused(chain, cart, reference, message):
-    """A cart that is not there, no step, or a cart out of the motor's reach is an error."""
+    """A missing cart, no step, or a cart that the motor cannot reach is an error."""
     with pytest.raises(DataError, match=message):
         design(chain, cart=cart, reference=reference)

@@ -1,4 +1,4 @@
-"""Static gain from step runs: levels found, gains, friction, what cannot be used."""
+"""Static gain from step runs: levels, gains, friction, and records that cannot be used."""
 
 from dataclasses import replace
 
@@ -140,7 +140,7 @@ def test_a_record_that_ends_before_the_carts_settle(name, wait):
 
 
 def test_an_edge_before_the_carts_have_settled():
-    """Where the input goes off too soon, both edges still count."""
+    """If the input goes off too soon, both edges still count."""
     chain, t = PRESETS["throne-2dof"], seconds(8.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (0.5, 0.03), (1.7, 0.0))), cart=1)
     assert len(got.edges) == 2
@@ -195,7 +195,7 @@ def test_a_noisy_input_still_has_its_edges():
 
 
 def test_a_slow_edge_is_one_edge():
-    """An input that takes ten samples to its level steps once."""
+    """An input that takes ten samples to reach its level steps once."""
     chain, t = PRESETS["throne-1dof"], seconds(7.0)
     u = 0.03 * np.clip((t - 0.5) / 0.09, 0, 1)
     got = fit_step_gain(run_of(chain, t, u), cart=1)
@@ -204,7 +204,7 @@ def test_a_slow_edge_is_one_edge():
 
 
 def test_a_drift_is_taken_out():
-    """A rest point that creeps alike before and after the edges shifts no gain."""
+    """A rest point that creeps equally before and after the edges shifts no gain."""
     chain, t = PRESETS["throne-1dof"], seconds(16.0)
     u = staircase(t, (3.0, 0.03), (9.0, 0.0))
     y = simulate_linear(chain, t, u) + 0.01 * t
@@ -218,7 +218,7 @@ def test_a_drift_is_taken_out():
 
 
 def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
-    """Exponential moves between levels, each missed by what friction holds."""
+    """Exponential moves between levels, each short by the friction band."""
     y = np.full_like(t, rests[0])
     for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
         after = t >= edge
@@ -227,7 +227,7 @@ def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
 
 
 def test_a_rest_point_that_does_not_return_is_reported():
-    """A cart that sticks gives an interval, which holds what the gain would be without."""
+    """A cart that sticks gives an interval, which contains the gain without friction."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.0))
     got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
@@ -243,7 +243,7 @@ def test_a_rest_point_that_does_not_return_is_reported():
 
 
 def test_a_step_too_small_to_move_the_cart():
-    """An edge that friction swallows is named and does not count."""
+    """An edge that friction holds is named and does not count."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.035))
     got = fit_step_gain(
@@ -258,7 +258,7 @@ def test_a_step_too_small_to_move_the_cart():
 
 
 def test_without_an_input_the_error_says_what_to_do():
-    """A gain is per input unit: a file without the input cannot be used."""
+    """A gain is per input unit, so a file without the input cannot be used."""
     run = run_of(PRESETS["throne-1dof"], seconds(4.0), seconds(4.0) * 0)
     with pytest.raises(DataError, match=r"^step: step gain needs the input.*`columns`$"):
         fit_step_gain(replace(run, u=None), cart=1)
@@ -282,7 +282,7 @@ def test_a_held_cart_is_refused():
 
 
 def test_a_cart_that_does_not_move_is_refused():
-    """An unplugged encoder is no gain of zero."""
+    """An unplugged encoder does not mean a gain of zero."""
     t = seconds(8.0)
     u = staircase(t, (0.5, 0.03), (4.0, 0.0))
     with pytest.raises(DataError, match="needs motion, cart 1 does not move"):

@@ -1,4 +1,4 @@
-"""The joint fit on time records finds chains it has not seen, from nothing."""
+"""The joint fit on time records finds unknown chains without a start value."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 
 def std(fit: ChainFit, name: str) -> float:
-    """Return the standard error of a named parameter, which must be there."""
+    """Return the standard error of a named parameter, which must exist."""
     found = fit.parameters[name].std
     assert found is not None
     return found
@@ -95,7 +95,7 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
 
 
 def test_a_band_limited_input_is_used_as_such():
-    """A smooth input between samples is followed to 1e-4 of the motion, a held one is not."""
+    """A smooth input is followed to 1e-4 of the motion; read as held it is not."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
     t = np.arange(600) / 113.0
     u = 0.05 * np.sin(15 * t) * np.sin(np.pi * t / t[-1]) ** 2
@@ -149,13 +149,13 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
         assert fit.converged
         # 3 × 4 × at most 17 numbers: none beyond 4.5 standard errors but in 1 of 700 such tests.
         assert np.max(np.abs(errors(fit, chain))) < 4.5
-        # chi² of over 2000 positions is within 0.1 of 1; a rounding error that is not uniform
-        # (a cart at rest stays on one count) takes up to 0.3 off.
+        # chi² of over 2000 positions is within 0.1 of 1; a rounding error that is not uniform (a
+        # cart at rest stays on one count) lowers it by up to 0.3.
         assert 0.6 < fit.chi_square_per_dof < 1.15
 
 
 def test_held_carts_and_hand_releases_join_in():
-    """Steps with a cart held and decays of single carts are fitted together with the others."""
+    """Steps with a cart held, and decays of single carts, are fitted together with the others."""
     rng = np.random.default_rng(3)
     chain = PRESETS["throne-3dof"]
     records = [
@@ -168,12 +168,12 @@ def test_held_carts_and_hand_releases_join_in():
     assert fit.converged
     assert np.max(np.abs(errors(fit, chain))) < 4
     alone = fit_records(records[:1], bench=Bench(springs=(True,) * 4))
-    # Decays of cart 3 tell more of it than a step that reaches it through two springs.
+    # Decays of cart 3 determine it better than a step that reaches it through two springs.
     assert std(fit, "zeta_3") < 0.8 * std(alone, "zeta_3")
 
 
 def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
-    """A window cut out of a motion is recognised, said, and does no harm."""
+    """A window cut out of a motion is recognised, with a note, and does no harm."""
     rng = np.random.default_rng(4)
     chain = PRESETS["throne-2dof"]
     x0 = np.array([0.3, -4.0, -0.2, 3.0])  # cm, cm/s
@@ -187,7 +187,7 @@ def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
 
 
 def test_a_cart_that_was_not_measured_is_still_found():
-    """With the middle cart's encoder missing, the other two carry all there is to know."""
+    """Without the middle cart's encoder, the other two carry all the information."""
     rng = np.random.default_rng(5)
     chain = PRESETS["throne-3dof"]
     whole = [step_record(chain, rng=rng, swing=swing, id=f"{swing}") for swing in (1.0, 0.5)]
@@ -227,7 +227,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """An undamped cart's step: held at zero or not, the damping is never known to be zero."""
+    """An undamped cart's step: held at zero or not, its damping has no standard error."""
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
         fit_records(
@@ -246,7 +246,7 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """The last spring, expected but missing, is found to be zero and said to be held there."""
+    """The last spring, declared but missing, is held at zero, with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
     fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
@@ -313,7 +313,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
 
 
 def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
-    """Beyond the comparisons it may take no start is tried; what was found first is returned."""
+    """Beyond the allowed number of comparisons no start is tried; the first result is returned."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
@@ -361,7 +361,7 @@ def test_correlated_residuals_count_for_less():
 
 
 def test_a_long_rest_before_the_step_is_one_reading():
-    """What an encoder rounds off while nothing moves makes a gain no less certain than it is."""
+    """A constant reading before the step does not make a gain more certain."""
     chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0
     t = np.arange(int(10 * rate)) / rate
     u = np.where(t > 5.0, 1.0 / chain.static_gains()[0], 0.0)
@@ -378,13 +378,13 @@ def test_a_long_rest_before_the_step_is_one_reading():
         white.append(
             std(fit, "K") / std(fit_records([short], bench=Bench(springs=(True, True))), "K")
         )
-    # 24 draws tell a spread to 14 %.
+    # 24 draws determine a spread to 14 %.
     assert 0.6 < np.sqrt(np.mean(np.square(off)[:, 0])) < 1.4
     assert 0.5 < np.median(white) < 1.1
 
 
 def test_readings_of_a_rest_share_an_error():
-    """Weighed, the mean of a first rest tells what a mean with that error in common tells."""
+    """The weighted mean of a first rest has the information of one mean with a common error."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
     window = open_window(step_record(chain, rng=rng, noise=0.0))
     n = window.n_resting

@@ -1,4 +1,4 @@
-"""A recording that the report leaves out is no part of the gap either."""
+"""A recording that the report leaves out is not used for the gap either."""
 
 import json
 from dataclasses import replace
@@ -23,7 +23,7 @@ HEAVIER = Chain(m=1.4 * CHAIN.m, c=CHAIN.c, k=CHAIN.k)  # a weight was left on t
 
 @pytest.fixture(scope="module")
 def analysis(tmp_path_factory):
-    """A linear bench: steps of two sizes, decays, and one repeat with a weight left on."""
+    """The analysis of a linear bench: two step sizes, decays, one repeat with an extra weight."""
     folder = tmp_path_factory.mktemp("bench")
     rng = np.random.default_rng(5)
     records = [
@@ -47,7 +47,7 @@ def analysis(tmp_path_factory):
 
 
 def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
-    """The odd repeat neither trains nor judges; gap.json names it with the report's own reason."""
+    """The odd repeat is neither trained nor judged on; gap.json has the report's reason."""
     (odd,) = analysis.left_out
     assert (odd.experiment, odd.is_wrong) == ("step-4", False)
 
@@ -64,14 +64,14 @@ def test_what_the_report_leaves_out_is_in_no_figure_of_the_gap(analysis):
 
 
 def test_a_gap_file_of_before_is_still_read(analysis):
-    """A gap.json without `left_out` is read as one that left nothing out."""
+    """A gap.json without `left_out` is read as an empty list."""
     document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
     del document["left_out"]
     assert read_gap(json.dumps(document)).left_out == ()
 
 
 def test_nothing_left_is_an_error_that_says_why(analysis):
-    """Where every recording is left out the reasons are told."""
+    """If every recording is left out, the message gives the reasons."""
     out = tuple(
         LeftOut(experiment=record.id, reason="its clock stood still", is_wrong=True)
         for record in analysis.records

@@ -1,4 +1,4 @@
-"""Standard errors of friction and delay, where no bodies meet: about as large as the errors are."""
+"""Standard errors of friction and delay, without contacts, match the actual errors."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ from tests.truth.cases import make_case
 
 
 def standardised(folder, *, preset, hide, seed):
-    """Return by how many standard errors each parameter of the true model is off."""
+    """Return the error of each parameter of the true model in standard errors."""
     bench = VirtualBench(prepare_bench(preset=preset, model=None, hide=hide), seed=seed)
     hidden = bench.carts._bench
     springs = tuple(bool(k > 0) for k in hidden.chain.k)
@@ -58,9 +58,9 @@ def standardised(folder, *, preset, hide, seed):
     ],
 )
 def test_parameters_are_off_by_what_is_stated(tmp_path, preset, hide, seeds):
-    """A cart that friction holds reads the same for seconds: that is one reading, not a thousand.
+    """A cart that friction holds for seconds gives one reading, not a thousand.
 
-    Of so few numbers a root mean square scatters by a quarter; with white noise it was four.
+    The root mean square of so few numbers scatters by a quarter; under white noise it was four.
     """
     z = np.array(
         [
@@ -81,7 +81,7 @@ def fitted(case):
 
 
 def test_a_model_that_runs_away_has_no_errors():
-    """A spring that softens without end: its readings and derivatives are no numbers."""
+    """A spring that softens without end gives no finite readings or derivatives."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     chain = fit.structure.chain(fit.theta)
     soft = make_candidate(find_effect("cubic_spring"), 1, (-1.0,), runs=runs, chain=chain)
@@ -91,7 +91,7 @@ def test_a_model_that_runs_away_has_no_errors():
 
 
 def test_every_record_has_encoder_errors_of_its_own():
-    """A record that stands there twice is drawn for twice: not just half the covariance."""
+    """A record that is listed twice is drawn twice, so the covariance is not just halved."""
     fit, runs = fitted(make_case(seed=42, n=1, rate=113.1))
     once = covariance(replace(fit, nuisance=fit.nuisance[:1]), runs[:1]).covariance
     twice = covariance(replace(fit, nuisance=fit.nuisance[:1] * 2), runs[:1] * 2).covariance

@@ -1,4 +1,4 @@
-"""A model that follows a record: its derivatives are those of what it computes."""
+"""A model that follows a record: its derivatives equal differences of its errors."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.simulator.terms import Kind
 from tests.truth.cases import make_case
 
-# Of the largest input, position and the parameters of cart 1 and spring 2.
+# Relative to the largest input, position and the parameters of cart 1 and spring 2.
 SIZES = {
     Kind.COULOMB_FRICTION: lambda u, x, m, k: (0.02 * u,),
     Kind.LOAD_FRICTION: lambda u, x, m, k: (0.02,),
@@ -32,14 +32,14 @@ SIZES = {
     Kind.BACKLASH: lambda u, x, m, k: (0.1 * x, 0.3 * m, 0.6),
 }
 DRIVEN = (Kind.DRIVE_DAMPING, Kind.COGGING, Kind.BACKLASH)
-# Whether a cart turns, or bodies meet, before a reading or after it is a jump in its error.
+# Whether a cart turns, or bodies meet, before or after a reading makes its error jump.
 JUMPS = (*DRY, Kind.BACKLASH)
 
 
 @pytest.mark.parametrize("gain", [0.5, 0.1, 0.0])
 @pytest.mark.parametrize("kind", SIZES)
 def test_derivatives_are_those_of_what_is_computed(kind, gain):
-    """All parameters and a run's own, with a drive that has all its laws: central differences."""
+    """All parameters and a run's own unknowns, with all laws of a drive: central differences."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))
@@ -66,7 +66,7 @@ def test_derivatives_are_those_of_what_is_computed(kind, gain):
         _, J = errors(at, derive=True)
         steps = np.diag(1e-5 * np.where(at == 0.0, 1e-3, np.abs(at)))
         present = at != 0.0
-        present[p.size : p.size + 2] = True  # zeros, which are nothing here
+        present[p.size : p.size + 2] = True  # zeros, which mean no effect here
         for lane in np.flatnonzero(present):
             above, below = (errors(at + sign * steps[lane])[0] for sign in (1.0, -1.0))
             numeric = (below - above) / (2.0 * steps[lane, lane])
@@ -78,7 +78,7 @@ def test_derivatives_are_those_of_what_is_computed(kind, gain):
 
 
 def test_a_model_that_runs_away_is_told():
-    """A spring that softens without end leaves no errors, and no derivatives."""
+    """A spring that softens without end gives neither errors nor derivatives."""
     case = make_case(seed=44, n=2, rate=113.1)
     chain = Chain(m=np.array(case.m), c=np.array(case.c), k=np.array(case.k))
     track = make_track(make_run(case.records[0], n=2))

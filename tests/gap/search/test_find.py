@@ -1,4 +1,4 @@
-"""Which laws are looked for, and what is judged."""
+"""The laws that are searched for, and the hypotheses that are judged."""
 
 from pipeline.gap.limits import BIC_DROP
 from pipeline.gap.search.find import find_hypotheses
@@ -8,7 +8,7 @@ from tests.truth.bench import Hidden
 
 
 def test_what_hides_below_the_floor_is_looked_for():
-    """Hardly any friction, beside a delay that alone leaves what may be noise."""
+    """Tiny friction beside a delay that alone leaves about the noise."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 2.4e-6}),
         Hidden(effect="input_delay", parameters={"delay": 0.014}),

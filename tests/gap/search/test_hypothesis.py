@@ -1,4 +1,4 @@
-"""What an effect must bring to be worth it."""
+"""The gain in fit that justifies an effect."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -12,7 +12,7 @@ from tests.gap.search.begun import CUBIC, DELAY
 
 
 def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0) -> Hypothesis:
-    """Return a hypothesis with what it leaves of 1000 training and 1000 held-out points."""
+    """Return a hypothesis with its errors at 1000 training and 1000 held-out points."""
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
     fit: Any = SimpleNamespace(chi=chi, structure=SimpleNamespace(effects=effects), n_points=1000.0)
     left: Any = SimpleNamespace(chi=held)
@@ -37,7 +37,7 @@ def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0)
     ],
 )
 def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
-    """Of the runs fitted and of those held out; of what the fuller model leaves."""
+    """Both of the training runs and of the held-out runs; counted in the fuller model."""
     parent = judged(CUBIC, chi=6.0, held=6.0)
     both = judged(CUBIC, DELAY, **child)
     study: Any = SimpleNamespace(explains=lambda h: True)
@@ -50,7 +50,7 @@ def test_an_effect_is_worth_it_by_independent_residuals(child, worth):
      (0.014, False, 0.01, False)],
 )  # fmt: skip
 def test_a_name_that_leaves_more_than_noise_says_so(error, contact, repeatability, said):
-    """Not beside a contact, whose own law is not the model's, nor within what repeats differ by."""
+    """Except beside a contact, whose law is approximate, and within the difference of repeats."""
     chosen: Any = SimpleNamespace(error=error, has_contact=contact)
     study: Any = SimpleNamespace(floor=0.01, repeatability=repeatability)
     assert Study.may_be_half(study, chosen) == said

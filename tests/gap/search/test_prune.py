@@ -1,4 +1,4 @@
-"""What a search leaves out at its end."""
+"""The last step of a search: removing needless effects."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ from tests.truth.bench import Hidden
 
 
 def test_a_richer_law_that_explains_no_more_gives_way():
-    """Dry friction that yields over next to nothing is plain dry friction."""
+    """Friction that yields over almost no distance is plain dry friction."""
     fit, study = begun(
         Hidden(effect="coulomb_friction", place=1, parameters={"force": 0.0006}),
         Hidden(effect="input_delay", parameters={"delay": 0.015}),
@@ -38,7 +38,7 @@ def test_a_richer_law_that_explains_no_more_gives_way():
 
 @pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
 def test_what_is_nothing_within_its_error_is_told(value, nothing):
-    """A delay is named where it is three standard errors from none."""
+    """A delay is named if it is three standard errors from zero."""
     fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
     chain = fit.structure.chain(fit.theta)
     delay = make_candidate(
@@ -50,4 +50,4 @@ def test_what_is_nothing_within_its_error_is_told(value, nothing):
 
     (found,) = sureness(replace(known, covariance=sure))
     assert (found < SURE) == nothing
-    assert sureness(known) == [np.inf]  # without an error nothing is said
+    assert sureness(known) == [np.inf]  # without an error no statement is made

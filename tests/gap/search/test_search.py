@@ -49,7 +49,7 @@ def test_what_is_hidden_is_named(hidden, verdict, found):
 
 
 def test_without_time_the_linear_model_is_the_answer():
-    """Past the time allowed nothing more is tried, and the deadline says so."""
+    """Past the time limit nothing more is tried, and the deadline is reported."""
     search = searched(FRICTION, seconds=0.0)
 
     assert search.deadline.cut
@@ -58,7 +58,7 @@ def test_without_time_the_linear_model_is_the_answer():
 
 
 def test_noise_that_was_taken_for_too_much_is_measured_anew():
-    """With three times the noise there is, the friction still comes out, and the noise too."""
+    """With an assumed noise three times too large, friction and noise are still found."""
     fit, study = begun(FRICTION)
     loud = study.with_noise([replace(run, sigma=3.0 * run.sigma) for run in study.training])
     search = Search(loud, fit, Deadline(map, seconds=None))

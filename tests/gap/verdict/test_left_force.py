@@ -1,4 +1,4 @@
-"""The force that no effect explains: laws that are not in the catalogue are read off the data."""
+"""The unexplained force: laws that are not in the catalogue are read off the data."""
 
 from collections.abc import Callable
 
@@ -27,7 +27,7 @@ CARTS = {
 
 
 def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: int) -> Record:
-    """Return one run of carts on springs with a law of force more on one of them.
+    """Return one run of carts on springs with an extra law of force on one of them.
 
     Heun's method with steps of 1 ms; encoder steps and noise of a third of one.
     """
@@ -70,7 +70,7 @@ def record(chain: Chain, law: Law, *, cart: int, kind: Kind, size: float, seed: 
 
 
 def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
-    """Return a lab of sweeps, steps and decays."""
+    """Return a lab with sweeps, steps and decays."""
     plan: tuple[tuple[Kind, float], ...] = (
         ("sweep", 0.05), ("sweep", 0.03), ("step", 0.08), ("step", 0.05), ("decay", 2.0),
         ("decay", 1.2),
@@ -82,7 +82,7 @@ def recordings(law: Law, *, carts: int = 1, cart: int = 1) -> list[Record]:
 
 
 def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tuple[Residual, ...]:
-    """Return what is left by the linear chain that fits best."""
+    """Return the force that the best linear chain leaves."""
     runs = prepare(records, springs=springs, interventions=(), notes=[])
     training, held_out = take_sides(runs, notes=[])
     fit, training = fit_baseline(training, springs=springs, start=None)
@@ -103,9 +103,9 @@ def left_by_the_chain(records: list[Record], *, springs: tuple[bool, ...]) -> tu
     ids=["drag", "root friction", "van der Pol", "force by place", "two laws"],
 )
 def test_a_law_is_read_off_what_it_leaves(law, terms):
-    """The terms of a law are found, no other, its numbers within 6 %.
+    """The terms of a law are found, and no others, with numbers within 6 %.
 
-    That is three of the standard errors stated of the least sure, the root's.
+    That is three of the stated standard errors of the least certain one, the root.
     """
     (residual,) = left_by_the_chain(recordings(law), springs=(True, False))
 
@@ -117,7 +117,7 @@ def test_a_law_is_read_off_what_it_leaves(law, terms):
 
 
 def test_noise_has_no_formula():
-    """Nothing is read into what a right model leaves."""
+    """The residual of a right model gets no formula."""
     (residual,) = left_by_the_chain(recordings(lambda x, v, u: 0.0), springs=(True, False))
 
     assert residual.formula is None
@@ -125,7 +125,7 @@ def test_noise_has_no_formula():
 
 
 def test_the_force_is_on_the_cart_that_it_acts_on():
-    """Of two carts only the second has a formula for it: its neighbour's motion is taken off."""
+    """Of two carts only the second has a formula: its neighbour's motion is subtracted."""
     records = recordings(lambda x, v, u: -6e-5 * v * abs(v), carts=2, cart=2)
 
     first, second = left_by_the_chain(records, springs=(True, True, True))
@@ -141,7 +141,7 @@ def test_the_force_is_on_the_cart_that_it_acts_on():
 
 
 def test_an_effect_that_the_catalogue_lacks_is_described():
-    """The workflow without quadratic drag: unexplained, and the formula is that of drag."""
+    """Without quadratic drag in the catalogue: unexplained, and the formula is that of drag."""
     catalogue = [effect for effect in CATALOGUE if effect.key != "quadratic_drag"]
 
     gap = explain_gap(
