@@ -1,4 +1,4 @@
-"""What others are compared by is fair: the right model, failures counted, free runs judged."""
+"""Other tools are compared fairly: the right model, failures counted, free runs judged."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -38,7 +38,7 @@ def _vector(n: int, named: dict[str, float]) -> np.ndarray:
 
 @pytest.mark.parametrize("chain", PRESETS.values(), ids=list(PRESETS))
 def test_the_papers_transfer_functions_are_those_of_the_chain(chain):
-    """What Nelder–Mead and `curve_fit` fit can be right: the same response, by the same names."""
+    """The model of Nelder–Mead and `curve_fit` can be right: same response, same names."""
     p = _vector(chain.n, chain.parameters())
 
     assert p.shape == start_of(chain.n).shape
@@ -60,7 +60,7 @@ def test_curve_fit_finds_the_truth_in_dwells_without_noise():
 
 
 def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
-    """The hold is undone and the transient left out; what the hold folds back is below 1 %."""
+    """The hold is undone and the transient left out; aliases of the hold are below 1 %."""
     chain = PRESETS["throne-2dof"]
     hertz, G = responses_of(multisine(chain, rng=np.random.default_rng(0), noise=1e-12))
 
@@ -70,7 +70,7 @@ def test_the_responses_for_a_modal_analysis_are_those_of_the_chain():
 
 
 def test_subspaces_find_the_truth_in_a_record_without_noise():
-    """A realisation of Markov parameters: the rest of 8 s of ringing is below a thousandth."""
+    """A realisation of Markov parameters: after 8 s the ringing is below a thousandth."""
     chain = PRESETS["throne-1dof"]
     found = realised(multisine(chain, rng=np.random.default_rng(0), noise=1e-9))
 
@@ -79,7 +79,7 @@ def test_subspaces_find_the_truth_in_a_record_without_noise():
 
 
 def test_no_answer_is_infinitely_wrong():
-    """A method that stops, or finds too few resonances, is counted and not left out."""
+    """A method that stops, or finds too few resonances, is counted."""
     chain = PRESETS["throne-1dof"]
     truth = modes_named(chain, list(chain.parameters().values()))
 
@@ -102,7 +102,7 @@ def test_a_free_run_is_judged_after_its_start_and_divergence_is_infinite():
 
 
 def test_of_nearly_equal_models_the_sparser_is_taken():
-    """And none, where all of them diverge."""
+    """And no model, if all of them diverge."""
     part = Part(dt=0.01, u=np.zeros(100), y=np.ones(100), first=0)
 
     def off_by(value: float, terms: int) -> Model:
@@ -116,7 +116,7 @@ def test_of_nearly_equal_models_the_sparser_is_taken():
 
 
 def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
-    """Nothing is larger than what could be learnt from, and the linear carts are the same."""
+    """No input exceeds those of the training records, and the linear carts are the same."""
     case = make_case(seed=7, n=1, rate=113.1)
     further = further_records(case, seed=8)
 
@@ -147,7 +147,7 @@ def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
     ],
 )
 def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
-    """The right effects under another verdict are no promise."""
+    """The right effects under another verdict do not count."""
     found = ("cubic_spring",) if verdict not in ("none", "unexplained") else ()
     effects = tuple(SimpleNamespace(effect=SimpleNamespace(key=key)) for key in found)
     gap: Any = SimpleNamespace(verdict=verdict, effects=effects)

@@ -1,4 +1,4 @@
-"""What is compared with has to be right too: the notebook's reference, the slips, the records."""
+"""The basis of the comparison is right: the notebook's reference, the slips, the records."""
 
 import json
 from functools import partial
@@ -14,7 +14,7 @@ from pipeline.submission import load_submission
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory):
-    """Return a class of an honest team and one of each slip, and whose slip is which."""
+    """Return a class of an honest team and one with each slip, and the slips by team."""
     folder = tmp_path_factory.mktemp("class") / "class"
     return folder, grading_notebooks.write_teams(folder, honest=1, each=1)
 

@@ -1,4 +1,4 @@
-"""The page of the benchmarks: one section made anew leaves the others, and quick ones run."""
+"""The page of the benchmarks: making one section keeps the others, and quick runs work."""
 
 import sys
 
@@ -22,7 +22,7 @@ def _section(name: str, cell: str) -> str:
 
 
 def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
-    """The page is its own store: order is the list's, whatever was made first."""
+    """The page stores its sections in the order of the list, whichever was made first."""
     file, order = tmp_path / "README.md", ("first", "second")
     file.write_text("# Mine\n\nWritten by hand.\n", encoding="utf-8")
 
@@ -38,7 +38,7 @@ def test_one_section_made_anew_leaves_the_others_and_the_head(tmp_path):
 
 
 def test_a_section_says_what_it_was_made_with():
-    """Versions of what is compared stand below, and what is not installed is said to be so."""
+    """Versions of the compared tools are listed below; tools that are not installed are named."""
     text = _section("first", "1.0")
 
     assert f"numpy {version('numpy')}" in text
@@ -63,7 +63,7 @@ def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
 
 @pytest.mark.parametrize("name", CHEAP)
 def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
-    """`--quick` tells its tables on stdout only."""
+    """`--quick` prints its tables on stdout only."""
     before = command.PAGE.read_bytes()
     monkeypatch.setattr(sys, "argv", ["benchmarks", name, "--quick"])
 
@@ -74,7 +74,7 @@ def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
 
 
 def test_an_unknown_name_is_refused(monkeypatch):
-    """The names there are stand in the message; nothing is written."""
+    """The message lists the known names; nothing is written."""
     monkeypatch.setattr(sys, "argv", ["benchmarks", "no-such-benchmark"])
 
     with pytest.raises(SystemExit) as refused:
@@ -87,11 +87,11 @@ def test_an_unknown_name_is_refused(monkeypatch):
     ("value", "text"), [(0.01234, "0.012"), (12.34, "12"), (123.4, "123"), (1e7, "1e+07")]
 )
 def test_numbers_keep_two_digits(value, text):
-    """As many digits as mean something."""
+    """As many digits as are significant."""
     assert significant(value) == text
 
 
 def test_spread_is_median_and_quartiles():
-    """One value has none."""
+    """A single value has no spread."""
     assert spread([1.0, 2.0, 3.0, 4.0, 5.0]) == "3.0 (2.0–4.0)"
     assert spread([2.0]) == "2.0"

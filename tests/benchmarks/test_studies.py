@@ -1,4 +1,4 @@
-"""What the studies count: all benches that were drawn, all errors that were stated."""
+"""The studies count all benches that were drawn, and all stated errors."""
 
 import pytest
 
@@ -48,7 +48,7 @@ def test_a_limit_passed_is_told_apart_from_other_ends():
 
 
 def test_a_recording_beyond_the_travel_limit_is_a_limit_passed(tmp_path):
-    """The name under which a study counts it: of the bench that records, not of the study."""
+    """A study counts it under the exception's name on the bench that records."""
     drawn = draw(71_001, effects=0)
     bench = VirtualBench(drawn.bench, seed=1)
     submission = load_submission(new_folder(tmp_path / "lab", bench, springs=drawn.springs))

@@ -1,4 +1,4 @@
-"""What `report --tables` saves is what the analysis found, for pandas and for MATLAB."""
+"""`report --tables` saves the results of the analysis, for pandas and for MATLAB."""
 
 import io
 from dataclasses import replace
@@ -71,12 +71,12 @@ def test_matlab_finds_the_names_of_the_report(analysis):
 
 
 def test_a_file_of_matlab_does_not_tell_the_time(analysis):
-    """The header that MATLAB skips over holds no date, so that the bytes are the same tomorrow."""
+    """The header that MATLAB skips holds no date, so the bytes are always the same."""
     assert matlab_file(analysis)[:116] == b"MATLAB 5.0 MAT-file".ljust(116)
 
 
 def test_bode_data_are_those_of_the_analysis(analysis):
-    """A row a cart and frequency, and the standard errors have the units of what they are of."""
+    """One row for each cart and frequency; standard errors have the units of their values."""
     frame = frames.frequency_response(analysis)
     second = frame[frame["cart"] == 2]
     for name in ("omega", "magnitude", "magnitude_std", "phase", "phase_std"):
@@ -88,7 +88,7 @@ def test_bode_data_are_those_of_the_analysis(analysis):
 
 
 def test_a_table_of_ratios_has_no_phase(analysis):
-    """It is missing in the table and empty for MATLAB, not zero."""
+    """It is missing in the table and empty in MATLAB, not zero."""
     first = replace(analysis.frequency_responses[0], phase=None, phase_std=None, source="table")
     reduced = replace(analysis, frequency_responses=(first,))
     assert np.isnan(frames.frequency_response(reduced)["phase"].to_numpy()).all()
@@ -97,7 +97,7 @@ def test_a_table_of_ratios_has_no_phase(analysis):
 
 
 def test_records_get_names_that_matlab_takes(analysis):
-    """Ids that MATLAB would read as the same name, or as none, stay apart and keep their id."""
+    """Ids that MATLAB would confuse or refuse get different names, and keep their id."""
     record = analysis.records[0]
     ids = ("step-1", "step 1", "1", "end", "é" * 80, "é" * 81, "x" * 70, "x" * 71)
     found = matlab(replace(analysis, records=tuple(replace(record, id=id_) for id_ in ids)))
@@ -108,7 +108,7 @@ def test_records_get_names_that_matlab_takes(analysis):
 
 
 def test_an_analysis_of_nothing_still_has_its_tables(analysis, tmp_path):
-    """Where nothing was found, tables have their headings and the MAT-file has no A."""
+    """Tables have their headings only, and the MAT-file has no A."""
     nothing = replace(
         analysis, records=(), log_decrements=(), step_gains=(), sine_points=(), rows=(), checks=(),
         frequency_responses=(), fit=None, feedback=None,

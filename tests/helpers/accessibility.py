@@ -1,11 +1,11 @@
-"""What axe finds wrong with a page for those who see it badly, or not at all."""
+"""Faults that axe finds on a page for readers with poor or no sight."""
 
 from typing import Any, NamedTuple
 
 from axe_playwright_python.sync_playwright import Axe
 
-# Figures are images with a text of their own, and rows of a table are alike: without the drawings
-# and the rows after the eighth axe is done in a fifth of the time. Both are put back.
+# Figures are images with their own text, and the rows of a table are similar. Without the drawings
+# and the rows after the eighth, axe takes a fifth of the time. Both are put back.
 _THIN = """() => {
   const spare = document.querySelectorAll('figure svg > *, tbody tr:nth-child(n + 9)');
   window.spare = [...spare].map((it) => [it, it.previousSibling, it.parentNode]);
@@ -28,7 +28,7 @@ class Violation(NamedTuple):
 
 
 def violations(page: Any) -> list[Violation]:
-    """Return what axe finds by day, and in the colours by night: nothing else differs then."""
+    """Return the faults that axe finds by day; at night only the colours, as only they differ."""
     page.evaluate(Axe().axe_script)
     page.evaluate(_THIN)
     found = []

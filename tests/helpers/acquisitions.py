@@ -14,7 +14,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until
 
-LIMITS = PlanLimits(input=0.5, travel=2.5)  # V, cm: what the virtual benches state as theirs
+LIMITS = PlanLimits(input=0.5, travel=2.5)  # V, cm: the scales that the virtual benches state
 
 
 def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:
@@ -34,7 +34,7 @@ def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0
 def write_work(
     folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits = LIMITS, scales: str = ""
 ) -> Path:
-    """Write a submission of two carts with this plan; its scales are the bench's to state."""
+    """Write a submission of two carts with this plan; the bench states the scales."""
     folder.mkdir(parents=True, exist_ok=True)
     text = f'version = 1\n\n[system]  # ours\ncarts = 2\nposition = {{ unit = "cm" }}\n{scales}'
     (folder / NAME).write_text(text, encoding="utf-8")
@@ -43,7 +43,7 @@ def write_work(
 
 
 class Notes:
-    """Takes down what it is told; confirms everything."""
+    """Records what it is told, and confirms everything."""
 
     def __init__(self) -> None:
         self.confirmed: list[str] = []
@@ -64,7 +64,7 @@ class Notes:
         """Note nothing."""
 
     def started(self, recording: Recording) -> None:
-        """Forget the lines of the run before."""
+        """Forget the lines of the previous run."""
         self.readings_seen = []
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
@@ -94,7 +94,7 @@ def host(folder: Path, port: str, *options: str) -> AbstractContextManager[subpr
 
 
 def until_bytes(raw: Path, process: subprocess.Popen[str], *, least: int = 5_000) -> None:
-    """Wait until a host has written so much of a run."""
+    """Wait until a host has written this many bytes of a run."""
 
     def written() -> bool:
         assert process.poll() is None, "the host ended before"

@@ -41,7 +41,7 @@ _PRESET = {1: "throne-1dof", 2: "throne-2dof", 3: "throne-3dof"}
 
 @cache
 def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysis:
-    """Return everything `analyse` would find for the preset of 1, 2 or 3 carts."""
+    """Return a complete analysis of the preset of 1, 2 or 3 carts."""
     rng = np.random.default_rng(seed)
     chain = PRESETS[_PRESET[carts]]
     numbers = range(1, carts + 1)
@@ -76,7 +76,7 @@ def make_analysis(carts: int = 2, *, seed: int = 1, repeats: int = 2) -> Analysi
 
 
 def _measure(y: Array, rng: np.random.Generator) -> Array:
-    """Return positions as an encoder with a little noise gives them."""
+    """Return positions as an encoder with a little noise reads them."""
     return np.round((y + rng.normal(0.0, 0.3 * _COUNT, y.shape)) / _COUNT) * _COUNT
 
 

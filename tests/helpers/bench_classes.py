@@ -1,4 +1,4 @@
-"""Whole classes on one bench, in memory: what every team's run has in common is simulated once."""
+"""Whole classes on one bench, in memory: motion common to all teams is simulated once."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ BENCHES = [
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Moved:
-    """What the carts of a class did: for each team its runs and their motions."""
+    """The motion of a class's carts: the runs of each team and their positions."""
 
     bench: SimulatedBench
     teams: Sequence[Sequence[tuple[BenchRun, TrueMotion]]]
@@ -35,7 +35,7 @@ class Moved:
 def move_class(
     preset: str, hide: str = "", *, seeds: range, count: float = COUNT, dwells: int = 12
 ) -> Moved:
-    """Return how the carts moved for as many teams as there are seeds, all on one bench."""
+    """Return the motion of the carts for as many teams as there are seeds, on one bench."""
     bench = prepare_bench(preset=preset, hide=(hide,) if hide else ())
     bench = replace(bench, count=count)
     session = runs.SimulatedSession(bench=bench, repeats=2, n_dwells=dwells)
@@ -50,7 +50,7 @@ def move_class(
         rng = np.random.default_rng(seed)
         controller = _controller(claims.believed_chain(bench.chain, rng), bench)
         own = [
-            *runs.plan_decays(session, rng),  # no two hands let go alike
+            *runs.plan_decays(session, rng),  # no two hands let go in the same way
             runs.plan_closed_loop(session, cart=min(2, bench.chain.n), controller=controller),
         ]
         moved = [(run, bench.move(run)) for run in own]
@@ -61,7 +61,7 @@ def move_class(
 def read_class(
     moved: Moved, *, seed: int, count: float | None = None, noise: float = USUAL_NOISE
 ) -> list[tuple[Record, ...]]:
-    """Return what each team's encoders say of it, with noise in counts, as its files have it."""
+    """Return the readings of each team's encoders, with noise in counts, as in its files."""
     count = moved.bench.count if count is None else count
     bench = replace(moved.bench, count=count, noise_counts=noise)
     decimals = max(0, math.ceil(-math.log10(count)) + 1)

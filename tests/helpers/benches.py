@@ -1,4 +1,4 @@
-"""A virtual bench in a process of its own, for tests and for whoever tries a host."""
+"""A virtual bench in a process of its own, for tests and for trying a host."""
 
 import json
 import os
@@ -78,7 +78,7 @@ def emulator(
 
 
 def _listen(running: Emulator, said: IO[str], ready: threading.Event) -> None:
-    """Take down what the bench says until it says no more."""
+    """Collect the bench's messages until it ends."""
     for line in said:
         if line.startswith("{"):
             event = json.loads(line)

@@ -1,4 +1,4 @@
-"""The command line as people meet it: in a process of its own, or quicker, in this one."""
+"""The command line in a process of its own, or faster in this one."""
 
 import subprocess
 import sys

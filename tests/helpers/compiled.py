@@ -1,4 +1,4 @@
-"""What the tests need compiled: once, before they begin; each of their processes would, else."""
+"""Compile the tests' simulators once, before they begin, instead of in each process."""
 
 import os
 import subprocess
@@ -9,11 +9,11 @@ import psutil
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import until
 
-_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for those that wait for it
+_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for processes that wait for it
 
 
 def start_compiler() -> "subprocess.Popen[bytes]":
-    """Compile in a process beside this one, of which the processes started from now on know."""
+    """Start to compile in another process; later child processes wait for it."""
     script = "from tests.helpers.compiled import compile_all; compile_all()"
     compiler = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
     os.environ[_COMPILER] = str(compiler.pid)
@@ -21,7 +21,7 @@ def start_compiler() -> "subprocess.Popen[bytes]":
 
 
 def await_compiler() -> None:
-    """Wait until what another process compiles is there."""
+    """Wait until the other process has compiled."""
 
     def ended() -> bool:
         try:
@@ -35,7 +35,7 @@ def await_compiler() -> None:
 
 
 def compile_all() -> None:
-    """Compile the workflow's simulator and the truth's."""
+    """Compile the workflow's simulator and the second one."""
     import numpy as np
 
     from pipeline.plant.nonlinear.augmented import compile_simulator

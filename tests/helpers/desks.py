@@ -1,4 +1,4 @@
-"""A desk that is served, and somebody who asks it as a browser without scripts does."""
+"""A desk, and a visitor who uses it as a browser without scripts does."""
 
 import http.client
 import json
@@ -32,7 +32,7 @@ site = "https://Lab.example.edu"
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What came back."""
+    """The desk's answer to a request."""
 
     status: int
     headers: Mapping[str, str]
@@ -53,7 +53,7 @@ class Answer:
 
 @dataclass(kw_only=True)
 class Visitor:
-    """Who asks: with a cookie or the headers of a proxy, from an address of this computer."""
+    """A visitor with a cookie or the headers of a proxy, from an address of this computer."""
 
     port: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class Visitor:
 
     @classmethod
     def of(cls, url: str) -> "Visitor":
-        """Return who opened the address that was printed."""
+        """Return a visitor who opened the printed address."""
         parts = urlsplit(url)
         visitor = cls(port=parts.port or 0)
         answer = visitor.get(parts.path)
@@ -91,14 +91,14 @@ class Visitor:
         return self.send(path, whole, kind=f"multipart/form-data; boundary={BOUNDARY}")
 
     def send(self, path: str, body: bytes, *, kind: str, **headers: str) -> Answer:
-        """Send something."""
+        """Send a request with a body."""
         host = self.host or f"127.0.0.1:{self.port}"
         scheme = "https" if self.host else "http"
         own = {"Content-Type": kind, "Origin": f"{scheme}://{host}"}
         return self.ask("POST", path, body, own | headers)
 
     def ask(self, method: str, path: str, body: bytes | None, headers: dict[str, str]) -> Answer:
-        """Ask anything."""
+        """Send a request."""
         connection = http.client.HTTPConnection(
             "127.0.0.1", self.port, timeout=PATIENCE, source_address=(self.source, 0)
         )
@@ -114,7 +114,7 @@ class Visitor:
 
 
 class WorkerHere:
-    """What a desk's worker does, in this process: another takes a second to start.
+    """A desk's worker in this process, as another takes a second to start.
 
     One task at a time; it is waited for, not killed.
     """
@@ -125,17 +125,17 @@ class WorkerHere:
         pass
 
     def do(self, task: Any, *, tell: Progress = silent, **_: object) -> Any:
-        """Do a task, which comes and goes as JSON."""
+        """Do a task that arrives and returns as JSON."""
         with self._turn:
             plain = json.loads(json.dumps(task))
             return json.loads(json.dumps(attempt(lambda: do(plain, tell))))
 
     def close(self) -> None:
-        """Have nothing to end."""
+        """Do nothing: there is no process to end."""
 
 
 def through_proxy(port: int, name: str, **given: str) -> Visitor:
-    """Return who comes through the proxy of a lab server, which names them; "" for no name."""
+    """Return a visitor behind the proxy of a lab server, which names them; "" for no name."""
     headers = {"X-Proxy-Secret": "the-proxy-and-the-desk-know-it"}
     if name:
         headers["X-Remote-User"] = name
@@ -143,12 +143,12 @@ def through_proxy(port: int, name: str, **given: str) -> Visitor:
 
 
 def wrongs(page: str) -> list[str]:
-    """Return what a page says is wrong."""
+    """Return the errors that a page shows."""
     return [unescape(w) for w in re.findall(r'class="wrong"[^>]*>([^<]*)<', page)]
 
 
 def write_users(folder: Path, text: str) -> Path:
-    """Write the file of users of a lab server, for the desk's eyes only."""
+    """Write the file of users of a lab server, readable by the desk only."""
     path = folder / "users.toml"
     path.write_text(PROXY + text, encoding="utf-8")
     path.chmod(0o600)

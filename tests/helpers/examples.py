@@ -1,4 +1,4 @@
-"""The shipped examples, analysed once a process for all tests that only look at the results."""
+"""The shipped examples, analysed once in each process, for tests that only read results."""
 
 from functools import cache
 
@@ -10,5 +10,5 @@ from pipeline.workflow import analyse
 
 @cache
 def analysed(name: str) -> Analysis:
-    """Return what all stages make of "one-cart", "two-cart" or "three-cart"."""
+    """Return the complete analysis of "one-cart", "two-cart" or "three-cart"."""
     return analyse(load_submission(EXAMPLES / name))

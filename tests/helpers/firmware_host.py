@@ -1,4 +1,4 @@
-"""The firmware's core, compiled here: a controller as `pipeline.simulated.emulator.core` is one."""
+"""The firmware's core, compiled here: a controller like `pipeline.simulated.emulator.core`."""
 
 import ctypes
 import shutil
@@ -19,7 +19,7 @@ COMPILER = shutil.which("cc")
 
 
 def compile_c(target: Path, *arguments: str | Path, compiler: str | None = COMPILER) -> Path:
-    """Compile as strictly as the compiler can; returns the target."""
+    """Compile with all warnings as errors; return the target."""
     assert compiler is not None
     include = f"-I{FIRMWARE / 'core'}"
     command = [compiler, *STRICT, include, "-o", target, *arguments]
@@ -69,7 +69,7 @@ class FirmwareCore:
         library.bench_init(self._bench, ctypes.byref(self._settings))
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; what they ask for happens at the next tick."""
+        """Take bytes from the line; they act at the next tick."""
         for byte in data:
             self._library.bench_receive(self._bench, byte)
 
@@ -79,13 +79,13 @@ class FirmwareCore:
         return self._library.bench_tick(self._bench, array, stamp, now & 0xFFFFFFFF)
 
     def take(self) -> bytes:
-        """Return what is to be sent since the last call."""
+        """Return the bytes to send since the last call."""
         return bytes(iter(lambda: self._library.bench_take(self._bench), -1))
 
 
 @contextmanager
 def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
-    """Have `serve` work beside the block, until the block ends and what it was handed says so."""
+    """Run `serve` beside the block, until the block ends and its event says so."""
     done = threading.Event()
     beside = threading.Thread(target=serve, args=(done.is_set,))
     beside.start()
@@ -96,7 +96,7 @@ def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
         beside.join()
 
 
-# A bench that has no processor of its own may be silent for a while.
+# A bench that gets no processor time may be silent for a while.
 _PATIENT = (
     "from pipeline.bench.host import session; session.SILENCE = 5.0; "
     "from pipeline.cli import main; main()"
@@ -104,7 +104,7 @@ _PATIENT = (
 
 
 def acquire(folder: Path, *, port: str, only: Sequence[str]) -> None:
-    """Run `cartlab acquire` in a process of its own; hands are taken to do what they are asked."""
+    """Run `cartlab acquire` in a process of its own; hands are assumed to do as asked."""
     chosen = [word for name in only for word in ("--only", name)]
     command = [
         sys.executable,

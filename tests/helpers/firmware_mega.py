@@ -19,7 +19,7 @@ _CPP = ("-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics")
 
 
 def missing() -> str:
-    """Return what is not here that a simulated Mega needs; "": nothing."""
+    """Return what a simulated Mega lacks here; "": nothing."""
     if COMPILER is None:
         return "a C compiler"
     if not shutil.which("avr-g++"):
@@ -36,7 +36,7 @@ def _run(*command: str | Path) -> str:
 
 
 def build_sketch(folder: Path, *, encoders: int = 2) -> Path:
-    """Build the sketch as arduino-cli does, warnings in our own files being errors."""
+    """Build the sketch as arduino-cli does; warnings in our own files are errors."""
     sketch = Path(shutil.copytree(FIRMWARE / "cartlab_bench", folder / "cartlab_bench"))
     board = (sketch / "board.h").read_text(encoding="utf-8")
     board = board.replace("#define ENCODERS 2 ", f"#define ENCODERS {encoders} ")
@@ -64,14 +64,14 @@ def build_sketch(folder: Path, *, encoders: int = 2) -> Path:
 
 
 def memory(program: Path) -> tuple[int, int]:
-    """Return bytes of flash and of RAM that a program takes, the stack left out."""
+    """Return the bytes of flash and RAM that a program takes, without the stack."""
     report = _run("avr-size", "-C", "--mcu=atmega2560", program)
     flash, ram = (int(size) for size in re.findall(r"(\d+) bytes", report))
     return flash, ram
 
 
 class Mega:
-    """A board with power. Time passes on it only in the calls that say so.
+    """A board with power, whose time passes only in the calls that say so.
 
     Its pins are those of firmware/cartlab_bench/board.h.
     """
@@ -95,17 +95,17 @@ class Mega:
         assert self._board.mega_turn(encoder, counts) == 0
 
     def flicker(self, encoder: int, seconds: float, *, every: float) -> None:
-        """Have a channel of an encoder change so often, as a broken wire does."""
+        """Toggle a channel of an encoder this often, as a broken wire does."""
         assert self._board.mega_flicker(encoder, round(1e6 * seconds), round(1e6 * every)) == 0
 
     @property
     def clock(self) -> float:
-        """Seconds since the board had power."""
+        """Return the seconds since power-on."""
         return 1e-6 * self._board.mega_clock()
 
     @property
     def duty(self) -> int:
-        """Duty counts, as the motor's pins have them."""
+        """Return the duty counts at the motor's pins."""
         return self._board.mega_duty()
 
     def send(self, data: bytes) -> None:
@@ -114,5 +114,5 @@ class Mega:
             self._board.mega_send(byte)
 
     def take(self) -> bytes:
-        """Return what came over the line since the last call."""
+        """Return the bytes that came over the line since the last call."""
         return bytes(iter(self._board.mega_receive, -1))

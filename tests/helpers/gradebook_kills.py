@@ -1,11 +1,12 @@
-"""Kill a process again and again while it writes into a gradebook; say what was lost.
+"""Kill a process again and again while it writes into a gradebook; report any loss.
 
-    python -m tests.helpers.gradebook_kills PLACE KILLS [answers]
+python -m tests.helpers.gradebook_kills PLACE KILLS [answers]
 
-A child puts outcomes in and tells each through a pipe once `put` has returned. What it told must
-be there afterwards, whole, and beside it at most the one that it had no time to tell. With
-`answers` it answers requests instead, each with other points: of these both must be there, or
-neither.
+A child stores outcomes and confirms each through a pipe once `put` has returned. Confirmed outcomes
+must be there afterwards, whole, and beside them at most one that it could not confirm any more.
+
+With `answers` it answers requests instead, each with other points: answer and points must both be
+there, or neither.
 """
 
 import os
@@ -40,7 +41,7 @@ def put_until_killed(place: str, first: int, pipe: int) -> None:
 
 
 def answer_until_killed(place: str, first: int, pipe: int) -> None:
-    """Ask, answer with other points, reopen: each round tells its number once it is over."""
+    """Ask, answer with other points, reopen: confirm each round by its number."""
     book, number = RequestBook(place), first
     while True:
         asked = book.queue().waiting
@@ -57,7 +58,7 @@ def answer_until_killed(place: str, first: int, pipe: int) -> None:
 
 
 def kill_once(child_does: Callable[[int], None], rng: random.Random) -> list[bytes]:
-    """Return the whole lines that a child told before it was killed."""
+    """Return the complete lines that a child wrote before it was killed."""
     ours, theirs = os.pipe()
     child = os.fork()
     if child == 0:
@@ -74,7 +75,7 @@ def kill_once(child_does: Callable[[int], None], rng: random.Random) -> list[byt
 
 
 def kill_answers(place: str, kills: int) -> None:
-    """Kill who answers requests; every answer must be there with its points."""
+    """Kill a process that answers requests; every answer must be there with its points."""
     outcome = make_outcome(make_grade("team", share=0.5))
     with RequestBook(place, assignment="lab", create=True) as book:
         book.put(outcome)

@@ -1,4 +1,4 @@
-"""Grades and outcomes for tests of the gradebook and of what is written from it."""
+"""Grades and outcomes for tests of the gradebook and of the files written from it."""
 
 import sqlite3
 from collections.abc import Iterator, Sequence
@@ -34,7 +34,7 @@ def two_cart_rubric() -> Rubric:
 
 
 def in_this_process(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
-    """Run tasks without a worker, which takes longer to start than to grade a small class."""
+    """Run tasks without a worker, which takes longer to start than a small class to grade."""
     how = {"rubric": setup.rubric, "scratch": setup.scratch, "figures": setup.figures}
     for task in tasks:
         yield grade_task(task, **how)
@@ -85,7 +85,7 @@ def hertz_flag() -> Flag:
 
 
 def shared_flag(other: str) -> Flag:
-    """Return the flag of a recording that stands in another submission too."""
+    """Return the flag of a recording that is in another submission too."""
     return Flag(
         code="shared_data",
         parameters=("step-1",),
@@ -105,7 +105,7 @@ def shared_flag(other: str) -> Flag:
 
 
 def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
-    """Return the outcome that such a grade comes with."""
+    """Return the outcome that belongs to such a grade."""
     fields: dict[str, Any] = {
         "submission": grade.submission,
         "authors": grade.authors,
@@ -120,7 +120,7 @@ def make_outcome(grade: Grade, *, key: str = "", **changes: Any) -> Grading:
 
 
 def write_class(folder: Path, *, anonymous: bool = False) -> Path:
-    """Write the pages of a class of all sorts into a folder, figures and hostile names included."""
+    """Write the pages of a varied class into a folder, with figures and hostile names."""
     for name, content in _class_files(anonymous=anonymous).items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
@@ -128,9 +128,9 @@ def write_class(folder: Path, *, anonymous: bool = False) -> Path:
 
 
 def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
-    """Grade a class called `lab`: a team with all points, and one that is late with a gain off.
+    """Grade a class called `lab`: a perfect team, and one that is late with a wrong gain.
 
-    The gradebook keeps what the checks found, as that of a real grading does.
+    As after a real grading, the gradebook has the findings of the checks.
     """
     from pipeline.grading.judge.reweigh import findings_text
     from tests.helpers.grading_students import student  # simulates a bench and analyses it
@@ -150,7 +150,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
 
 @cache
 def _class_files(*, anonymous: bool) -> dict[str, bytes]:
-    """Return the files of such a folder by their names, made once a process."""
+    """Return the files of such a folder by name, made once in each process."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         fill_book(folder, anonymous=anonymous)
@@ -161,7 +161,7 @@ def _class_files(*, anonymous: bool) -> dict[str, bytes]:
 
 
 def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
-    """Make a gradebook with a class of all sorts, figures and hostile names included."""
+    """Make a gradebook with a varied class, with figures and hostile names."""
     rubric = two_cart_rubric().model_copy(update={"anonymous": anonymous})
     names = [f"team-{n:02d}" for n in range(1, 13)]
     names += ["Ünal 学生 & co", "a-name-without-end-" * 5, "=cmd'C'!A0"]
@@ -185,7 +185,7 @@ def fill_book(place: str | Path, *, anonymous: bool = False) -> None:
 
 
 def _figure(name: str) -> tuple[tuple[str, str], ...]:
-    """Return a response with a fit and the curve of a reported table that is off."""
+    """Return a response with a fit and the curve of a wrong reported table."""
     chain = PRESETS["throne-2dof"]
     omega = np.geomspace(5.0, 60.0, 20)
     response = chain.frequency_response(omega)[0]
@@ -203,7 +203,7 @@ def _figure(name: str) -> tuple[tuple[str, str], ...]:
 
 
 def n_graded(out: Path) -> int:
-    """Return how many gradings the gradebook of a class holds; it may be in use, or not there."""
+    """Return the number of gradings in a class's gradebook, which may be in use or missing."""
     try:
         with closing(sqlite3.connect(f"file:{out / FILE}?mode=ro", uri=True)) as book:
             return book.execute("SELECT count(*) FROM gradings").fetchone()[0]

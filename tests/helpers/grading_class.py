@@ -1,7 +1,7 @@
-"""A class of honest teams: benches all over what a lab may have, numbers as a textbook gives them.
+"""A class of honest teams: benches of every kind, numbers as a textbook teaches them.
 
-A number is the textbook student's own reading where that is an honest one, near the truth; where
-the method does not reach that far on this bench, it is that of a more careful student.
+A number is the textbook student's own reading if that is near the truth. If the method cannot reach
+that on this bench, it is the number of a more careful student.
 """
 
 import tempfile
@@ -46,7 +46,7 @@ DIGITS = (2, 4)
 FRICTION = 0.02  # at most, of the force of the small step
 LEAST_COUNTS = 25.0  # that carts are made to move, by who can choose how far
 
-# How far off an honest number may be, relative: gains and frequencies, dampings.
+# The largest relative error of an honest number: gains and frequencies, dampings.
 HONEST_FIRST, HONEST_FIRST_DAMPING = 0.06, 0.4
 HONEST_BY_EYE = 0.2
 HONEST_FINAL, HONEST_FINAL_DAMPING = 0.03, 0.3
@@ -126,7 +126,7 @@ def rubric_of(bench: Bench) -> Rubric:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Team(Student):
-    """An honest team; `bench` is what nobody but the test knows."""
+    """An honest team; `bench` is known to the test only."""
 
     bench: Bench
     rng: np.random.Generator
@@ -149,7 +149,7 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
 
 
 def with_spoilt_data(seed: int) -> Team:
-    """Return the team of a seed with one file spoilt before anything is read of it."""
+    """Return the team of a seed with one file spoilt before anything is read."""
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +157,7 @@ def with_spoilt_data(seed: int) -> Team:
 
 
 def with_wrong_rubric(seed: int) -> Team | None:
-    """Return the team of a seed whose rubric lacks its near spring; None where it has none."""
+    """Return the team of a seed whose rubric lacks its near spring; None if there is no spring."""
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     if bench.chain.n == 1 or not bench.springs[0]:
@@ -230,18 +230,18 @@ def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
 
 
 def _fewer_dwells(submission: Submission, count: int) -> Submission:
-    """Return the submission with so many of its dwells, evenly chosen."""
+    """Return the submission with that many of its dwells, evenly chosen."""
     sines = [e.id for e in submission.experiments if e.kind == "sine"]
     chosen = {sines[i] for i in np.linspace(0, len(sines) - 1, count).round().astype(int)}
     kept = tuple(e for e in submission.experiments if e.kind != "sine" or e.id in chosen)
     return submission.model_copy(update={"experiments": kept})
 
 
-# --------------------------------------------------------------------- what they report
+# ---------------------------------------------------------------- reported numbers
 
 
 def report(team: Team) -> Team:
-    """Return the team with what it finds in its own recordings."""
+    """Return the team with the results of its own recordings."""
     n, records, rng = team.bench.chain.n, team.analysis.records, team.rng
     truth, digits = team.bench.chain.parameters(), team.bench.digits
     read = initial_table(records, n)
@@ -257,7 +257,7 @@ def report(team: Team) -> Team:
     table = {x: written(v, digits) for x, v in final.items()}
     space, feedback = team.reported.state_space, team.reported.feedback
     if final is not believed:
-        # From what they have found, or from what they have typed of it; in one way or the other.
+        # From the results, or from the typed numbers, in one way or the other.
         values = final if rng.random() < 0.5 else {x: float(v) for x, v in table.items()}
         own = own_chain(values, n=n)
         if own is not None and is_real(own):
@@ -282,7 +282,7 @@ def _error(rng: np.random.Generator) -> float:
 
 
 def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
-    """Return A and B with the couplings by where the carts rest, not by the polynomials alone."""
+    """Return A and B with couplings from the rest positions, not from the polynomials alone."""
     if n == 1:
         return np.array([[0, 1], [-(p["omega_n"] ** 2), -2 * p["zeta"] * p["omega_n"]]]), np.array(
             [[0], [p["K"] * p["omega_n"] ** 2]]
@@ -310,12 +310,12 @@ def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
 
 
 def is_real(chain: Chain) -> bool:
-    """Whether a chain could be one of carts."""
+    """Return whether real carts could form the chain."""
     return bool(np.all(chain.c > 0) and np.all(np.linalg.eigvalsh(chain.stiffness) > 0))
 
 
 def _first(team: Team, name: str, read: float, right: float) -> float:
-    """Return a first estimate: as read, where that is honest, else as a careful student reads."""
+    """Return an initial estimate: as read if that is honest, else as a careful student reads."""
     guessed = team.bench.chain.n > 1 and read_name(name).is_damping and not name[-1].isdigit()
     if guessed:
         return 0.1
@@ -328,7 +328,7 @@ def _first(team: Team, name: str, read: float, right: float) -> float:
 
 
 def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
-    """Return the final table of a fit in dB; None where it is not near the truth."""
+    """Return the final table of a fit in dB, or None if it is far from the truth."""
     n = team.bench.chain.n
     try:
         found = final_table(team.analysis.records, n, dict(first))
@@ -345,7 +345,7 @@ def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
 
 
 def written(value: float, digits: int) -> Decimal:
-    """Return a number as typed to so many digits."""
+    """Return a number as typed to that many digits."""
     return Decimal(f"{value:#.{digits}g}".removesuffix("."))
 
 
@@ -362,7 +362,7 @@ def state_space(A: Array, B: Array, *, digits: int) -> ReportedStateSpace:
 
 
 def designed(submission: Submission, chain: Chain) -> ReportedFeedback | None:
-    """Return a controller made for a team's own carts, as typed."""
+    """Return a controller designed for a team's own carts, as typed."""
     task = submission.design or Design(cart=chain.n)
     try:
         design = design_feedback(chain, task)

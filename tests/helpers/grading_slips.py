@@ -1,6 +1,6 @@
-"""Planted mistakes: each code's slip, made by an honest team with what it has in its own hands.
+"""Planted mistakes: the slip of each code, made by an honest team with its own data.
 
-They are made with the recordings and the true bench, never with the grader's own catalogue.
+They use the recordings and the true bench, never the grader's own catalogue.
 """
 
 from collections.abc import Callable, Mapping
@@ -66,7 +66,7 @@ def hz(team: Team) -> Team:
 
 
 def hz_of_one(team: Team) -> Team:
-    """One frequency, the one that was forgotten, divided by 2π."""
+    """One frequency, which was not converted, divided by 2π."""
     names = [n for n in team.reported.final if n.startswith("omega")]
     return scaled(team, [str(team.rng.choice(names))], 1 / TURN, some_tables(team))
 
@@ -81,7 +81,7 @@ def peak_count(team: Team) -> Team:
 
 
 def peak_for_steady_state(team: Team) -> Team:
-    """Every gain from the furthest that the cart goes after the first edge of the first step."""
+    """Every gain from the largest excursion after the first edge of the first step."""
     step = next(r for r in team.analysis.records if r.kind == "step" and len(r.carts) > 0)
     assert step.u is not None
     on = np.flatnonzero(step.u)
@@ -106,7 +106,7 @@ def log10_for_ln(team: Team) -> Team:
 
 
 def carts_swapped(team: Team) -> Team:
-    """The gains, the frequencies with their dampings, or all, of two carts exchanged."""
+    """The gains, the frequencies with their dampings, or all, of two carts swapped."""
     i, j = team.rng.choice(np.arange(1, team.bench.chain.n + 1), 2, replace=False)
     groups = [["K"], ["omega", "zeta"], ["K", "omega", "zeta"]][int(team.rng.integers(3))]
     truth = team.bench.chain.parameters()
@@ -126,7 +126,7 @@ def carts_swapped(team: Team) -> Team:
 
 
 def no_fit_done(team: Team) -> Team:
-    """The first table once more."""
+    """The initial table copied as the final one."""
     return reporting(team, team.reported.model_copy(update={"final": team.reported.initial}))
 
 
@@ -144,17 +144,17 @@ def _one_off(team: Team, table: str) -> Team:
 
 
 def final_off(team: Team) -> Team:
-    """One gain or frequency of the final table off, as nothing explains."""
+    """One gain or frequency of the final table off, without an explanation."""
     return _one_off(team, "final")
 
 
 def initial_off(team: Team) -> Team:
-    """One gain or cart's own frequency of the first table off, as nothing explains."""
+    """One gain or frequency of a cart in the initial table off, without an explanation."""
     return _one_off(team, "initial")
 
 
 def initial_final_disagree(team: Team) -> Team:
-    """Without its recordings nothing but the team's own tables tells that one is wrong."""
+    """Without recordings only the team's own tables show that one of them is wrong."""
     runs = tuple(e for e in team.submission.experiments if e.kind == "closed_loop")
     moved = scaled(team, own(team, "K")[:1], 1.6, ["initial"])
     analysis = replace(
@@ -181,9 +181,9 @@ def physically_impossible(team: Team) -> Team:
 
 
 def transient_used(team: Team) -> Team:
-    """Amplitudes read off the first cycles of every dwell, and a fit to them, if there is one."""
+    """Amplitudes of the first cycles of every dwell, and a fit to them if there is one."""
     if any(e.note for e in team.submission.experiments if e.kind == "sine"):
-        return team  # recorded after the transient: nobody can use it
+        return team  # recorded after the transient, so nobody can use it
     truth = team.bench.chain.parameters()
     for cycles in team.rng.permutation([2.0, 3.0]):
         try:
@@ -192,7 +192,7 @@ def transient_used(team: Team) -> Team:
                 bench=Bench(springs=team.bench.springs),
                 initial=truth,
             )
-        except DataError:  # nothing fits such amplitudes; they would try others
+        except DataError:  # nothing fits such amplitudes; the student would try others
             continue
         if min(e.value for e in fit.parameters.values()) > 0:
             return change(team, final={name: e.value for name, e in fit.parameters.items()})
@@ -200,7 +200,7 @@ def transient_used(team: Team) -> Team:
 
 
 def _early(team: Team, cycles: float) -> list[FrequencyResponse]:
-    """Return what half the swing of the first cycles gives."""
+    """Return half the swing of the first cycles."""
     runs = [r for r in team.analysis.records if r.kind == "sine" and r.omega and r.u is not None]
     rows: list[Array] = []
     for run in runs:
@@ -226,7 +226,7 @@ def _early(team: Team, cycles: float) -> list[FrequencyResponse]:
 
 
 def wrong_state_space(team: Team) -> Team:
-    """A sign, exchanged or missing couplings, another order of the states, ω for ω²."""
+    """A sign, swapped or missing couplings, another order of the states, ω for ω²."""
     space, n = team.reported.state_space, team.bench.chain.n
     assert space is not None
     A = [list(row) for row in space.A]
@@ -281,7 +281,7 @@ def _with_runs(team: Team, update: Mapping[str, object]) -> Team:
 
 
 def wrong_prefilter(team: Team) -> Team:
-    """The static gain itself, none at all, or another number."""
+    """The static gain itself, no prefilter, or another number."""
     right = float(_feedback(team).prefilter or 1)
     wrong = [1 / right, 1.0, right * 1.3, right * 0.7]
     wrong = [w for w in wrong if abs(np.log(w / right)) > np.log(1.25)]
@@ -289,7 +289,7 @@ def wrong_prefilter(team: Team) -> Team:
 
 
 def missing(team: Team) -> Team:
-    """A parameter, the state model, or the closed loop is not there."""
+    """A parameter, the state model or the closed loop is missing."""
     kind = int(team.rng.integers(3))
     if kind == 0:
         final = dict(team.reported.final)
@@ -330,4 +330,4 @@ DOUBLE = (
     ("wrong_state_space", "wrong_prefilter"),
     ("hz_for_rad_s", "peak_to_peak"),
 )
-OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # of one cart nothing tells
+OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # with one cart nothing shows it

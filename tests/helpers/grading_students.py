@@ -1,4 +1,4 @@
-"""Simulated students, honest until a test changes what they report; analysed once."""
+"""Simulated students, honest until a test changes their report; analysed once."""
 
 import tempfile
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ class Student:
 
     @property
     def reported(self) -> Reported:
-        """What the student claims."""
+        """The student's reported numbers."""
         assert self.submission.reported is not None
         return self.submission.reported
 
@@ -68,18 +68,18 @@ class Student:
         return replace(self, submission=self.submission.model_copy(update={"reported": reported}))
 
     def grade(self, *, days_late: float = 0.0) -> Grade:
-        """Grade what is reported against the recordings."""
+        """Grade the report against the recordings."""
         return self.graded(days_late=days_late).grade
 
     def graded(self, *, days_late: float = 0.0) -> Graded:
-        """Grade what is reported, with what the checks found."""
+        """Grade the report, with the findings of the checks."""
         return grade_analysis(
             self.submission, self.analysis, rubric=self.rubric, name="team-07", days_late=days_late
         )
 
 
 def typed(value: float | Decimal) -> Decimal:
-    """Return a number as typed to three digits; one that is typed stays."""
+    """Return a number as typed to three digits; a text stays as typed."""
     if isinstance(value, Decimal):
         return value
     return Decimal(f"{value:#.3g}".removesuffix("."))

@@ -1,7 +1,7 @@
-"""Honest teams on benches with one effect of the catalogue each, at up to three times its size.
+"""Honest teams on benches with one effect of the catalogue, up to three times its usual size.
 
-What they report they have read off their own recordings, as a textbook says; what cannot be read
-there is what a more careful student finds, which here is the pipeline.
+They report readings of their own recordings by the textbook. Numbers that cannot be read that way
+are those of a more careful student, here the pipeline.
 """
 
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from tests.helpers.textbook_student import by_eye, final_table, initial_table
 LEAST, MOST = 0.5, 3.0  # times the usual size
 DIGITS = 3
 
-# What makes an effect larger; of the others it is their first parameter.
+# The parameter that makes an effect larger; by default the first one.
 _GROWS = {
     "stiction": ("force", "static_force"),
     "backlash": ("gap",),
@@ -39,7 +39,7 @@ _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
 def draw_effect(chain: Chain, seed: int) -> EffectTerm:
-    """Return the effect of a seed: nineteen seeds in a row have all of the catalogue."""
+    """Return the effect of a seed: nineteen seeds in a row cover the catalogue."""
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
     effect = CATALOGUE[int(np.random.default_rng([16, turn]).permutation(len(CATALOGUE))[place])]
@@ -56,7 +56,7 @@ def draw_effect(chain: Chain, seed: int) -> EffectTerm:
 
 def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str, float]:
     values = dict(usual)
-    if effect.key == "sensor_gain":  # of which one is no effect
+    if effect.key == "sensor_gain":  # one of which is not an effect
         values["gain"] = 1 + (values["gain"] - 1) * size
     elif effect.key in _SHRINKS:
         values[_SHRINKS[effect.key]] /= size
@@ -69,7 +69,7 @@ def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str,
 def grade_honest_team(
     folder: Path, *, preset: str, seed: int
 ) -> tuple[Grade, Analysis, EffectTerm]:
-    """Return the grade of the honest team of a seed, the analysis, and what its bench does."""
+    """Return the grade of the honest team of a seed, the analysis, and the hidden effect."""
     chain, rubric = preset_bench(preset).chain, load_rubric(Path(preset))
     term = draw_effect(chain, seed)
     write_submission(
@@ -87,7 +87,7 @@ def grade_honest_team(
 
 
 def textbook_report(submission: Submission, analysis: Analysis) -> Reported:
-    """Return what a student reads off these recordings in place of what the bench is said to be."""
+    """Return a student's readings of these recordings in place of the true numbers."""
     claimed, n = submission.reported, analysis.bench.n
     assert claimed is not None
     rows = {row.name: row for row in analysis.rows}

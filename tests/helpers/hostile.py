@@ -1,7 +1,7 @@
-"""A class of a hundred hand-ins that mean harm, or look as if they did: one entry each.
+"""A class of a hundred submissions that are malicious, or look so: one entry each.
 
-Every one is a folder or an archive of its own in the class's folder. What varies (sizes, depths,
-which file is spoilt) comes from the seed.
+Every one is a folder or an archive in the class's folder. Sizes, depths and the spoilt file come
+from the seed.
 """
 
 import io
@@ -37,10 +37,10 @@ _STEP = '[[experiments]]\nid = "a"\nkind = "step"\nfile = "{}"\n'
 def write_hostile(
     school: Path, good: Files, *, seed: int, every: int = 1, drawn: int = 0
 ) -> list[str]:
-    """Write the hostile hand-ins beside whatever is there; return the names of the entries.
+    """Write the hostile submissions beside existing ones; return the names of the entries.
 
     Of the good submissions with one thing spoilt, which take the longest, one in `every`; beside
-    these so many `drawn` at random, a third of them archives.
+    these as many as `drawn` at random, a third of them archives.
     """
     rng = random.Random(seed)
     outside = school.parent / "outside"
@@ -90,7 +90,7 @@ def _zip(members: Mapping[str, bytes], *, mode: int = 0, method: int = zipfile.Z
 
 
 def _archives(good: Files, rng: random.Random) -> dict[str, bytes]:
-    """Return archives that are bombs, lead elsewhere, or are none."""
+    """Return archives that are bombs, contain paths outside, or are not archives at all."""
     zeros = bytes(rng.randrange(20_000_000, 30_000_000))
     whole = _zip(good)
     lying = _zip({"submission.toml": zeros[:3_000_000]}).replace(
@@ -149,7 +149,7 @@ def _archives(good: Files, rng: random.Random) -> dict[str, bytes]:
 
 
 def _overlapping(zeros: bytes, *, copies: int) -> bytes:
-    """Return an archive in which many members are one and the same packed bytes."""
+    """Return an archive in which many members share the same packed bytes."""
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)
     packed = packer.compress(zeros) + packer.flush()
     crc = zlib.crc32(zeros)
@@ -168,7 +168,7 @@ def _overlapping(zeros: bytes, *, copies: int) -> bytes:
 
 
 def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
-    """Return submissions with something in them that no reader should trust."""
+    """Return submissions with content that no reader should trust."""
     toml = good["submission.toml"].decode()
     spoilt: dict[str, Files] = {}
 
@@ -251,7 +251,7 @@ def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
 
 
 def _marked(toml: str, text: str) -> str:
-    """Return a submission with this text wherever a student may write one."""
+    """Return a submission with this text wherever a student may write."""
     quoted = '"' + "".join(
         c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text
     ) + '"'  # fmt: skip
@@ -269,7 +269,7 @@ def _marked(toml: str, text: str) -> str:
 
 
 class _Evil:
-    """What a careless reader would run."""
+    """Code that a careless reader would run."""
 
     def __reduce__(self) -> tuple[Callable, tuple]:
         return os.system, ("touch /tmp/escaped",)
@@ -282,7 +282,7 @@ def _mat() -> bytes:
 
 
 def _mat_bomb() -> bytes:
-    """Return a variable that says it has 10^18 numbers, deflated zeros for as long as they last."""
+    """Return a variable that claims 10^18 numbers, followed by deflated zeros."""
     size = struct.pack("<LL", 6, 8) + bytes([6]) + bytes(7)
     shape = struct.pack("<LLll", 5, 8, 2**30, 2**30)
     body = size + shape + struct.pack("<LL", 1, 1) + b"x" + bytes(7)
@@ -296,7 +296,7 @@ def _mat_bomb() -> bytes:
 
 
 def _names(rng: random.Random) -> list[str]:
-    """Return names of folders that are markup, formulas, reserved, alike or very long."""
+    """Return names of folders that are markup, formulas, reserved, similar or very long."""
     names = [
         "<b>bold<", '" onload=alert(1) x="', "&lt;script&gt;", _FORMULA.replace("/", ""),
         "@SUM(A1)", "-1+1", "#include $x$ *b*", "CON", "aux.txt", "com1", "...", "a.", "a ", " a",
@@ -312,7 +312,7 @@ def _names(rng: random.Random) -> list[str]:
 
 
 def _places(outside: Path) -> dict[str, Callable[[Path], object]]:
-    """Return what is done to a good submission so that a file of it is not what it seems."""
+    """Return changes to a good submission by which a file is not what it seems."""
 
     def instead(name: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
         def build(folder: Path) -> None:
@@ -333,7 +333,7 @@ def _places(outside: Path) -> dict[str, Callable[[Path], object]]:
         "linked round": instead("data/step-1.csv", lambda p: p.symlink_to(p)),
         "linked folder": linked_folder,
         "loop": lambda folder: (folder / "data" / "up").symlink_to(folder),
-        # What it links to is not told from a copy: a regular file, to be read like any other.
+        # A hard link looks like a copy: a regular file, to be read like any other.
         "hard link": instead("data/step-1.csv", lambda p: p.hardlink_to(outside / "junk.txt")),
         "pipe toml": instead("submission.toml", os.mkfifo),
         "pipe data": instead("data/step-1.csv", os.mkfifo),
@@ -358,7 +358,7 @@ def _socket(path: Path) -> None:
 
 
 def _entries(school: Path, outside: Path) -> dict[str, Callable[[Path], object]]:
-    """Return what stands in a class's folder itself and is neither a folder nor a file."""
+    """Return entries of a class's folder that are neither folders nor files."""
     return {
         "pipe.zip": os.mkfifo,
         "socket.zip": _socket,

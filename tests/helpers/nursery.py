@@ -1,6 +1,7 @@
-"""Where virtual benches come from: a process that has loaded all that one needs forks each.
+"""Virtual benches are forked from a process that has loaded everything they need.
 
-That takes two seconds of a processor, once. Where nothing can be forked each bench loads it anew.
+Loading takes two seconds of a processor, once. Where fork is missing, each bench loads everything
+again.
 """
 
 import json
@@ -17,7 +18,7 @@ from tests.helpers.places import ROOT
 
 
 def order(**bench: Any) -> None:
-    """Have a bench made; it connects to `port`, as `be` says."""
+    """Request a bench; it connects to `port`, as `be` says."""
     if sys.platform == "win32":
         script = f"from tests.helpers.nursery import be; be(**{bench!r})"
         subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
@@ -28,7 +29,7 @@ def order(**bench: Any) -> None:
 
 
 def be(*, words: list[str], watchdog: float, port: int) -> None:
-    """Be the command of these words, whose stderr is a line to that port; first comes its pid."""
+    """Become the bench of these words, with its stderr sent to that port after its pid."""
     from pipeline.cli import main
     from pipeline.simulated.emulator import core
 
@@ -46,7 +47,7 @@ def be(*, words: list[str], watchdog: float, port: int) -> None:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Start the process, which ends with this one: with its stdin."""
+    """Start the process, which ends with this one, when its stdin closes."""
     script = "from tests.helpers.nursery import fork_benches; fork_benches()"
     return subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, text=True, cwd=ROOT
@@ -56,7 +57,7 @@ def _nursery() -> "subprocess.Popen[str]":
 def fork_benches() -> None:
     """Fork a bench for each line of stdin."""
     load_bench()
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that ended
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended children
     for line in sys.stdin:
         if os.fork() == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -64,7 +65,7 @@ def fork_benches() -> None:
 
 
 def load_bench() -> None:
-    """Import all that a bench needs, and compile its simulator where nobody has yet."""
+    """Import all that a bench needs, and compile its simulator unless that is done."""
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 

@@ -1,6 +1,6 @@
-"""Things done to sound files so that no reader should trust them: drawn, not listed.
+"""Random damage to sound files, for readers that must trust nothing.
 
-Everything comes from a `random.Random`, so that a seed is a case.
+All randomness comes from a `random.Random`, so that a seed is a case.
 """
 
 import io
@@ -26,7 +26,7 @@ _OTHER = ("true", "[]", "{}", "[[]]", "[1, 2, 3]", "2024-01-01", "''", "[" * 500
 
 
 def damaged(raw: bytes, rng: Random, *, hits: int = 3) -> bytes:
-    """Cut, flip, insert, remove or repeat bytes, up to so many times."""
+    """Cut, flip, insert, remove or repeat bytes, up to that many times."""
     for _ in range(rng.randint(1, hits)):
         at, n = rng.randrange(len(raw) + 1), rng.randint(1, 60)
         junk = rng.choice([*map(str.encode, (*_MARKS, *_NUMBERS[:20])), rng.randbytes(n)])
@@ -46,7 +46,7 @@ def text(rng: Random) -> str:
 
 
 def toml_value(rng: Random) -> str:
-    """Return a value as TOML has it, mostly one that a parser takes."""
+    """Return a TOML value, mostly one that a parser accepts."""
     kind = rng.randrange(4)
     return (
         json.dumps(text(rng)) if kind == 0
@@ -72,7 +72,7 @@ def poisoned_toml(toml: str, rng: Random) -> str:
 
 
 def poisoned_table(table: str, rng: Random) -> str:
-    """Put other numbers into a column of a CSV, or other rows and headings around them."""
+    """Change numbers of a column of a CSV, its rows or its headings."""
     head, *rows = [line.split(",") for line in table.splitlines()]
     column, scale = rng.randrange(len(head)), rng.choice(_SCALES)
     at, what = rng.randrange(1, len(rows)), rng.randrange(8)
@@ -97,7 +97,7 @@ def poisoned_table(table: str, rng: Random) -> str:
 
 
 def poisoned_json(document: Any, rng: Random) -> Any:
-    """Put something else in the place of a few values, at any depth; the document is changed."""
+    """Replace a few values at any depth; the document is changed."""
     for _ in range(rng.choice([1, 1, 2, 5])):
         here: Any = document
         while True:
@@ -116,7 +116,7 @@ def poisoned_json(document: Any, rng: Random) -> Any:
 
 
 def poisoned(good: Files, rng: Random) -> dict[str, bytes]:
-    """Return the files of a submission with a few things done to some of them."""
+    """Return the files of a submission with some of them damaged."""
     files = dict(good)
     tables = sorted(name for name in files if name.endswith(".csv"))
     steps: tuple[Callable[[], object], ...] = (

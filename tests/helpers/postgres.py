@@ -1,4 +1,4 @@
-"""A PostgreSQL server of the tests' own: its folder, its socket, no network."""
+"""A PostgreSQL server for the tests: its own folder and socket, no network."""
 
 import os
 import shutil
@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 
-NEEDED = "CARTLAB_TESTS_NEED_POSTGRESQL"  # set where a missing server is a failure, not a skip
+NEEDED = "CARTLAB_TESTS_NEED_POSTGRESQL"  # set if a missing server is a failure, not a skip
 
 
 def missing() -> str:
@@ -31,7 +31,7 @@ def _binaries() -> Path | None:
 
 @contextmanager
 def running() -> Iterator[str]:
-    """Start a server and yield the URL of its database; it is gone afterwards."""
+    """Start a server and yield the URL of its database; it is removed afterwards."""
     binaries = _binaries()
     assert binaries is not None
     # Not in pytest's folder: only its owner can enter that, and a server never runs as root.

@@ -1,8 +1,8 @@
-"""A careful student with a textbook, a ruler and a curve fit: none of the pipeline's own methods.
+"""A careful student with a textbook, a ruler and a curve fit, without the pipeline's methods.
 
-Levels are means over the last part of a step, periods and decrements are read off the peaks,
-amplitudes are half the swing of the last cycles; the Bode magnitudes are fitted in dB, last cart
-first, as in Throne (2005), and the remaining numbers follow from the coefficients.
+Levels are means over the last part of a step; periods and decrements are read off the peaks;
+amplitudes are half the swing of the last cycles. Bode magnitudes are fitted in dB, last cart first,
+as in Throne (2005); the other numbers follow from the coefficients.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def gain(record: Record, cart: int) -> float | None:
 
 
 def decay(record: Record, cart: int) -> tuple[float, float] | None:
-    """Return (omega_n, zeta) from the first peaks after the hand, or the edge, has let go."""
+    """Return (omega_n, zeta) from the first peaks after the hand or the edge."""
     y = record.position(cart) - settled(record.position(cart))
     if record.u is not None and np.any(record.u):
         y = y[np.flatnonzero(np.diff(record.u))[-1] + 1 :]
@@ -65,7 +65,7 @@ def bode(records: Sequence[Record], cart: int) -> tuple[Array, Array]:
 
 
 def initial_table(records: Sequence[Record], n: int) -> dict[str, float]:
-    """Return the first estimates; what cannot be read is left out."""
+    """Return the initial estimates; numbers that cannot be read are left out."""
     table: dict[str, float] = {}
     for cart in range(1, n + 1):
         suffix = "" if n == 1 else f"_{cart}"
@@ -90,7 +90,7 @@ def initial_table(records: Sequence[Record], n: int) -> dict[str, float]:
 
 
 def by_eye(records: Sequence[Record], n: int) -> dict[str, float]:
-    """Return resonances (of the last cart) and nulls (of the first) as the dwells next to them."""
+    """Return resonances (of the last cart) and nulls (of the first) at the nearest dwells."""
     omega, last = bode(records, n)
     _, first = bode(records, 1)
     slope = np.log(np.concatenate([last[:1] * 0.9, last, last[-1:] * 0.5]))
@@ -167,7 +167,7 @@ def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) ->
 
 
 def _recomputed(p: dict[str, float], n: int) -> dict[str, float]:
-    """Return the carts' numbers that follow from the coefficients; none where no cart has them."""
+    """Return the carts' numbers that follow from the coefficients; none if no carts fit."""
 
     def quadratic(x: str) -> Array:
         return np.array([1.0, 2 * p[f"zeta_{x}"] * p[f"omega_{x}"], p[f"omega_{x}"] ** 2])

@@ -24,7 +24,7 @@ def measure(
     hold: Hold = "zero_order",
     id: str = "run",
 ) -> Record:
-    """Return true positions as an encoder with white noise before its rounding reads them."""
+    """Return positions read by an encoder, with white noise before the rounding."""
     read = y + noise * rng.standard_normal(y.shape)
     if count:
         read = np.round(read / count) * count
@@ -67,7 +67,7 @@ def step_record(
 def decay_record(
     chain: Chain, *, free: tuple[int, ...], rng: np.random.Generator, id: str = "decay"
 ) -> Record:
-    """Return carts pulled aside over 0.5 s, held for 1 s and let go; the encoder zero is off."""
+    """Return carts pulled aside in 0.5 s, held for 1 s and released; the encoder zero is off."""
     t = np.arange(int(7.0 * RATE)) / RATE
     x0 = np.zeros(2 * len(free))
     x0[0::2] = rng.uniform(1.0, 2.0, len(free))  # cm
@@ -85,9 +85,9 @@ def decay_record(
 
 
 def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, ...]]:
-    """Return a chain of n carts unlike its neighbours (cm, V), and which springs it has.
+    """Return a random chain of n carts (cm, V), and the springs that it has.
 
-    Carts alone at some 6 to 60 rad/s with damping ratios from 0.01 to 0.3; about half have no
+    Carts alone swing at some 6 to 60 rad/s with damping ratios from 0.01 to 0.3; about half have no
     spring to one of the walls.
     """
     omega = np.exp(rng.uniform(np.log(6), np.log(40)))

@@ -1,4 +1,4 @@
-"""The real ECP 210 recordings: one by one, and as whole submissions in a temporary folder."""
+"""The real ECP 210 recordings: single ones, and whole submissions in a temporary folder."""
 
 import shutil
 from pathlib import Path
@@ -11,7 +11,7 @@ PID = '{ type = "pid", kp = 0.5, ki = 0.5, kd = 0.03, scale = 0.009765625, cart 
 
 
 def ecp_record(path: Path, *, column: int, kind: str) -> Record:
-    """Read one encoder of a raw ECP export; positions in counts, the input's sign turned."""
+    """Read one encoder of a raw ECP export; positions in counts, input sign reversed."""
     lines = [line.strip(" [];\n") for line in path.read_text().splitlines()]
     rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=float)
     # Stamps are rounded to a millisecond: the clock itself is even.
@@ -29,7 +29,7 @@ def ecp_record(path: Path, *, column: int, kind: str) -> Record:
 
 
 def write_two_cart_submission(folder: Path, data: Path, *, steps: tuple[int, ...]) -> Path:
-    """Write a two-cart submission: single-cart runs, the two-cart steps asked for, the PID run."""
+    """Write a two-cart submission: single-cart runs, the given two-cart steps, the PID run."""
     experiments = [
         _experiment(f"alone-1-{i}", "step", f"DOF1_en1_input1_test{i}.csv", "carts = [1]")
         for i in range(1, 6)

@@ -1,4 +1,4 @@
-"""Recordings carried out on a virtual bench without a line or a clock: as fast as it computes."""
+"""Recordings on a virtual bench without a line or a clock, as fast as it computes."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,11 +37,11 @@ _PULL_OUT = 1700  # ticks a hand takes
 
 
 class LimitPassed(AssertionError):
-    """A recording passed a limit of its plan, which no proposal may."""
+    """A recording passed a limit of its plan; no proposal may do that."""
 
 
 class VirtualBench:
-    """A bench at whose line somebody sits who never waits: ticks are run one after the other."""
+    """A bench whose host never waits: ticks run one after the other."""
 
     def __init__(self, bench: SimulatedBench, *, seed: int) -> None:
         self.carts = VirtualCarts(bench, seed=seed)
@@ -57,7 +57,7 @@ class VirtualBench:
         )
         self.scales = CountScales(input=input_per_count(bench), position=bench.count)
         self._core, self._ticks = ReferenceCore(self.description), 0
-        self.seconds = 0.0  # of the bench's clock, all told
+        self.seconds = 0.0  # of the bench's clock, in total
 
     def _tick(self) -> list[Reading]:
         duty = self._core.tick(
@@ -68,9 +68,9 @@ class VirtualBench:
         return [r for line in self._core.take().splitlines() if (r := parse_reading(line))]
 
     def _driven(self, *, held: Sequence[int], ticks: int) -> list[Reading]:
-        """Return the lines of as many ticks from rest, all carts' motion computed at once.
+        """Return the lines of that many ticks from rest, with all motion computed at once.
 
-        Without feedback the controller never looks at the counts: they are put in afterwards.
+        Without feedback the controller never reads the counts, which are inserted afterwards.
         """
         duties, lines, spare = np.zeros(ticks), [], (0,) * self.description.encoders
         for tick in range(ticks):
@@ -84,7 +84,7 @@ class VirtualBench:
     def carry_out(
         self, recording: Recording, *, submission: Submission, limits: PlanLimits
     ) -> list[Reading]:
-        """Return the lines of one recording; raise LimitPassed where it passes a limit."""
+        """Return the lines of one recording; raise LimitPassed if it passes a limit."""
         n = submission.system.carts
         order = make_order(
             recording,
@@ -94,7 +94,7 @@ class VirtualBench:
             bench=self.description,
         )
         held = tuple(cart for cart in range(1, n + 1) if cart not in recording.carts)
-        # Whoever takes the carts in hand brings them to rest: nothing happens while they wait.
+        # A person who holds the carts brings them to rest: nothing happens meanwhile.
         self.carts.take_in_hand(Hands(held=held, released=recording.release or 0))
         self._ticks += round(recording.settle / TRUE_PERIOD)
         self.seconds += recording.settle
@@ -134,7 +134,7 @@ class VirtualBench:
 def _counts(
     carts: VirtualCarts, duties: NDArray[np.float64], *, held: Sequence[int]
 ) -> NDArray[np.int64]:
-    """Return what the encoders count at each tick under these duties, the first being zero."""
+    """Return the encoder counts at each tick under these duties, the first being zero."""
     hidden = carts._bench
     free = [cart for cart in range(1, hidden.chain.n + 1) if cart not in held]
     t = np.asarray(TRUE_PERIOD * np.arange(duties.size), dtype=np.float64)
@@ -163,17 +163,17 @@ def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) ->
 
 
 class VirtualSession:
-    """What an exploration records through: the bench, and the folder that the first call makes."""
+    """Records for an exploration: the bench, and the folder that the first call makes."""
 
     def __init__(
         self, folder: Path, bench: VirtualBench, *, springs: Sequence[bool] | None = None
     ) -> None:
-        """Take the springs for there, all of them, where nobody says which."""
+        """Assume all springs, unless they are given."""
         self.folder, self.bench = folder, bench
         self.springs = springs or [True] * (bench.description.carts + 1)
 
     def __call__(self, ids: Sequence[str]) -> Recorded:
-        """Carry out recordings of the plan; make submission and plan where there are none."""
+        """Carry out recordings of the plan; make submission and plan if they are missing."""
         if not (self.folder / NAME).exists():
             new_folder(self.folder, self.bench, springs=self.springs)
         submission = load_submission(self.folder)

@@ -1,4 +1,4 @@
-"""Waiting for what happens, however busy the machine: a deadline only ends a hang."""
+"""Waiting for an event on a machine of any load: a deadline only ends a hang."""
 
 import subprocess
 import time
@@ -30,7 +30,7 @@ def until(happened: Callable[[], object], what: str = "it") -> None:
 
 @contextmanager
 def started(command: Sequence[object], **options: Any) -> Iterator[subprocess.Popen[Any]]:
-    """Run a program beside a block; after it that and all it started have ended."""
+    """Run a program beside a block; afterwards it and all its children have ended."""
     with subprocess.Popen(list(map(str, command)), **options) as process:
         try:
             yield process
@@ -39,7 +39,7 @@ def started(command: Sequence[object], **options: Any) -> Iterator[subprocess.Po
 
 
 def kill(process: subprocess.Popen[Any]) -> None:
-    """Kill a program, then what it had started, and wait until all of them are gone."""
+    """Kill a program and its children, and wait until all of them are gone."""
     if process.poll() is not None:
         return
     tree: list[psutil.Process] = []

@@ -16,7 +16,7 @@ from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.recovery import recover_chain, recover_from_parameters
 from pipeline.set_up import PAPER_UNITS
 
-# The paper's final estimates: Tables 1 and 2 are kept by the presets, Table 3 by no real chain.
+# The paper's final estimates: Tables 1 and 2 are met by presets, Table 3 by no real chain.
 TABLE_1 = {"K": 28.9, "omega_n": 13.2, "zeta": 0.10}
 TABLE_2 = {
     "K_1": 24.3, "K_2": 16.4, "omega_a": 10.1, "omega_b": 37.3,
@@ -60,7 +60,7 @@ def assert_same_chain(got, chain, *, rtol):
 
 @given(chains(max_carts=3))
 def test_chain_to_parameters_and_back(chain):
-    """The named parameters of one to three carts give the chain back, redundancies at zero."""
+    """The named parameters of one to three carts give the chain back, with zero redundancies."""
     got = recover_from_parameters(chain.parameters())
 
     # Poles come from an eigenvalue routine with errors near 1e-14; a weak coupling, the
@@ -91,7 +91,7 @@ def test_number_of_redundancies(carts, redundancies):
     [("zeta_x", {"R1"}), ("zeta_b", {"R2", "R4"}), ("K_2", {"R5"}), ("omega_3", {"R3"})],
 )
 def test_an_inconsistent_table_shows_in_the_redundancies(name, broken):
-    """A table that no chain made leaves residuals far above rounding."""
+    """A table that no chain has leaves residuals far above rounding."""
     values = PRESETS["throne-3dof"].parameters()
     got = recover_from_parameters(values | {name: 1.1 * values[name]})
 
@@ -111,7 +111,7 @@ def test_the_names_of_the_tables():
 
 
 def test_units_of_parameters():
-    """Gains, frequencies and the rigid body's two carry units; damping ratios do not."""
+    """Gains, frequencies and a rigid body's two numbers have units; damping ratios do not."""
     units = {
         name: read_name(name).unit(PAPER_UNITS)
         for name in ("K_2", "omega_a", "zeta_1", "mass", "damping")
@@ -150,7 +150,7 @@ def test_zeros_make_each_response_vanish(chain):
         oracle = control.zeros(control.ss(A, B, C[[cart - 1]], D[[cart - 1]]))
         finite = oracle[np.abs(oracle) < 1e4]  # its infinite zeros come out huge
         matched = [np.min(np.abs(finite - zero)) / abs(zero) for zero in zeros]
-        # The oracle's generalised eigenvalues mix scales of 1 and 1e4 (k/m): 1e-6 is its own.
+        # The oracle's generalised eigenvalues mix scales of 1 and 1e4 (k/m): 1e-6 is its own error.
         assert max(matched) < 1e-6
 
 
@@ -165,7 +165,7 @@ def test_frequency_response_matches_state_space(chain):
     A, B, C, _ = chain.state_space()
     eye = np.eye(A.shape[0])
     expected = np.stack([(C @ np.linalg.solve(1j * w * eye - A, B))[:, 0] for w in omega], axis=1)
-    # Beside a sharp null the two routes cancel to a hundredth of what they add up.
+    # Beside a sharp null the terms of both methods cancel to a hundredth.
     scale = np.abs(expected).max(axis=1, keepdims=True)
     assert_allclose(got / scale, expected / scale, atol=1e-10)
 
@@ -254,7 +254,7 @@ def test_frequencies_interlace(chain):
 
 @given(chains(min_carts=2), st.data())
 def test_a_held_cart_is_a_wall(chain, data):
-    """One cart alone has the frequency and damping that bear its number."""
+    """One cart alone has the frequency and damping with its number."""
     cart = data.draw(st.integers(1, chain.n))
 
     A, B, _, _ = chain.state_space(free=[cart])
@@ -271,13 +271,13 @@ def test_the_order_of_free_carts_does_not_matter():
 
 
 def test_a_cart_that_is_not_there_cannot_be_free():
-    """Cart 3 of two is a mistake in the call."""
+    """Cart 3 of two is an error of the caller."""
     with pytest.raises(ValueError, match=r"free carts \[3\] are not among 1 to 2"):
         PRESETS["throne-2dof"].state_space(free=[3])
 
 
 def test_a_missing_spring_uncouples():
-    """Without the spring between them, the second cart neither moves nor has a gain."""
+    """Without the spring between them the second cart neither moves nor has a gain."""
     chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.1, 0.0, 0.1]))
 
     assert_allclose(chain.static_gains(), [10.0, 0.0], atol=1e-15)
@@ -285,7 +285,7 @@ def test_a_missing_spring_uncouples():
 
 
 def test_equal_gains_without_a_far_spring():
-    """Where no spring holds the far end, both carts go equally far."""
+    """If no spring holds the far end, both carts move equally far."""
     chain = Chain(m=np.array([2e-4, 3e-4]), c=np.array([1e-4, 1e-4]), k=np.array([0.1, 0.2, 0.0]))
 
     assert_allclose(chain.static_gains(), [10.0, 10.0], rtol=1e-12)
@@ -321,7 +321,7 @@ def test_an_overdamped_factor_has_zeta_above_one():
 
 @given(chains(max_carts=3, max_zeta=3.0))
 def test_heavy_damping_survives_the_maps(chain):
-    """Overdamped carts come back too, as long as the real poles are told apart."""
+    """Overdamped carts come back too, as long as the real poles are distinct."""
     roots = [chain.poles, *(chain.zeros(cart) for cart in range(1, chain.n))]
     gaps = [
         np.min(np.abs(r[:, None] - r[None, :]) + np.diag(np.full(r.size, np.inf))) / np.abs(r).min()

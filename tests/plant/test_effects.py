@@ -1,4 +1,4 @@
-"""The catalogue: complete, documented, and without effect where an effect's size is nothing."""
+"""The catalogue is complete and documented, and an effect of zero size has no effect."""
 
 from collections.abc import Callable
 
@@ -22,7 +22,7 @@ from tests.helpers.effects import SIZES, make_term
 
 
 def test_catalogue_has_the_agreed_names():
-    """Keys and reported parameters are those that files and users rely on."""
+    """Keys and parameters are those that files and users rely on."""
     found = {e.key: {p.name for p in e.parameters if p.reported} for e in CATALOGUE}
     assert found == {key: set(sizes) for key, sizes in SIZES.items()}
 
@@ -38,14 +38,14 @@ def test_entry_says_all_a_student_needs(effect):
 
 
 def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
-    """Return an effect at `share` of a size that is plain to see; its shape stays."""
+    """Return an effect at `share` of a clearly visible size, with the same shape."""
     place = {"cart": 1, "spring": 2, "input": 0}[effect.place]
     scales = chain_scales(chain, place=effect.place, at=place, input=0.05)
     sized = {p.unit for p in effect.parameters if p.neutral is not None}
     values = {}
     for parameter in effect.parameters:
         value, neutral = parameter.typical * parameter.size(scales), parameter.neutral or 0.0
-        if not sized:  # a limit: nothing is left of it where nobody reaches it
+        if not sized:  # a limit acts on nothing that does not reach it
             value /= share
         elif parameter.neutral is not None or (parameter.reported and parameter.unit in sized):
             value = neutral + share * (value - neutral)
@@ -58,7 +58,7 @@ def faint_term(effect: Effect, *, share: float, chain: Chain) -> EffectTerm:
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
 def test_an_effect_of_no_size_is_the_linear_bench(effect):
-    """Made smaller and smaller, every effect of the catalogue leaves the motion of the chain."""
+    """As its size goes to zero, every effect of the catalogue leaves the motion of the chain."""
     chain = PRESETS["throne-2dof"]
     t = np.linspace(0.0, 3.0, 601)
     u = np.where(t < 1.5, 0.05, -0.025)
@@ -71,12 +71,12 @@ def test_an_effect_of_no_size_is_the_linear_bench(effect):
 
     plain = departs(1.0)
     assert plain > 3e-3
-    # In proportion, or with the root where a speed comes in; what meets keeps a little give.
+    # In proportion, or with the root if a speed is involved; bodies that meet keep some give.
     assert departs(1e-4) < 0.02 * plain
 
 
 def test_what_an_effect_is_follows_from_its_law():
-    """Friction that differs from run to run, hidden masses, contacts, several rests."""
+    """Friction that varies between runs, hidden masses, contacts, several rest positions."""
 
     def those(is_so: Callable[[Effect], bool]) -> set[str]:
         return {effect.key for effect in CATALOGUE if is_so(effect)}
@@ -109,7 +109,7 @@ def test_single_cart_has_one_spring_place():
     ],
 )
 def test_a_word_of_a_name_finds_the_effects_that_have_it(typed, meant):
-    """The commonest comes first; a misspelt name finds the nearest."""
+    """The most common comes first; a misspelt name finds the nearest."""
     with pytest.raises(ConfigError, match=rf"did you mean {meant}\?"):
         find_effect(typed)
 

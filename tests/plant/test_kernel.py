@@ -1,4 +1,4 @@
-"""The compiled simulator against exact solutions, an event-driven one, and the fine-step truth."""
+"""The compiled simulator against exact solutions, an event-driven one, and the fine-step one."""
 
 import subprocess
 import sys
@@ -86,7 +86,7 @@ def friction_decay(m, k, force, x0, t):
 
 
 def test_a_held_cart_that_is_moved_moves_its_neighbour():
-    """Guided as it swings when free, it leaves the other cart its motion."""
+    """Guided along its own free motion, it leaves the other cart's motion unchanged."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(2000, 1e-3)
     both = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0))
@@ -94,14 +94,14 @@ def test_a_held_cart_that_is_moved_moves_its_neighbour():
 
     got = simulate(tables, t, np.where(t < 0.5, 1.0, 0.0), free=(1,), guided=guided)
 
-    # Straight lines from sample to sample are off by an eighth of the curve's bend, always to the
-    # inside; a cart that swings follows such a pull by up to twice as much.
+    # Straight lines between samples are off by an eighth of the curvature, always to the inside; a
+    # swinging cart follows such a pull by up to twice as much.
     np.testing.assert_allclose(got, both, atol=np.abs(np.diff(both[1], n=2)).max() / 4)
 
 
 @pytest.mark.parametrize("rate", [113.1, 250.0, 1000.0])
 def test_friction_decay_follows_the_events(rate):
-    """Dry friction alone gives the exact half swings, and the cart then rests where it stopped."""
+    """Dry friction alone gives the exact half swings, and the cart then stays where it stopped."""
     m, k, force = 2e-4, 0.035, 0.004
     chain = Chain(m=np.array([m]), c=np.array([0.0]), k=np.array([k, 0.0]))
     tables = linear_tables(chain)
@@ -110,7 +110,7 @@ def test_friction_decay_follows_the_events(rate):
 
     got = simulate(tables, t, 0 * t, x0=[2.0])[0]
 
-    # 0.5 count is what is asked; reversals are found to the root of the velocity.
+    # 0.5 count is the requirement; reversals are found to the root of the velocity.
     assert np.abs(got - friction_decay(m, k, force, 2.0, t)).max() < 0.05 * COUNT
     assert np.ptp(got[-50:]) == 0.0
 
@@ -156,8 +156,7 @@ def test_every_effect_agrees_with_the_fine_step_truth(key):
         free=(1, 2),
     )
 
-    # The truth's own steps leave 0.1 count; a contact's end is softer
-    # by what one step of it moves.
+    # The fine-step simulator's own steps leave 0.1 count; a contact ends softer by one step of it.
     limit = {"end_stop": 1.5, "backlash": 0.6}.get(key, 0.25)
     assert np.sqrt(np.mean((got - truth) ** 2)) < limit * COUNT
     linear = simulate(linear_tables(chain), t, u)
@@ -169,7 +168,7 @@ DISSIPATIVE = ("coulomb_friction", "stiction", "presliding_friction", "quadratic
 
 @pytest.mark.parametrize("key", DISSIPATIVE)
 def test_energy_never_grows_without_input(key):
-    """Swings that nothing drives only shrink, whatever the effect."""
+    """Without an input swings only shrink, whatever the effect."""
     chain = PRESETS["throne-1dof"]
     effect = find_effect(key)
     term = make_term(effect, place=1, values=SIZES[key], chain=chain)
@@ -213,7 +212,7 @@ def test_diverging_model_is_reported_as_nan():
 
 
 def test_batch_gives_what_single_runs_give():
-    """Variants simulated together do not disturb each other."""
+    """Variants simulated together do not influence each other."""
     chain = PRESETS["throne-1dof"]
     t = sample_times(300, 0.005)
     u = np.where(t > 0.1, 0.03, 0.0)
@@ -284,12 +283,12 @@ assert [dict(one.cache_misses) for one in stats] == before
 
 
 def test_once_compiled_nothing_is_left_to_compile():
-    """A bench that is stepped and derivatives run what `compile_simulator` compiled."""
+    """A stepped bench and derivatives run the code that `compile_simulator` compiled."""
     subprocess.run([sys.executable, "-c", _NOTHING_LEFT], check=True)
 
 
 def test_arrays_of_any_kind_meet_the_same_simulator():
-    """Views, whole numbers and what may not be written to cost no compilation of their own."""
+    """Views, integers and read-only arrays cost no compilation of their own."""
     tables = linear_tables(PRESETS["throne-2dof"])
     t = sample_times(50, 0.005)
     command = np.zeros(50, dtype=int)
@@ -310,7 +309,7 @@ def test_arrays_of_any_kind_meet_the_same_simulator():
 
 
 def test_no_array_is_counted():
-    """Two threads that search would wait for each other at every count of who uses an array."""
+    """Reference counts of arrays would make two searching threads wait for each other."""
     compile_simulator()
     folder = kernel._simulate.stats.cache_path
     assert folder is not None
@@ -321,7 +320,7 @@ def test_no_array_is_counted():
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
-    """Read every 4 ms under an input that changes every millisecond, the carts are where they are.
+    """Read every 4 ms under an input that changes every millisecond, the carts are right.
 
     The input's mean over a step alone would leave (omega h)² / 12 of the motion, 2e-3 here.
     """
@@ -337,7 +336,7 @@ def test_an_input_that_changes_within_a_step_moves_the_carts_in_time(preset):
 
 
 def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
-    """Whatever the steps: friction brakes the cart from the edge on, not from the step's begin."""
+    """Whatever the steps, friction brakes the cart from the edge on, not from the step's start."""
     chain = PRESETS["throne-1dof"]
     dry = make_term(find_effect("coulomb_friction"), place=1, values={"force": 6e-3}, chain=chain)
     tables = AugmentedChain(chain=chain, terms=(dry,)).tables()
@@ -351,7 +350,7 @@ def test_an_input_that_jumps_inside_a_step_frees_a_held_cart_at_once():
 
 
 def test_what_stands_behind_the_last_sample_is_no_time():
-    """A shot ends with its samples: driven on to a time behind them, the cart would be far away."""
+    """A run ends with its samples: driven to a later time the cart would be far away."""
     chain = Chain(m=np.array([1e-4]), c=np.zeros(1), k=np.zeros(2))
     t = np.append(sample_times(100, 4e-3), 2e4)[:-1]  # a view: the time behind is its neighbour
     x = simulate(linear_tables(chain), t, np.full(t.size, 0.02))
@@ -363,7 +362,7 @@ def test_what_stands_behind_the_last_sample_is_no_time():
     [("actuator_lag", {"time_constant": 2.8e-3}), ("input_delay", {"delay": 2.8e-3})],
 )
 def test_what_is_late_is_as_late_in_long_steps(key, values):
-    """Of a fast sweep, four ticks a step: of a lag as of a delay less than a tenth of a count."""
+    """In a fast sweep of four ticks a step, lag and delay are right to a tenth of a count."""
     chain = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.array([0.05, 0.0]))
     term = make_term(find_effect(key), place=0, values=values, chain=chain)
     tables = AugmentedChain(chain=chain, terms=(term,)).tables()

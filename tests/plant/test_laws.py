@@ -1,4 +1,4 @@
-"""The laws, each written once: what is made from them is what stands there, derivatives too."""
+"""The laws, each written once: the generated code agrees with them, derivatives included."""
 
 import ast
 import sys
@@ -33,7 +33,7 @@ STATES = [(0.4, 0.7, 0.02, 1.0), (-0.9, -0.3, -0.05, 1.0), (1.3, -1.1, 0.03, 0.0
 
 @pytest.mark.parametrize("name", MADE)
 def test_what_stands_there_is_made_from_the_laws(name):
-    """Nobody changed a law without `python -m docs.codegen`, or what it makes by hand."""
+    """Nobody changed a law without `python -m docs.codegen`, or the generated files by hand."""
     stored, made = (ROOM / name).read_text(encoding="utf-8"), MADE[name](CATALOGUE)
     assert ast.dump(ast.parse(stored)) == ast.dump(ast.parse(made)), "run python -m docs.codegen"
 
@@ -54,7 +54,7 @@ def terms_of(kind: int, p: np.ndarray, x: float, v: float, u: float, on: float) 
 @pytest.mark.parametrize("state", STATES)
 @pytest.mark.parametrize("effect", FOLLOWED, ids=lambda effect: effect.key)
 def test_derivatives_are_those_of_the_law(effect, state):
-    """By position, velocity, input and every coordinate, as differences give them."""
+    """By position, velocity, input and every coordinate, they agree with differences."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     out = terms_of(kind, p, *state)
@@ -73,7 +73,7 @@ def test_derivatives_are_those_of_the_law(effect, state):
 
 @pytest.mark.parametrize("key", ["end_stop", "slack_spring"])
 def test_contacts_are_those_of_the_law(key):
-    """Stiffness, damping and where it begins give the force of the law, either side of it."""
+    """Stiffness, damping and start give the force of the law on either side of it."""
     effect = find_effect(key)
     law, kind = effect.law, CATALOGUE.index(effect)
     assert isinstance(law, ContactLaw)
@@ -97,7 +97,7 @@ def test_contacts_are_those_of_the_law(key):
 
 @pytest.mark.parametrize("v", [0.7, -0.3])
 def test_hysteresis_settles_as_its_rate_says(v):
-    """Its state goes to a place at a pace; both simulators have the same, and its derivatives."""
+    """Its state goes to a value at a rate; both simulators agree, and its derivatives."""
     effect = find_effect("presliding_friction")
     law = effect.law
     assert isinstance(law, HysteresisLaw)
@@ -133,7 +133,7 @@ def test_hysteresis_settles_as_its_rate_says(v):
     ids=lambda effect: effect.key,
 )
 def test_simulator_and_follower_have_the_same_law(effect, state):
-    """The parameters that go with coordinates give, in the tables, the force that those give."""
+    """Parameters computed from coordinates give the same force in the tables."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     x, v, u, on = state
     within = {"F": 0.2} if isinstance(effect.law, FrictionLaw) and effect.law.beyond else {}
@@ -158,14 +158,14 @@ def test_simulator_and_follower_have_the_same_law(effect, state):
 
 @pytest.mark.parametrize("effect", FOLLOWED, ids=lambda effect: effect.key)
 def test_a_law_vanishes_with_its_coefficients(effect):
-    """The coordinates that a drop takes out leave nothing of the law; its shape alone is none."""
+    """With its coefficients at zero nothing of the law is left, whatever its shape."""
     kind, p = CATALOGUE.index(effect), coordinates_of(effect)
     p[list(terms.COEFFICIENTS[kind])] = 0.0
     assert all(terms_of(kind, p, *state)[0] == 0.0 for state in STATES)
 
 
 def test_dead_zone_and_saturation_shape_the_input():
-    """The input behind both: nothing, less by the width, at the limit."""
+    """The input behind both is zero, reduced by the width, or at the limit."""
     drive = np.zeros(len(TABLES["input"]))
     for key in ("dead_zone", "saturation"):
         effect = find_effect(key)
@@ -176,7 +176,7 @@ def test_dead_zone_and_saturation_shape_the_input():
 
 
 def test_friction_at_rest_is_what_the_law_says():
-    """Where `at_rest` differs from the size, it is the size at no speed."""
+    """If `at_rest` differs from the size, it is the size at zero speed."""
     for effect in CATALOGUE:
         if isinstance(effect.law, FrictionLaw) and effect.law.at_rest:
             row = np.zeros((1, len(TABLES["cart"])))
@@ -189,7 +189,7 @@ def test_friction_at_rest_is_what_the_law_says():
 
 
 def load(source: str, name: str, folder: Path):
-    """Import source as a module that stands for a moment."""
+    """Import source as a temporary module."""
     path = folder / f"{name}.py"
     path.write_text(source, encoding="utf-8")
     spec = util.spec_from_file_location(name, path)
@@ -210,7 +210,7 @@ WEAK_ZONE = replace(
 
 
 def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
-    """A law that nobody thought of: columns, force, slopes and what follows come by themselves."""
+    """For a new law, columns, force, slopes and follower are generated."""
     catalogue = (*CATALOGUE, CUBIC_DRAG, WEAK_ZONE)
     load(columns_source(catalogue), "new_columns", tmp_path)
     source = laws_source(catalogue).replace("pipeline.plant.nonlinear.columns", "new_columns")
@@ -253,5 +253,5 @@ def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
     ],
 )
 def test_equations_read_as_in_a_book(key, equation):
-    """Factors side by side, no bracket too many, details of a contact left out."""
+    """Factors side by side, no needless bracket, details of a contact left out."""
     assert to_tex(find_effect(key).formula) == equation

@@ -79,7 +79,7 @@ def test_an_exact_observer_adds_its_own_poles_and_moves_none():
 
 
 def test_the_input_stays_within_its_limit():
-    """A limit clips the input; one that is never reached changes nothing."""
+    """A limit clips the input; a limit that is never reached changes nothing."""
     free = simulate_loop(TWO, feedback(TWO), t=CLOCK, reference=1.0)
     peak = np.abs(free.u).max()
     roomy = simulate_loop(
@@ -107,7 +107,7 @@ def test_proportional_control_holds_a_share_of_the_reference():
 
 
 def test_the_pid_terms_are_sum_and_difference():
-    """The first two efforts follow the stated sums and differences of the error."""
+    """The first two inputs follow the stated sums and differences of the error."""
     pid = Pid(kp=0.3, ki=2.0, kd=0.004, scale=0.1)
     run = simulate_loop(
         PRESETS["throne-1dof"], pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0)
@@ -129,7 +129,7 @@ def test_integral_action_removes_the_error():
 
 
 def test_the_controller_sees_whole_encoder_steps():
-    """Proportional efforts are multiples of the gain times the encoder step."""
+    """Proportional inputs are multiples of the gain times the encoder step."""
     step = np.array([0.01, 0.0])
     run = simulate_loop(
         TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(encoder_step=step, delay=0)
@@ -151,7 +151,7 @@ def test_positions_between_the_ticks_are_those_of_the_held_input():
 
 
 def test_a_controller_faster_than_the_log_acts_between_its_samples():
-    """A log of each tenth tick holds the same motion as the full one."""
+    """A log of every tenth tick holds the same motion as the full one."""
     fine = T / 10 * np.arange(2001.0)
     full = simulate_loop(TWO, feedback(TWO), t=fine, reference=1.0)
     logged = simulate_loop(
@@ -174,7 +174,7 @@ def test_rounded_time_stamps_keep_the_reference_at_its_sample():
 
 
 def test_a_drive_of_the_other_sign_wants_the_other_gains():
-    """Negative efforts through a negative drive are the same forces."""
+    """Negative inputs through a reversed drive are the same forces."""
     mirrored = Pid(kp=-0.02, kd=-0.0005)
     run = simulate_loop(TWO, Pid(kp=0.04, kd=0.001), t=CLOCK, reference=1.0)
     other = simulate_loop(TWO, mirrored, t=CLOCK, reference=1.0, setup=LoopSetup(drive=-2.0))
@@ -184,7 +184,7 @@ def test_a_drive_of_the_other_sign_wants_the_other_gains():
 
 
 def test_the_rest_adds_to_the_readings():
-    """An encoder zeroed off the rest shifts the readings and what the controller makes of them."""
+    """An encoder zeroed away from the rest shifts the readings and the controller's response."""
     shift = np.array([0.3, -0.1])
     run = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0, setup=LoopSetup(rest=shift))
     same = simulate_loop(TWO, Pid(kp=0.02), t=CLOCK, reference=1.0 - 0.3)
@@ -202,7 +202,7 @@ def test_held_carts_are_walls():
 
 
 def test_a_replay_gives_the_efforts_that_were_logged():
-    """On the readings of an undelayed PID run the law asks for the logged input."""
+    """On the readings of an undelayed PID run the law returns the logged input."""
     pid = Pid(kp=0.02, ki=0.01, kd=0.0004, scale=0.7, cart=2)
     run = simulate_loop(TWO, pid, t=CLOCK, reference=1.0, setup=LoopSetup(delay=0))
 

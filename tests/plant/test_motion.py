@@ -1,4 +1,4 @@
-"""The equation of motion for python-control does what the simulator does, whatever the effect."""
+"""The equation of motion for python-control agrees with the simulator for every effect."""
 
 from itertools import pairwise
 
@@ -21,7 +21,7 @@ ON, OFF, LEVEL = 0.1, 0.9, 0.05  # s, s, V
 
 
 def usual(effect: Effect) -> AugmentedChain:
-    """Return the carts with one effect of a size that is plain to see."""
+    """Return the carts with one effect of a clearly visible size."""
     place = (effect.places((True, True, True)) or (0,))[-1]
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=LEVEL)
     values = {p.name: p.size(scales) * p.typical for p in effect.parameters}
@@ -85,7 +85,7 @@ def test_without_effects_it_is_the_linear_chain():
 
 
 def test_effects_have_states_of_their_own():
-    """What moves unseen and what remembers the input is in the state, under a name."""
+    """Hidden motion and memory of the input are named states."""
     own = {
         "extra_mode": ["x2_hidden", "v2_hidden"],
         "presliding_friction": ["z2"],
@@ -99,7 +99,7 @@ def test_effects_have_states_of_their_own():
 
 
 def test_a_drive_that_leads_its_log_has_no_system():
-    """A negative delay asks for the future input, which is said."""
+    """A negative delay needs future input, and the error says so."""
     term = make_term(find_effect("input_delay"), place=0, values={"delay": -0.01}, chain=CHAIN)
 
     with pytest.raises(DataError, match="leads its log"):

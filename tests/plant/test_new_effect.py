@@ -1,4 +1,4 @@
-"""A new effect takes its file and its line in the catalogue; the rest is made from its law."""
+"""A new effect takes its file and a line in the catalogue; the rest is generated."""
 
 import ast
 import re
@@ -31,7 +31,7 @@ CUBIC_DRAG = Effect(
 
 
 def function_of(name: str, source: str, **known: object) -> Any:
-    """Return one function of a made file, as it would run without the compiler."""
+    """Return one function of a generated file, without the compiler."""
     tree = ast.parse(source)
     (found,) = (n for n in tree.body if isinstance(n, ast.FunctionDef) and n.name == name)
     found.decorator_list = []
@@ -41,7 +41,7 @@ def function_of(name: str, source: str, **known: object) -> Any:
 
 
 def kinds_of(source: str, name: str) -> dict[str, int]:
-    """Return the members of an enumeration in a made file."""
+    """Return the members of an enumeration in a generated file."""
     (found,) = (n for n in ast.parse(source).body if isinstance(n, ast.ClassDef) and n.name == name)
     return {
         one.targets[0].id: ast.literal_eval(one.value)
@@ -52,12 +52,12 @@ def kinds_of(source: str, name: str) -> dict[str, int]:
 
 @pytest.fixture(scope="module")
 def made() -> dict[str, str]:
-    """Return what is made from a catalogue with one effect more."""
+    """Return the generated source for a catalogue with one more effect."""
     return {name: source((*CATALOGUE, CUBIC_DRAG)) for name, source in MADE.items()}
 
 
 def test_its_columns_force_and_slopes_are_made(made):
-    """The simulator reads its parameter from a column of its own, and knows its derivative."""
+    """The simulator reads its parameter from a column of its own, and has its derivative."""
     columns = kinds_of(made["columns.py"], "Cart")
     Cart = type("Cart", (), columns)
     row = np.zeros((1, len(columns)))
@@ -93,9 +93,9 @@ PLAIN = [
 
 @pytest.mark.parametrize("effect", PLAIN, ids=lambda effect: effect.key)
 def test_no_other_file_of_the_plant_names_it(effect):
-    """A law without a state that the simulators have built in stands in one file alone.
+    """A law without a built-in state appears in one file only.
 
-    Trial shapes of laws that need one are in `gap.follow.score`.
+    Trial shapes, for laws that need one, are in `gap.follow.score`.
     """
     files = {
         path.relative_to(ROOM).as_posix()

@@ -1,4 +1,4 @@
-"""The derivatives that the simulator carries along, against differences of its own readings."""
+"""The derivatives of the simulator against differences of its own readings."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.simulator.sensitivity import (
 from pipeline.plant.nonlinear.tables import Cart, Spring, Tables
 from tests.helpers.effects import SIZES, make_term
 
-# Small enough that, of contacts and jumps, none is won or lost by a difference.
+# Small enough that a difference neither adds nor removes a contact or jump.
 CASES = {
     **SIZES,
     "nothing": {},
@@ -31,13 +31,13 @@ CASES = {
 }
 
 
-# At rest, what takes hold only when the motor pulls.
+# For carts at rest, effects that act only when the motor pulls.
 @pytest.mark.parametrize(
     ("effect", "speed"), [*((effect, 1.0) for effect in CASES), ("load_friction", 0.0)]
 )
 @pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof"])
 def test_derivatives_are_those_of_the_readings(preset, effect, speed):
-    """By mass, damping, stiffness, friction and start: as central differences give them."""
+    """By mass, damping, stiffness, friction and start: central differences agree."""
     chain = PRESETS[preset]
     n = chain.n
     terms = ()
@@ -56,12 +56,12 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
     lanes += [(kind, i) for kind in (BY_FRICTION, BY_POSITION, BY_VELOCITY) for i in range(n)]
 
     def simulate(by=-1, at=0, change=0.0):
-        """Return readings and derivatives where one number is changed."""
+        """Return readings and derivatives after one number is changed."""
         tables = [cart.copy(), spring.copy(), x0.copy(), v0.copy(), scatter.copy()]
         if by in (BY_MASS, BY_DAMPING):
             tables[0][at, Cart.MASS if by == BY_MASS else Cart.DAMPING] += change
         elif by == BY_STIFFNESS:
-            # What changes past a stretch is stated in shares of the stiffness.
+            # A change past a stretch is given as a share of the stiffness.
             tables[1][at, Spring.STIFFNESS] += change
         elif by in (BY_POSITION, BY_VELOCITY):
             tables[2 if by == BY_POSITION else 3][0, at] += change
@@ -80,7 +80,8 @@ def test_derivatives_are_those_of_the_readings(preset, effect, speed):
             BY_DAMPING: chain.c[min(at, n - 1)],
             BY_STIFFNESS: chain.k[at],
         }.get(by, 1.0)
-        # Small enough that no event is won or lost, large enough above the kernel's rounding.
+        # Small enough that no event appears or disappears, large enough above the kernel's
+        # rounding.
         step = 1e-5 * size
         difference = (simulate(by, at, step)[0] - simulate(by, at, -step)[0]) / (2.0 * step)
         scale = max(float(np.linalg.norm(difference)) * size, 1e-6)

@@ -93,7 +93,7 @@ def test_a_sample_between_two_changes_nothing(seed, carts):
 
 
 def test_motions_add():
-    """The sum of inputs and of starts moves the carts by the sum of the motions."""
+    """The response to a sum of inputs and starts is the sum of the responses."""
     rng = np.random.default_rng(4)
     t = irregular_times(rng, 200)
     u, x0 = 0.05 * rng.standard_normal((2, t.size)), rng.standard_normal((2, 6))
@@ -114,7 +114,7 @@ def test_held_carts_are_walls():
 
 
 def test_the_motor_does_not_reach_past_a_held_first_cart():
-    """With cart 1 held the input moves nothing."""
+    """With cart 1 held the input moves no cart."""
     t = clock(50)
 
     x = simulate_linear(THREE, t, np.ones(t.size), free=(2, 3))
@@ -168,7 +168,7 @@ def test_steady_state_of_a_band_limited_sine():
 
 
 def test_a_band_limited_constant_is_a_constant():
-    """The interpolation of equal samples is flat, to its very ends."""
+    """The interpolation of equal samples is flat up to its ends."""
     t = clock(100)
     u = np.full(t.size, 0.03)
 
@@ -199,7 +199,7 @@ def test_even_and_uneven_times_agree(n):
 
 
 def test_the_last_input_has_no_time_to_act():
-    """The sample at the end of the record is held only beyond it."""
+    """The input at the last sample acts only after the record."""
     t = clock(20)
     u = np.ones(t.size)
 

@@ -39,7 +39,7 @@ def test_settling_is_the_last_entry_into_the_band():
 
 
 def test_many_responses_at_once_are_each_judged_alone():
-    """A stack of responses gives what each gives alone; one that never settles gives NaN."""
+    """A stack of responses gives the results of each; one that never settles gives NaN."""
     y = np.stack([second_order(20.0, 0.5), second_order(20.0, 0.1), np.zeros(T.size)])
     level = np.ones(3)
 
@@ -55,7 +55,7 @@ def test_many_responses_at_once_are_each_judged_alone():
 
 
 def test_noise_widens_the_band():
-    """A response that is settled but for its noise counts as settled."""
+    """A response that is settled except for noise counts as settled."""
     y = second_order(20.0, 0.5) + 0.03 * np.sin(2000 * T)
 
     assert np.isnan(settling_time(T, y, before=0.0, level=1.0))

@@ -1,4 +1,4 @@
-"""The class of the demo: what is planted in it is what grading says of it."""
+"""The class of the demo: grading finds exactly the mistakes that were planted."""
 
 from pathlib import Path
 

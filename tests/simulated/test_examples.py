@@ -82,7 +82,7 @@ def test_the_shipped_examples_are_what_the_program_writes(tmp_path):
 
 
 def test_the_examples_are_small():
-    """Together they weigh less than a photograph."""
+    """Together they are smaller than a photograph."""
     sizes = [
         len(data) for example in CATALOGUE for data in content(EXAMPLES / example.folder).values()
     ]
@@ -90,7 +90,7 @@ def test_the_examples_are_small():
     assert sum(sizes) < 2e6
 
 
-# --------------------------------------------------------------- what is there
+# --------------------------------------------------------------- the content
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
@@ -122,7 +122,7 @@ def test_a_whole_session(sessions, preset):
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_the_carts_move_well_and_not_too_far(sessions, preset):
-    """Every run moves some cart by 0.4 to 2 cm, in whole counts, with an input a motor gives."""
+    """Every run moves some cart by 0.4 to 2 cm, in whole counts, with a realistic input."""
     for entry in toml(sessions / preset)["experiments"]:
         data = table(sessions / preset, entry)
         x = positions(data)
@@ -230,7 +230,7 @@ def test_after_the_hand_the_decay_is_free():
 
 
 def test_a_held_cart_reads_one_number():
-    """Noise shakes only what is free to move."""
+    """Noise moves only free carts."""
     _, _, run, bench = release_by_hand()
 
     y = bench.read(bench.move(run), run=run, rng=np.random.default_rng(1))
@@ -244,7 +244,7 @@ def test_a_held_cart_reads_one_number():
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_honest_claims_are_near_the_truth(sessions, preset):
-    """Final gains and frequencies within 2 %, dampings within 20 %; guesses stand as guessed."""
+    """Final gains and frequencies within 2 %, dampings within 20 %; guesses as guessed."""
     truth, reported = PRESETS[preset].parameters(), toml(sessions / preset)["reported"]
 
     assert list(reported["initial"]) == list(reported["final"]) == list(truth)
@@ -268,7 +268,7 @@ def test_claims_have_three_digits(sessions):
 
 @pytest.mark.parametrize("preset", PRESET_NAMES[1:])
 def test_honest_claims_agree_with_each_other(sessions, preset):
-    """The reported final values are one chain's: redundancies are left at their rounding."""
+    """The reported final values belong to one chain: redundancies are at their rounding."""
     final = toml(sessions / preset)["reported"]["final"]
 
     residuals = recover_from_parameters(final).residuals
@@ -278,7 +278,7 @@ def test_honest_claims_agree_with_each_other(sessions, preset):
 
 
 def test_reported_state_space_and_feedback(sessions):
-    """A and B have their shapes, and the gains are those that ran."""
+    """A and B have the right shapes, and the gains are those that ran."""
     document = toml(sessions / "throne-3dof")
     reported = document["reported"]
     (control,) = [e for e in document["experiments"] if e["kind"] == "closed_loop"]
@@ -350,7 +350,7 @@ def test_rounded_time_stamps(tmp_path):
 
 
 def test_an_unknown_preset_names_the_known_ones(tmp_path):
-    """A misspelt preset is the caller's to mend."""
+    """A misspelt preset is an error with the known names."""
     with pytest.raises(ConfigError, match=r"no preset 'throne-4dof': there are throne-1dof, "):
         write_submission(tmp_path, "throne-4dof", seed=0)
 

@@ -1,4 +1,7 @@
-"""Effects hidden in a synthetic bench: in every kind of run, against limits and the truth."""
+"""Effects hidden in a synthetic bench:
+
+in every kind of run, against limits and the other simulator.
+"""
 
 import json
 import subprocess
@@ -32,7 +35,7 @@ from tests.truth.bench import Hidden, simulate_truth
 
 TWO = PRESETS["throne-2dof"]
 KEYS = [effect.key for effect in CATALOGUE]
-# The truth knows these contacts by another law of its own.
+# The second simulator has its own law for these contacts.
 OWN_CONTACT = {"backlash", "end_stop"}
 
 
@@ -101,7 +104,7 @@ def _cases():
 
 @pytest.fixture(scope="module")
 def linear(tmp_path_factory):
-    """A session on each preset without effects."""
+    """A session without effects on each preset."""
     root = tmp_path_factory.mktemp("linear")
     for preset in PRESETS:
         write_submission(root / preset, preset, seed=3, compact=True)
@@ -110,7 +113,7 @@ def linear(tmp_path_factory):
 
 @pytest.mark.parametrize(("key", "preset"), list(_cases()))
 def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
-    """The session loads and reads as any other, shows the effect, and nowhere names it."""
+    """The session loads and reads like any other, shows the effect, and never names it."""
     chain = PRESETS[preset]
 
     write_submission(
@@ -127,7 +130,7 @@ def test_an_effect_hides_in_a_whole_submission(tmp_path, linear, key, preset):
 
 
 def test_several_effects_at_once():
-    """Each with its place, said or usual."""
+    """Each with its place, given or usual."""
     hide = ["coulomb_friction:cart=2", "cubic_spring:spring=3,coefficient=0.02", "dead_zone"]
     prepared = prepare_bench(preset="throne-2dof", hide=hide)
     assert [(t.effect.key, t.place) for t in prepared.effects] == [
@@ -153,7 +156,7 @@ def test_the_linear_path_compiles_nothing():
 @pytest.mark.parametrize("key", KEYS)
 @pytest.mark.parametrize("make_run", [step, decay, control], ids=lambda f: f.__name__)
 def test_next_to_nothing_is_the_linear_bench(key, make_run):
-    """With its size a hundred-thousandth, each effect leaves every kind of run within a count."""
+    """At a hundred-thousandth of its size, each effect changes no run by a count."""
     term = usual(key)
     # These have further sizes, without a neutral value of their own.
     further = {
@@ -168,7 +171,7 @@ def test_next_to_nothing_is_the_linear_bench(key, make_run):
         for p, value in zip(term.effect.parameters, term.values, strict=True)
     ]
     if key == "saturation":
-        values = [1e3]  # a limit nobody reaches
+        values = [1e3]  # a limit that is never reached
     if key == "backlash":
         values[0] = 0.0  # the contact's own stiffness stays, however small the gap
     small = replace(term, values=tuple(values))
@@ -268,7 +271,10 @@ def test_sample_by_sample_is_the_whole_run(key):
 
 
 def test_a_constant_force_shows_where_the_carts_rest():
-    """Carts rest where springs carry the force: elsewhere with other carts held, not in a loop."""
+    """Carts rest where springs carry the force:
+
+    elsewhere if other carts are held, not in a loop.
+    """
     term = usual("force_offset")
     (force,) = term.values
     model = AugmentedChain(chain=TWO, terms=(term,))
@@ -283,7 +289,7 @@ def test_a_constant_force_shows_where_the_carts_rest():
 
 
 def test_a_sensor_deceives_the_controller():
-    """A loop brings the reading to its place, so the cart itself stands off by the gain."""
+    """A loop brings the reading to its place, so the cart itself is off by the gain."""
     run = control()
     gain = 1.1
 
@@ -294,7 +300,7 @@ def test_a_sensor_deceives_the_controller():
 
 
 def test_a_hand_stops_before_the_end_stop():
-    """No hand pulls a cart into a stop; away from it the cart is held where it was meant to be."""
+    """No hand pulls a cart into a stop; otherwise the cart is held where it should be."""
     stop = usual("end_stop", position=-1.0)
 
     assert bench(stop).move(decay()).x[0, 0] == pytest.approx(-0.9, rel=0.01)
@@ -321,7 +327,7 @@ def test_carts_that_run_away_are_refused():
 
 
 def test_a_loop_cannot_look_ahead():
-    """A drive may lead its log by a sample at most: the next input is not known earlier."""
+    """A drive may lead its log by one sample at most: later inputs are unknown."""
     assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
     with pytest.raises(DataError, match="lead its log by over one sample"):
         bench(usual("input_delay", delay=-0.02)).move(control())
@@ -343,7 +349,7 @@ def stored(prepared):
 
 
 def test_a_stored_model_gives_the_same_records(tmp_path):
-    """Simulating from `gap.json` writes the very records of the bench it describes."""
+    """Simulating from `gap.json` writes exactly the records of the bench it describes."""
     prepared = prepare_bench(preset="throne-1dof", hide=["stiction", "backlash:gap=0.02"])
     file = tmp_path / "gap.json"
     file.write_text(json.dumps(stored(prepared)), encoding="utf-8")
@@ -358,7 +364,7 @@ def test_a_stored_model_gives_the_same_records(tmp_path):
 
 
 def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
-    """The fixed part of `gap.json` is enough: values with errors, and no contact details."""
+    """The documented part of `gap.json` suffices: values with errors, without contact details."""
     document = {
         "chain": {"m": [2e-4], "c": [5e-4], "k": [0.035, 0.0]},
         "effects": [
@@ -382,7 +388,7 @@ def test_a_model_of_chain_and_effects_alone_will_do(tmp_path):
 
 
 def test_a_model_in_counts_moves_as_far(tmp_path):
-    """Units stand in the file: a model in counts is moved by a centimetre's worth of counts."""
+    """The file states its units: a model in counts moves by a centimetre's worth of counts."""
     chain = PRESETS["throne-1dof"]
     document = {
         "chain": {name: (getattr(chain, name) * COUNT).tolist() for name in "mck"},
@@ -409,7 +415,7 @@ def with_backlash(**sizes):
 @pytest.mark.parametrize("command", ["simulate", "emulate"])
 @pytest.mark.parametrize("sizes", [{"contact_stiffness": 1e30}, {"motor_mass": 1e-30}])
 def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
-    """What no simulation would get through is refused at once; nothing is written or served."""
+    """A model that cannot be simulated in time is refused at once; nothing is written or served."""
     file = tmp_path / "gap.json"
     file.write_text(json.dumps(with_backlash(**sizes)), encoding="utf-8")
     out = ["--out", str(tmp_path / "out")] if command == "simulate" else []
@@ -474,13 +480,13 @@ def test_a_broken_model_is_one_line(tmp_path, document, message):
     ],
 )
 def test_a_wrong_effect_is_one_line(hide, message):
-    """A wrong name, place or size is told with the nearest that would do."""
+    """A wrong name, place or size gives the nearest valid one."""
     with pytest.raises(ConfigError, match=message):
         prepare_bench(preset="throne-2dof", hide=[hide])
 
 
 def test_one_place_has_one_dry_friction():
-    """Two effects of a family exclude each other at a place, not at two."""
+    """Two effects of a family exclude each other at one place, not at two."""
     with pytest.raises(ConfigError, match="cart 1 already has coulomb_friction"):
         prepare_bench(preset="throne-2dof", hide=["coulomb_friction", "stiction"])
     hide = ["coulomb_friction", "stiction:cart=2"]
@@ -488,7 +494,7 @@ def test_one_place_has_one_dry_friction():
 
 
 def test_defaults_are_told():
-    """What was left out gets a size that shows, and is said to be a default."""
+    """Omitted sizes get clearly visible defaults, and a note says so."""
     prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
 
     assert prepared.told == (
@@ -499,7 +505,7 @@ def test_defaults_are_told():
 
 
 def test_a_bench_needs_one_source(tmp_path):
-    """Neither a preset nor a model, or both, is the caller's to mend."""
+    """Neither a preset nor a model, or both, is an error."""
     with pytest.raises(ConfigError, match="either --preset or --model"):
         prepare_bench()
     with pytest.raises(ConfigError, match="either --preset or --model"):
@@ -513,7 +519,7 @@ def test_what_the_linear_chain_can_do_is_said():
     assert prepared.told[0].endswith("here the linear chain can do the same")
     (term,) = prepared.effects
     assert isinstance(term, EffectTerm)
-    # It is the cart's own damping, once more.
+    # It equals the cart's own damping.
     chain = PRESETS["throne-1dof"]
     damped = replace(chain, c=chain.c + term.values[0])
     assert_allclose(

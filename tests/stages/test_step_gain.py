@@ -129,7 +129,7 @@ def test_the_windows_are_found():
 @pytest.mark.parametrize("wait", [0.9, 1.5, 3.0])
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
 def test_a_record_that_ends_before_the_carts_settle(name, wait):
-    """The level is that of damped sinusoids, one per cart, with an error to match; it is said."""
+    """The level is that of damped sinusoids, one for each cart, with a fitting error and a note."""
     chain, t = PRESETS[name], seconds(0.5 + wait)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
     for cart, truth in enumerate(chain.static_gains(), start=1):

@@ -1,4 +1,7 @@
-"""Bode fit over many benches: as good as theory allows, honest errors, from poor starts too."""
+"""Bode fit over many benches:
+
+as accurate as theory allows, honest errors, also from poor starts.
+"""
 
 import numpy as np
 import pytest
@@ -12,7 +15,7 @@ from pipeline.plant.linear.presets import PRESETS
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_the_fit_is_efficient_and_its_errors_honest(preset, phases):
-    """Over 400 noisy sets: coverage near 95 %, and nearly all the accuracy the data hold."""
+    """Over 400 noisy sets: coverage near 95 %, and nearly the accuracy that the data allow."""
     got = quality(PRESETS[preset], seeds=400, phases=phases)
 
     # 95 % of 400 has a standard error of 1.1 %: 3 of them below, and 1 % above for a true 96 %,

@@ -1,4 +1,4 @@
-"""Effects hidden in benches of another simulator are named at their place, with their size."""
+"""Effects hidden in benches of another simulator are named with place and size."""
 
 import pytest
 
@@ -31,7 +31,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
     ],
 )
 def test_names_the_hidden_effect(effect, n):
-    """One hidden effect is named at its place, its size found, and the gap falls to the floor."""
+    """One hidden effect is named at its place with its size, and the error falls to the floor."""
     case = make_case(seed=41, n=n, effects=[effect], rate=113.1)
     (hidden,) = case.hidden
 
@@ -45,7 +45,7 @@ def test_names_the_hidden_effect(effect, n):
     assert gap.spread == {}  # the friction of this bench is the same in every run
     for name, true in hidden.parameters.items():
         found = gap.effects[0].parameters[name]
-        # Contact stiffness depends on a contact law the two simulators do not share.
+        # Contact stiffness depends on a contact law that the two simulators do not share.
         limit = 0.2 if effect == "end_stop" and name == "stiffness" else 0.02
         assert found.value == pytest.approx(true, rel=limit, abs=5 * (found.std or 0.0))
 
@@ -53,7 +53,7 @@ def test_names_the_hidden_effect(effect, n):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_hidden_mass_that_moves_when_a_hand_lets_go(tmp_path):
-    """In decays that hands release the hidden mass already moves; the gap closes all the same."""
+    """When a hand releases a cart the hidden mass already moves; the gap closes all the same."""
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["extra_mode"])
     write_submission(tmp_path / "bench", bench, seed=3, reported=False)
 
@@ -89,7 +89,7 @@ def test_two_effects_are_found_together():
 def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
     """Met just before the largest swing or far from it, neither is taken for the other.
 
-    A stop may be soft and bounce fully: where a spring that stiffens does as well, both are listed.
+    A stop may be soft and bounce fully: if a stiffening spring fits equally, both are listed.
     """
     bare = make_case(seed=7, n=1, rate=200.0)
     top = part * max(float(r.y.max()) for r in bare.records if r.kind == "step")
@@ -111,9 +111,9 @@ def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):
 @pytest.mark.sample
 @pytest.mark.parametrize("n", [2, 3])
 def test_friction_on_all_carts_is_found_at_once(n):
-    """What a real rig does together: friction on all carts, a braking motor, hands that let go.
+    """As on a real rig: friction on all carts, a braking motor, hands that let go.
 
-    Its errors fall to the noise, the frictions come from one step, each with its own force.
+    Its errors fall to the noise; one step finds the frictions, each with its own force.
     """
     case = make_rig(seed=1, n=n)
 

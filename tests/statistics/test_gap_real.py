@@ -1,4 +1,4 @@
-"""The gap workflow on real measurements; nothing is known beforehand but what was published."""
+"""The gap workflow on real measurements, knowing only what was published."""
 
 from pathlib import Path
 
@@ -33,7 +33,7 @@ def explain_five(folder: Path, name: str, *, column: int, kind: str) -> Gap:
 def test_driven_cart_has_dry_friction(real_data):
     """Five steps of a real cart: dry friction is found, unseen repeats come within 2.7 %.
 
-    That is all of it only as near as repeats come to each other, which is nearer.
+    The difference between repeats is the best that can be reached.
     """
     folder = real_data / "ecp210-ucsd"
 
@@ -46,7 +46,7 @@ def test_driven_cart_has_dry_friction(real_data):
 
 
 def test_released_cart_has_dry_friction(real_data):
-    """Five hand-released decays, from where the hand has left: dry friction first, within 4 %."""
+    """Five decays by hand, from the release on: dry friction first, within 4 %."""
     folder = real_data / "ecp210-ucsd"
 
     gap = explain_five(folder, "DOF1_en2_manual2", column=3, kind="decay")
@@ -57,7 +57,7 @@ def test_released_cart_has_dry_friction(real_data):
 
 
 def test_a_cart_held_in_all_runs_is_a_wall(real_data, tmp_path):
-    """The steps of cart 1 in a folder of two carts: as near as with a folder of one cart."""
+    """The steps of cart 1 in a two-cart folder give the errors of a one-cart folder."""
     folder = write_two_cart_submission(tmp_path / "lab", real_data, steps=())
     analysis = analyse(load_submission(folder), design=False)
     records = [r for r in analysis.records if r.id.startswith("alone-1")]

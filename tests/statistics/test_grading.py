@@ -1,4 +1,4 @@
-"""Classes on benches all over what a lab may have: no honest team is flagged, slips get names."""
+"""Classes on benches of every kind: no honest team is flagged, slips are named."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def test_no_honest_team_is_flagged(start):
         assert flags(team) == [], (seed, team.bench)
 
 
-NAMED = 0.9  # of the mistakes; on so many different benches some are past telling
+NAMED = 0.9  # of the mistakes; on such varied benches some cannot be recognised
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Hands in the recordings of a real rig: every one that a person sees in a plot, no other."""
+"""Hands in the recordings of a real rig: all that a person sees in a plot, and no others."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def rig(real_data, tmp_path_factory):
 
 
 def test_hands_are_where_a_person_sees_them(rig):
-    """Seven, in four files, each where it is in the plot."""
+    """Seven hands in four files, each where the plot shows it."""
     assert len(rig.records) == 17
     found: dict[str, list[tuple[float, float]]] = {}
     for one in find_interventions(rig.records):
@@ -58,7 +58,10 @@ def test_hands_are_where_a_person_sees_them(rig):
 
 
 def test_three_plucks_are_three_decays(rig):
-    """One natural frequency each, within 1 %; the damping is that of the swing, as friction is."""
+    """One natural frequency each, within 1 %;
+
+    the damping depends on the swing, as with friction.
+    """
     decays = [d for d in rig.log_decrements if d.experiment == "14-Feb-2025_09_22_43"]
 
     assert [decay.number for decay in decays] == [1, 2, 3]

@@ -1,4 +1,4 @@
-"""Honest teams on benches that are not linear: nobody's recordings or numbers are accused."""
+"""Honest teams on benches that are not linear: no recording or number is accused."""
 
 import pytest
 
@@ -6,7 +6,7 @@ from tests.helpers.honest_benches import grade_honest_team
 
 PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
 
-# Of effects that once had a unit, a clock or a mistake made of them, one bench each: a dead zone,
+# One bench for each effect that was once taken for a unit, a clock or a mistake: a dead zone,
 # stiction, a stop and an amplifier at its limit.
 ONCE_ACCUSED = [
     ("throne-2dof", 10),
@@ -21,7 +21,7 @@ STARTS = range(0, 40, 10)
 @pytest.mark.sample
 @pytest.mark.parametrize(("preset", "seed"), ONCE_ACCUSED)
 def test_benches_that_once_were_accused_are_not(preset, seed, tmp_path):
-    """No flag of any kind, and no record that is called wrong."""
+    """No flag of any kind, and no record is called wrong."""
     grade, analysis, term = grade_honest_team(tmp_path, preset=preset, seed=seed)
     assert [flag.message for flag in grade.flags] == [], term
     assert not any(one.is_wrong for one in analysis.left_out)

@@ -1,4 +1,4 @@
-"""Honest records of many kinds of lab: nobody's is called spoilt."""
+"""Honest records from many kinds of lab: none is called spoilt."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Friction in decays, at its rate: where there is none never, where it is always; honest errors."""
+"""Rates of friction found in decays: never without it, always with it; honest errors."""
 
 import numpy as np
 import pytest
@@ -25,4 +25,4 @@ def test_the_standard_errors_are_honest():
     """Over 400 noisy decays the 95 % intervals hold the truth in 92 to 98 %."""
     covered = np.mean(np.abs(standardised(400)) < 1.96, axis=0)
     assert np.all((covered[:2] > 0.92) & (covered[:2] < 0.98))
-    assert covered[2] > 0.92  # a turning point uses several samples: its error is an upper bound
+    assert covered[2] > 0.92  # a turning point uses several samples, so its error is an upper bound

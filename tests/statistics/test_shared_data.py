@@ -1,4 +1,4 @@
-"""Classes on one bench each, whatever it does: nobody honest is accused, copied files are told."""
+"""Classes on one bench each, of every kind: no honest team is accused, copied files are found."""
 
 from dataclasses import replace
 
@@ -34,9 +34,9 @@ def member(name, records):
     ids=lambda x: "-".join(x) if isinstance(x, tuple) else "",
 )
 def test_the_bench_is_no_copy_and_a_copy_is_no_bench(number, bench):
-    """Twelve honest teams are accused of nothing; four copied files are told, as equal.
+    """Twelve honest teams are not accused; four copied files are found as equal.
 
-    One of them may have moved too little to tell.
+    One of them may move too little to tell.
     """
     preset, effect = bench
     count = COUNT if bench in SAMPLE else COUNTS[number % len(COUNTS)]

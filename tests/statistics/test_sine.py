@@ -11,7 +11,7 @@ from tests.stages.test_sine import coverage
 def test_the_standard_errors_are_honest(from_rest):
     """95 % intervals of gain and phase hold the truth in about 95 % of 400 dwells."""
     covered = np.mean(np.abs(coverage(400, from_rest=from_rest)) < 1.96, axis=0)
-    # Binomial spread 1.1 %; the rounding's own error is not normal, and a transient that has
-    # waited seven time constants is still there by 0.1 %.
+    # Binomial spread 1.1 %; the rounding's own error is not normal, and after seven time constants
+    # 0.1 % of a transient is left.
     assert np.all(covered > 0.89)
     assert np.all(covered < 0.985)

@@ -1,4 +1,4 @@
-"""Fits in time over many chains: found from anywhere, intervals that cover at their rate."""
+"""Fits in time over many chains: found from any start, with intervals that cover at their rate."""
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ def test_intervals_cover_the_truth_at_their_rate(preset, noise):
 
 @pytest.mark.slow
 def test_every_random_chain_is_found():
-    """Of 200 random chains with 1 to 4 carts none is missed."""
+    """All of 200 random chains with 1 to 4 carts are found."""
     rng = np.random.default_rng(16)
     for i in range(200):
         n = 1 + i % 4

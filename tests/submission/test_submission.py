@@ -1,4 +1,4 @@
-"""`submission.toml` becomes a validated model, digits as typed, defaults filled in."""
+"""`submission.toml` becomes a validated model, with digits as typed and defaults filled in."""
 
 import re
 from decimal import Decimal
@@ -82,7 +82,7 @@ def folder(tmp_path):
 
 
 def test_every_table_of_the_format_is_read(folder):
-    """Carts left out are all of them, paths are normalised, whole numbers serve as decimals."""
+    """Missing carts mean all, paths are normalised, whole numbers serve as decimals."""
     submission = load_submission(folder)
 
     decay, control, pid = submission.experiments
@@ -102,7 +102,7 @@ def test_every_table_of_the_format_is_read(folder):
 
 
 def test_reported_numbers_keep_their_digits(folder):
-    """0.10 has two decimals, 25 none, 1.0e1 one: tolerances come from the last digit."""
+    """0.10 has two decimals, 25 has none, 1.0e1 one: tolerances come from the last digit."""
     reported = load_submission(folder).reported
 
     assert reported is not None
@@ -121,7 +121,7 @@ def test_reported_numbers_keep_their_digits(folder):
     )
 )
 def test_any_typed_number_comes_back_as_typed(number):
-    """What a student typed under [reported] is the same text again."""
+    """A number under [reported] keeps its text."""
     text = str(number)
     typed = text if "." in text else f"{text}.0"
     with TemporaryDirectory() as name:
@@ -141,7 +141,7 @@ def test_springs_left_out_are_all_there(carts, tmp_path):
 
 
 def test_a_cart_without_springs_reports_mass_and_damping(tmp_path):
-    """[false, false] on one cart is a rigid body; its parameters have other names."""
+    """[false, false] on one cart is a rigid body, whose parameters have other names."""
     head = "version = 1\n[system]\ncarts = 1\nsprings = [false, false]\n[reported.final]\n"
     (tmp_path / "submission.toml").write_text(head + "mass = 2.0\ndamping = 0.1\n")
     reported = load_submission(tmp_path).reported
@@ -169,7 +169,7 @@ def test_the_toml_itself_may_be_named(folder):
 
 
 def test_notes_are_the_discussion(folder):
-    """`notes.md` is kept as written; one that holds only comments is none."""
+    """`notes.md` is kept as written; one with only comments counts as missing."""
     assert load_submission(folder).discussion is None
     (folder / "notes.md").write_text("<!-- hint\n -->\n", encoding="utf-8")
     assert load_submission(folder).discussion is None
@@ -178,7 +178,7 @@ def test_notes_are_the_discussion(folder):
 
 
 def test_every_problem_is_told(folder):
-    """Three mistakes in one file are three lines, each with the file and the key."""
+    """Three mistakes in one file are three lines, each with file and key."""
     text = FULL.replace("K_1 = 25", "K_7 = 25\nzeta_q = 1").replace(
         "cart = 2\nref", "cart = 9\nref"
     )
@@ -196,7 +196,7 @@ def test_every_problem_is_told(folder):
 
 
 def test_an_unknown_table_hides_no_other_mistake(folder):
-    """A misspelt table at the top, one inside, and a wrong value are told together."""
+    """A misspelt table, a misspelt key inside one, and a wrong value are all reported."""
     text = FULL.replace("[design]", "[desing]").replace("version = 1", "version = 1\ncolour = 3")
     text = text.replace("carts = 2\n", 'carts = "two"\n')
     (folder / "submission.toml").write_text(text, encoding="utf-8")
@@ -208,7 +208,7 @@ def test_an_unknown_table_hides_no_other_mistake(folder):
 
 
 def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
-    """Every line that is no TOML is told with its number; the rest of a list is no second slip."""
+    """Every line that is not TOML has its number; the rest of a list is not a second mistake."""
     text = "version = 1\ntitle = “a”\n[system\ncarts = 2\n[design]\ncart = 1,5\nx = [1, two,\n 3]\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SubmissionError) as told:
@@ -218,7 +218,7 @@ def test_a_slip_in_one_line_hides_no_slip_in_another(folder):
 
 
 def test_a_list_that_is_not_closed_is_one_slip(folder):
-    """The keys behind it are read as they stand, so nothing else is called wrong."""
+    """The keys after it are read as they are, so nothing else is called wrong."""
     text = "version = 1\ntitle = [1,\n 2\n[system]\ncarts = 1\n[design]\ncart = 1,5\n"
     (folder / "submission.toml").write_text(text, encoding="utf-8")
     with pytest.raises(SubmissionError) as told:
@@ -230,7 +230,7 @@ def test_a_list_that_is_not_closed_is_one_slip(folder):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
-    """As written it is valid; reading data asks for the first experiment."""
+    """It is valid as written; reading its data asks for the first experiment."""
     new_submission(tmp_path / "team", carts=carts)
 
     submission = load_submission(tmp_path / "team")
@@ -243,7 +243,7 @@ def test_a_new_submission_loads_and_says_what_is_next(carts, tmp_path):
 
 @pytest.mark.parametrize("carts", [1, 2, 3, 4])
 def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
-    """With each # before a key taken away and files in place, the whole template loads."""
+    """With every # before a key removed and files in place, the whole template loads."""
     folder = tmp_path / "team"
     new_submission(folder, carts=carts)
     text = (folder / "submission.toml").read_text(encoding="utf-8")
@@ -263,7 +263,7 @@ def test_every_commented_key_of_a_new_submission_is_valid(carts, tmp_path):
 
 
 def test_a_new_submission_overwrites_nothing(tmp_path):
-    """A folder with anything in it is left alone."""
+    """A folder that is not empty is left alone."""
     (tmp_path / "mine.txt").write_text("work")
     with pytest.raises(ConfigError, match="not empty"):
         new_submission(tmp_path, carts=2)
@@ -276,7 +276,7 @@ def test_a_new_submission_overwrites_nothing(tmp_path):
 
 
 def test_a_wrong_number_of_carts_is_said_before_what_follows_from_it(tmp_path):
-    """Two lengths that agree on two carts: it is the three that is wrong, not both of them."""
+    """Two lengths that agree on two carts: the three is wrong, not both of them."""
     text = """
 version = 1
 [system]
@@ -295,7 +295,7 @@ gains = [1, 0, 1, 0]
 
 
 def test_of_many_thousand_mistakes_the_first_are_worded(tmp_path):
-    """The others are counted: what each may have meant would take minutes."""
+    """The others are counted: naming the nearest keys of all would take minutes."""
     keys = "".join(f"k{i} = 1\n" for i in range(60_000))
     text = f"version = 1\n[system]\ncarts = 1\n{keys}"
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")

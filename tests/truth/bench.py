@@ -1,8 +1,8 @@
 """A bench with known, hidden physics, simulated independently of `pipeline.plant`.
 
 Fine fixed steps (50 µs, velocity Verlet), dry friction as an inclusion solved at every step
-(Moreau's time stepping), penalty contacts, the delay as a look-up in the command's past. Slow
-and plain on purpose: it is what the workflow's simulator is judged by.
+(Moreau's time stepping), penalty contacts, the delay as a look-up in past commands. It is slow and
+plain on purpose: the workflow's simulator is judged by it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,11 +34,12 @@ class Hidden:
 
 @dataclass(frozen=True, kw_only=True)
 class Hand:
-    """What a hand does to one cart from `start` to `end` (s), unmeasured.
+    """An unmeasured hand on one cart from `start` to `end` (s).
 
     It grips the cart with a spring and a damper of its own, moves it by `pull` (position units)
-    until `there` of its time, keeps it and lets go over the last tenth. Or it pushes with a force
-    that swells to `push` (input units) and fades. A soft hold is a grip that never pulls.
+    until the share `there` of its time, holds it, and lets go over the last tenth. Or it pushes
+    with a force that swells to `push` (input units) and fades. A soft hold is a grip that never
+    pulls.
     """
 
     cart: int
@@ -97,7 +98,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
     on = 0
     first = True
     while sample < t.size:
-        # Read out: straight within one 50-µs step.
+        # Readings are straight within one 50-µs step.
         while sample < t.size and t[sample] <= now + h:
             part = t[sample] - now
             for i in range(n):
@@ -107,7 +108,7 @@ def _motion(cart, spring, drive, hands, free, t, times, command, x0, v0, scatter
         while on < times.size - 1 and times[on + 1] <= mid:
             on += 1
         # The delayed command over this step: steps are far shorter than samples, so at most one
-        # edge falls inside, and counts by the part of the step that is left.
+        # edge falls inside, and counts for the remaining part of the step.
         begin = now - drive[2]
         while at < times.size - 1 and times[at + 1] <= begin:
             at += 1

@@ -1,4 +1,4 @@
-"""Random benches with hidden effects, and what a class would record of them."""
+"""Random benches with hidden effects, and the recordings that a class would make."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -45,7 +45,7 @@ EFFECTS = (
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """A bench, what is hidden in it, its records, and the hands in them by record."""
+    """A bench, its hidden effects, its records, and the hands in them by record."""
 
     n: int
     springs: tuple[bool, ...]
@@ -68,13 +68,13 @@ def make_case(
     handled: bool = False,
     rate: float | None = None,
 ) -> Case:
-    """Make a bench with the named effects at random places and sizes, or with those given.
+    """Make a bench with the named effects at random places and sizes, or with the given ones.
 
-    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any
-    mass: what makes an effect hard to tell, or to fit, is then among the cases.
+    `wide` draws sizes over a decade, soft and hard contacts of any damping, and motors of any mass,
+    including cases that are hard to recognise or fit.
 
-    `dirt` adds what real benches do: friction that varies by 4 % from run to run, encoders
-    zeroed where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
+    `dirt` adds features of real benches: friction that varies by 4 % between runs, encoders zeroed
+    where the cart happens to rest, time stamps rounded to a tenth of a millisecond.
 
     `handled` has carts plucked by hand, once and twice a record, nudged, pushed at the end, and
     held by a hand that gives way.
@@ -127,9 +127,9 @@ def make_case(
 
 
 def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
-    """Return records of a clean case's bench that are not among its own.
+    """Return new records of a clean case's bench.
 
-    Other sizes of steps and sweep, none larger than it had; other releases, other noise.
+    Other sizes of steps and sweep, none larger than before; other releases, other noise.
     """
     rng = np.random.default_rng(seed)
     m, c, k = np.array(case.m), np.array(case.c), np.array(case.k)
@@ -144,11 +144,11 @@ def further_records(case: Case, *, seed: int) -> tuple[Record, ...]:
 
 
 def make_rig(*, seed: int, n: int, trials: int = 3) -> Case:
-    """Make a bench as a class meets it, with several effects that none shows alone.
+    """Make a realistic bench with several effects, which no single one explains.
 
-    Dry friction of nearly one size on every cart, which differs from run to run; viscous damping
-    of cart 1 that doubles while the motor drives; decays let go by hand, with a speed and a zero
-    of their own; a coarse encoder; `trials` repeats of each run and no other sizes.
+    Dry friction of nearly one size on every cart, which differs between runs. Viscous damping of
+    cart 1 that doubles while the motor drives. Decays released by hand, with a speed and a zero of
+    their own. A coarse encoder; `trials` repeats of each run, and no other sizes.
     """
     rng = np.random.default_rng(seed)
     m = np.array(_M[n - 1]) * rng.uniform(0.8, 1.25, n)
@@ -288,7 +288,7 @@ def _lay_hands(n, large, rng) -> dict[str, tuple[Hand, ...]]:
 
 
 def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=False) -> Hidden:
-    """Draw a place and sizes; `severity` scales how far the effect departs from the linear."""
+    """Draw a place and sizes; `severity` scales the departure from the linear bench."""
     s = severity * float(np.exp(rng.uniform(np.log(0.3), np.log(1.5)))) if wide else severity
     i = int(rng.integers(n))
     present = [j for j in range(n + 1) if k[j] > 0]
@@ -366,7 +366,7 @@ def _draw(name, n, m, c, k, stiffness, large, rate, linear, severity, rng, wide=
         case "backlash":
             return Hidden(effect=name, parameters={"gap": s * draw(0.03, 0.12)})
         case "cogging":
-            # At most 0.6 of what would let the cart snap from tooth to tooth.
+            # At most 0.6 of the size at which the cart would snap from tooth to tooth.
             pitch = draw(0.2, 0.6)
             force = s * draw(0.2, 0.6) * stiffness[0, 0] * pitch / (2 * np.pi)
             parameters = {"force": force, "pitch": pitch, "phase": draw(-np.pi, np.pi)}

@@ -31,7 +31,10 @@ def make_core(**changes) -> ReferenceCore:
 
 
 def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
-    """Tell the core something, then tick; returns its lines. `y` gives the counts at each tick."""
+    """Send something to the core, then tick;
+
+    return its lines. `y` gives the counts at each tick.
+    """
     core.receive(commands)
     for k in range(first, first + ticks):
         core.tick(y(k), stamp=k, now=k)
@@ -46,7 +49,7 @@ def still(k: int) -> tuple[int, int]:
 
 @pytest.mark.parametrize("wave", Wave)
 def test_a_run_streams_its_wave_and_ends(wave):
-    """A run of REPS/FREQ seconds sends that many lines of the wave, clipped, and goes silent."""
+    """A run of REPS/FREQ seconds sends that many lines of the wave, clipped, and then stops."""
     start = Start(wave=wave, frequency=8.0, amplitude=5000, cycles=3)
     lines = run(make_core(), encode(start), still, ticks=500)
     assert [line.ms for line in lines] == list(range(375))
@@ -97,7 +100,7 @@ def simulated(controller, reference, *, delay):
 
 @pytest.mark.parametrize("amplitude", [400, 40_000])
 def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
-    """The duty is what the loop's simulation asks for at the same readings, clipping included."""
+    """The duty equals that of the loop's simulation at the same readings, clipping included."""
     gains = StateGains(gains=(0.02, 0.002, 0.05, -0.001), prefilter=0.3)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=2.0, amplitude=amplitude)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
@@ -113,7 +116,7 @@ def test_state_feedback_is_the_law_of_the_simulated_loop(amplitude):
 
 @pytest.mark.parametrize("encoder", [1, 2])
 def test_pid_is_the_law_of_the_simulated_loop(encoder):
-    """The duty is what the loop's simulation asks for at the same readings, acting at once."""
+    """The duty equals that of the loop's simulation at the same readings, acting at once."""
     gains = PidGains(kp=0.05, ki=0.2, kd=0.001)
     start = Start(wave=Wave.SAWTOOTH, encoder=encoder, frequency=2.0, amplitude=3000)
     r = np.array([float(target_at(start, PERIOD * k)) for k in range(500)])
@@ -125,7 +128,7 @@ def test_pid_is_the_law_of_the_simulated_loop(encoder):
 
 
 def test_the_last_gains_count_from_the_next_start():
-    """`g` after `f` makes it a PID; gains that come in a run change the next one only."""
+    """`g` after `f` makes it a PID; gains that arrive during a run change the next one only."""
     core = make_core()
     lines = run(core, b"g;1;0;0;d;q;c;o;10;50;5;", still, ticks=100)
     assert lines[-1].duty == 50
@@ -150,7 +153,7 @@ def test_a_reset_forgets_and_a_stop_does_not():
 
 
 def test_a_start_in_mid_run_begins_anew():
-    """Stamps begin again at zero, and so do the sums of the PID."""
+    """Stamps start again at zero, and so do the sums of the PID."""
     core = make_core()
     first = run(core, b"g;0;1;0;d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80)
     again = run(core, b"d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80, first=80)
@@ -176,7 +179,10 @@ def test_silence_after_a_heartbeat_cuts_the_motor():
 
 
 def test_a_query_is_answered_and_hands_are_not_the_controllers():
-    """A query in mid-run gets its line between the others; `h` changes nothing; stock is silent."""
+    """A query during a run gets its line between the others;
+
+    `h` changes nothing; stock is silent.
+    """
     core = make_core()
     core.receive(b"d;q;o;o;1;50;1;h;1;2;?;")
     core.tick((0, 0), stamp=0, now=0)
@@ -187,7 +193,7 @@ def test_a_query_is_answered_and_hands_are_not_the_controllers():
 
 
 def test_a_bench_of_three_encoders_sends_three_counts():
-    """The line then has one field more, and state feedback six gains."""
+    """The line then has one more field, and state feedback six gains."""
     core = make_core(encoders=3, carts=3)
     lines = run(core, b"f;0;0;0;0;1;0;0;d;q;c;o;100;9;1;", lambda k: (0, 0, k), ticks=5)
     assert lines[-1] == Reading(counts=(0, 0, 4), target=0, duty=-4, ms=4)

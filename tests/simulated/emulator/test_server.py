@@ -52,7 +52,7 @@ def host(bench: Emulator) -> Iterator[serial.SerialBase]:
 def play(
     bench: Emulator, line: serial.SerialBase, *commands: bytes, heard: bytearray | None = None
 ) -> bytes:
-    """Return all that comes until a run has ended; into `heard` as well, as it comes."""
+    """Return all bytes until a run has ended, and add them to `heard` as they come."""
     heard, runs = bytearray() if heard is None else heard, bench.runs
     line.write(b"".join(commands))
     # pyserial forgets what it has read of a piece when the cable is pulled: small pieces.
@@ -62,7 +62,7 @@ def play(
 
 
 def stream(bench: Emulator, line: serial.SerialBase, start: Start) -> list[Reading]:
-    """Run it; every line must be a reading."""
+    """Run it; check that every line is a reading."""
     readings = [parse_reading(text) for text in play(bench, line, encode(start)).splitlines()]
     assert None not in readings
     return [reading for reading in readings if reading is not None]
@@ -79,7 +79,7 @@ def fast_bench() -> Iterator[Emulator]:
 @pytest.mark.sample
 @pty_only
 def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
-    """In real time: a description, a run with the stamps of a period that is no whole ms.
+    """In real time: a description, then a run whose period is not a whole ms.
 
     The next host finds the bench as the last one left it; a signal ends it with exit status 0.
     """
@@ -107,7 +107,7 @@ def test_hosts_talk_to_a_pseudo_terminal_one_after_the_other():
 
 
 def test_the_static_gain_comes_out(fast_bench):
-    """What a step moves the carts, in cm/V by the description, is the preset's static gain."""
+    """The motion of a step, in cm/V by the description, is the preset's static gain."""
     with host(fast_bench) as line:
         line.write(encode(Signal.QUERY))
         scales = parse_description(line.readline())
@@ -124,7 +124,7 @@ def test_the_static_gain_comes_out(fast_bench):
 
 
 def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
-    """Cart 2 with cart 1 held swings at ω_2 and ζ_2 of the chain; the held cart stands."""
+    """Cart 2 with cart 1 held swings at ω_2 and ζ_2 of the chain; the held cart is at rest."""
     chain = PRESETS["throne-2dof"]
     with host(fast_bench) as line:
         line.write(encode(Hands(held=(1,), released=2)))
@@ -152,7 +152,7 @@ def test_a_cart_that_hands_let_go_rings_at_its_own_frequency(fast_bench):
 
 
 def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
-    """It pulls for 1.5 s, then takes its time; the motor is idle meanwhile, and alive after."""
+    """It pulls for 1.5 s, then pauses; the motor is idle meanwhile, and works afterwards."""
     carts = VirtualCarts(prepare_bench(preset="throne-1dof"), seed=1)
     carts.take_in_hand(Hands(released=1))
     carts.start()
@@ -171,13 +171,13 @@ def test_a_hand_lets_go_even_where_the_run_starts_before_it_is_ready():
 
 
 def damaged(readings: bytes) -> tuple[list[Reading], int]:
-    """Return what a host can read, and how many lines it cannot."""
+    """Return the lines that a host can read, and the number that it cannot."""
     parsed = [parse_reading(line) for line in readings.split(b"\n") if line]
     return [reading for reading in parsed if reading is not None], parsed.count(None)
 
 
 def test_what_is_injected_is_what_a_host_finds():
-    """Lost, garbled and merged lines and new clocks add up; nothing else is missing."""
+    """Lost, garbled and merged lines and new clocks add up; no other line is missing."""
     faults = [f"--fault={kind}=0.01" for kind in ("drop", "garble", "merge", "delay", "reset")]
     with emulator("--speed", "10", *faults) as bench, host(bench) as line:
         start = encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=200, cycles=20))
@@ -197,7 +197,7 @@ def test_what_is_injected_is_what_a_host_finds():
 
 
 def test_faults_come_when_they_are_told_to():
-    """An encoder sticks 1 s into the streaming, for good; the cable is pulled 1 s later, once."""
+    """An encoder sticks 1 s into the stream, for good; the cable is pulled 1 s later, once."""
     options = ("--speed", "5", "--fault", "stuck=2@1", "--fault", "disconnect@2")
     with emulator(*options) as bench:
         with host(bench) as line:
@@ -217,7 +217,7 @@ def test_faults_come_when_they_are_told_to():
 
 
 def test_what_is_held_up_still_comes():
-    """A lost line end comes once the run is over; a late lump keeps its order, and comes."""
+    """A lost line end comes once the run is over; a late chunk keeps its order, and comes."""
     faults = Faults([read_fault("merge@0.003"), read_fault("delay@0.004")], seed=0, period=1e-3)
     sent = [faults.strike(b"1:2:3:4:%d\n" % ms, clock=1e-3 * ms)[0] for ms in range(3)]
     assert sent == [b"1:2:3:4:0\n", b"1:2:3:4:1\n", b"1:2:3:4:2"]
@@ -273,7 +273,7 @@ def test_a_host_that_leaves_an_unguarded_bench_stops_nothing(fast_bench):
 
 
 def test_a_stock_bench_knows_no_query_and_no_stop():
-    """It answers nothing and runs on, until the stock way of stopping it; cart two is no cart."""
+    """It answers nothing and runs on until the stock way of stopping; cart two does not exist."""
     with (
         emulator("--stock", "--period", "2.005", preset="throne-1dof") as bench,
         host(bench) as line,
@@ -306,7 +306,7 @@ def test_a_stock_bench_knows_no_query_and_no_stop():
     ],
 )
 def test_a_fault_that_is_none_is_said(fault, message):
-    """A fault without sense is one clear message."""
+    """A fault that does not exist gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         read_fault(fault)
 
@@ -321,13 +321,13 @@ def test_a_fault_that_is_none_is_said(fault, message):
     ],
 )
 def test_a_port_that_will_not_do_is_said(port, message):
-    """A port without sense, or one that others could reach, is one clear message."""
+    """A malformed port, or one open to others, gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         open_link(port)
 
 
 def test_a_port_that_is_taken_is_said():
-    """Two benches on one port are one too many; a remote one has to be meant."""
+    """Two benches cannot share one port; a remote port must be requested explicitly."""
     first = open_link("socket://127.0.0.1:0")
     with pytest.raises(ConfigError, match=r"in use|normally permitted"):
         open_link(first.address)
