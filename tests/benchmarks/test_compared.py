@@ -130,7 +130,7 @@ def test_further_records_are_of_the_same_bench_and_none_that_anybody_had():
     assert largest(further) < largest(case.records)
     for had, new in zip(case.records, further, strict=True):
         assert not np.array_equal(had.y, new.y)
-    had, new = case.records[0], further[0]  # steps: no resting level but that of the input
+    had, new = case.records[0], further[0]  # steps: the only constant level is that of the input
     scale = input_of(new).max() / input_of(had).max()
     assert np.abs(new.y - scale * had.y).max() < 4 * COUNT
 

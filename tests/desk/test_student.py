@@ -299,7 +299,7 @@ def test_handing_in_warns_of_open_questions(filled):
 
 @pytest.mark.parametrize("change", ["number", "answer", "older", "gone", "gap", "nothing"])
 def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
-    """Whatever changed since, whoever changed it; the zip then lacks that report."""
+    """Any later change by anybody counts; the zip then lacks that report."""
     visitor, folder = filled
     ask_for(folder, "zeta")
     file = folder / load_submission(folder).experiments[0].file

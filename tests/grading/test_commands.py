@@ -109,7 +109,7 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
         book.finish(Batch(keys=tuple(o.key for o in outcomes), shared={}), rubric=two_cart_rubric())
     status, _, err = run("export", tmp_path, "--lms", "canvas")
     assert err.startswith("eve  [2Kbob is in a (20) and b (10): left out")
-    assert status == 1  # an author with points has none in the table
+    assert status == 1  # an author with points has an empty cell in the table
 
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])

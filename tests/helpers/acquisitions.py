@@ -43,7 +43,7 @@ def write_work(
 
 
 class Notes:
-    """Records what it is told, and confirms everything."""
+    """Records every call, and confirms everything."""
 
     def __init__(self) -> None:
         self.confirmed: list[str] = []

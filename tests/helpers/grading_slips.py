@@ -17,8 +17,8 @@ from pipeline.submission import Reported, ReportedFeedback
 from tests.helpers.grading_class import Team, written
 
 TURN = 2 * np.pi
-OFF = (1.2, 1.6)  # factor: a number that is off, and no mistake explains it
-SEEN_SWAPPED = 0.15  # of ln ω: carts more alike nobody can see swapped
+OFF = (1.2, 1.6)  # factor of an error that no known mistake explains
+SEEN_SWAPPED = 0.15  # of ln ω: a swap of more similar carts cannot be seen
 
 
 def change(team: Team, **tables: Mapping[str, float]) -> Team:

@@ -44,27 +44,27 @@ _PAUSE = 0.001  # s
 
 
 class RunawayBench(threading.Thread):
-    """Keeps to the protocol but where `wrong` says otherwise; a context.
+    """A bench that keeps to the protocol except while `wrong` holds; a context manager.
 
-    Its carts stand where the duty of that moment holds them: 5 and 2 duty counts a count.
+    Its carts are where the present duty holds them: 5 and 2 duty counts a count.
 
     Parameters
     ----------
-    wrong : asked at each ms; whether the bench misbehaves now.
-    duty : of a motor that misbehaves; None: as told.
-    out : counts that cart 1 is away from where it should be, where the bench misbehaves.
-    mute : asked at each ms; whether nothing it says arrives.
+    wrong : called each ms; whether the bench misbehaves now.
+    duty : the duty of a misbehaving motor; None: as commanded.
+    out : error of cart 1 in counts while the bench misbehaves.
+    mute : called each ms; whether its lines are lost.
 
     Attributes
     ----------
-    run_on : the start that is carried out; None: no run is on.
-    starts : all starts, but those that only stop a stock bench.
-    resets, lines : how many it was told, and has sent.
-    is_stopped : it was told to stop, and nothing since.
-    is_pulled : a hand of its own has taken a cart to pull it out.
-    offence : ms of its clock at its first line that shows what is wrong; None: none yet.
-    told : ms of its clock when it was told to stop after that.
-    started_after : starts that it was told after that.
+    run_on : the start of the present run; None: no run.
+    starts : all starts, except those that only stop a stock bench.
+    resets, lines : numbers of resets received and of lines sent.
+    is_stopped : the last command was a stop.
+    is_pulled : a virtual hand is pulling a cart out.
+    offence : time in ms of the first line that shows the fault; None: no such line yet.
+    told : time in ms of the first stop after that.
+    started_after : starts received after that.
     """
 
     def __init__(

@@ -8,10 +8,10 @@ from typing import Any
 
 import psutil
 
-PATIENCE = 120.0  # s after which what is awaited is taken never to come
-# Asking may take the processor from what is waited for: the longer that takes, the less often.
-_OFTEN, _SELDOM = 0.01, 0.1  # s between two looks, at first and at most, …
-_LATER = 0.1  # … and of the time waited so far
+PATIENCE = 120.0  # s after which an event is taken never to come
+# Each check takes processor time from the awaited process, so checks become less frequent.
+_OFTEN, _SELDOM = 0.01, 0.1  # s between two checks, at first and at most, …
+_LATER = 0.1  # … and as a share of the time waited so far
 
 
 def until(happened: Callable[[], object], what: str = "it") -> None:

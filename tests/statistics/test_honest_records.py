@@ -1,4 +1,4 @@
-"""Honest records from many kinds of lab: none is called spoilt."""
+"""Honest records from many kinds of lab: no record is called spoilt."""
 
 from dataclasses import replace
 

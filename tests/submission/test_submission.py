@@ -102,7 +102,7 @@ def test_every_table_of_the_format_is_read(folder):
 
 
 def test_reported_numbers_keep_their_digits(folder):
-    """0.10 has two decimals, 25 has none, 1.0e1 one: tolerances come from the last digit."""
+    """0.10 has two decimals, 25 zero, 1.0e1 one: tolerances come from the last digit."""
     reported = load_submission(folder).reported
 
     assert reported is not None

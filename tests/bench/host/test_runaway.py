@@ -147,7 +147,7 @@ def test_a_cart_past_its_limit_at_rest_ends_the_session(tmp_path):
 
 
 def test_before_the_carts_are_zeroed_they_may_be_anywhere(tmp_path):
-    """Where a cart was when the line was opened is not its zero, so nothing is stopped."""
+    """A cart's position when the line is opened is not its zero, so nothing is stopped."""
     work = write_work(tmp_path, plan())
     with RunawayBench(lambda bench: bench.resets < 3, out=FAR) as bench:
         assert session(work, bench) == ([], "")

@@ -235,8 +235,8 @@ def test_a_new_line_is_zeroed_once_the_carts_rest(tmp_path, real):
             *whole, _ = heard.split(b"\n")
             return bool(whole) and int(whole[-1].split(b":")[0]) > 100
 
-        until(away, "a swing")  # it is on after one second, as for anyone who opens the line again
-        line.send(Signal.RESET)  # as whoever opens the line again does
+        until(away, "a swing")  # at the latest after one second
+        line.send(Signal.RESET)  # as at the start of every session
         line.drain()
         order = make_order(recording, **ask)
         assert session.prepare(order) == ""

@@ -230,7 +230,7 @@ def test_a_person_vetoes_and_adds(tmp_path, monkeypatch):
     def vetoes(recording):
         offered.append(recording)
         gap = json.loads((folder / "gap" / "gap.json").read_text(encoding="utf-8"))
-        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # looked anew, too
+        assert (gap["next_experiment"] == "another") == (len(offered) >= 2)  # searched again, too
         if len(offered) == 1:
             step = next(one for one in load_plan(load_submission(folder)).recordings
                         if one.kind == "step")  # fmt: skip

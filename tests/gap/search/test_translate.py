@@ -21,7 +21,7 @@ ALL = frozenset().union(*(filled(effect) for effect in CATALOGUE))
         (Kind.COULOMB_FRICTION, [(True, True)], [0, 1]),
         (Kind.COULOMB_FRICTION, [(False, True), (False, True)], [1]),  # cart 1 is always held
         (Kind.CUBIC_SPRING, [(True, True)], [0, 1, 2]),
-        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1 and 2 stretch alike, 3 never
+        (Kind.CUBIC_SPRING, [(True, False)], [0]),  # springs 1 and 2 stretch equally, 3 never
     ],
 )
 def test_a_law_is_looked_for_where_it_would_show(kind, free, places):

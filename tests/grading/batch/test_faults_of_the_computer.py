@@ -158,7 +158,7 @@ def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
 def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
-    """However early the files run out: the grade is the same, or there is none yet."""
+    """However early the files run out: the grade is the same or still missing."""
     source = zips / "team-0.zip" if packed else teams / "team-0"
     few = range(3, 12)  # open at the start are three, and a few of the libraries'
     (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
