@@ -207,7 +207,7 @@ def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
 
 
 def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
-    """Each changed team with its change, the largest first; then the rubric is saved and applied."""
+    """Changed teams, the largest change first; then the rubric is saved and applied."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
