@@ -1,1 +1,1 @@
-"""What the linear model leaves, and the physical effect that explains it on held-out runs."""
+"""The residual of the linear model, and the physical effect that explains it on held-out runs."""

@@ -1,4 +1,4 @@
-"""The gap workflow in one line: split, fit the chain, search, judge, say what is left."""
+"""The gap workflow: split, fit the chain, search, judge, describe the rest."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -41,10 +41,10 @@ from pipeline.words.progress import Progress, silent
 
 
 def investigate(analysis: Analysis, *, progress: Progress, budget: float | None = None) -> Gap:
-    """Explain the gap of the time records of a submission, starting from the identified chain.
+    """Explain the gap of a submission's time records, starting from the identified chain.
 
-    Recordings that the identification left out neither train nor judge here, and no figure of the
-    gap is about them. Past `budget` s, the compilation apart, the best answer so far is returned.
+    Recordings that the identification left out are not used here. After `budget` s, compilation
+    excluded, the best answer so far is returned.
 
     Raises
     ------
@@ -75,15 +75,15 @@ def explain_gap(
     budget: float | None = None,
     progress: Progress = silent,
 ) -> Gap:
-    """Find where the linear chain and the records disagree, name why, and show the gap shrink.
+    """Find where the linear chain and the records disagree, name the cause, and shrink the gap.
 
     Parameters
     ----------
-    records : any kind but tables; dwells beyond a few and, where open-loop runs exist, runs
-        under feedback are left out.
-    chain : the stages' estimate, as one start of the fit.
+    records : any kind but tables; all dwells beyond a few, and feedback runs if there are open-loop
+        runs, are left out.
+    chain : the estimate of the stages, used as one start of the fit.
     catalogue : the effects that may be named.
-    budget : s; past it the best answer so far. By default the search ends by itself, and the
+    budget : s; after that the best answer so far. By default the search ends by itself, and the
         answer does not depend on the machine.
 
     Raises
@@ -94,9 +94,9 @@ def explain_gap(
     interventions = find_interventions(records)
     runs = prepare(records, springs=bench.springs, interventions=interventions, notes=notes)
     training, held_out = take_sides(runs, notes=notes)
-    # One run more than there were: the longest was cut in time.
+    # One run more than before: the longest was cut in time.
     whole = runs if len(training) + len(held_out) > len(runs) and not any(bench.springs) else []
-    # Its matrices are small: BLAS with threads of its own only gets in the workers' way.
+    # The matrices are small: threads inside BLAS would only slow the workers down.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=2) as pool:
         deadline = Deadline(pool.map, seconds=budget)
         progress("fitting the linear chain")
@@ -129,11 +129,11 @@ def explain_gap(
 
 
 def _describe(search: Search, bench: Bench) -> Gap:
-    """Return what a search amounts to."""
+    """Return the result of a search."""
     study, path, chosen, final = search.study, search.path, search.chosen, search.final
     verdict, found, close = search.verdict, search.found, search.close
     driven = any(np.any(run.command) for run in study.training)
-    # Without an input the first mass is one.
+    # Without an input the first mass is set to one.
     units = bench.units if driven else replace(bench.units, input=f"{bench.units.position}/s^2")
     effects = list_effects(path, final, found, units)
     traces = make_traces(path[0], chosen, study)
@@ -173,7 +173,7 @@ def _describe(search: Search, bench: Bench) -> Gap:
 
 
 def _notes(search: Search, budget: float | None) -> list[str]:
-    """Return what a reader must know of a search and its end."""
+    """Return notes on a search and its end for the reader."""
     words, study, chosen, notes = phrases("gap"), search.study, search.chosen, search.notes.copy()
     times = f"{chosen.error / study.floor:.1f}"
     if search.verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -188,7 +188,7 @@ def _notes(search: Search, budget: float | None) -> list[str]:
 
 
 def _learnt_spread(fit: GapFit) -> dict[int, float]:
-    """Return the run-to-run spread of each cart's dry friction, where the runs asked for one."""
+    """Return the run-to-run spread of each cart's dry friction, if the runs needed one."""
     moved = np.any([nuisance.scatter != 1.0 for nuisance in fit.nuisance], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}

@@ -1,4 +1,4 @@
-"""One run again, by the model with effects: started from rest, or as its readings say."""
+"""One run simulated with effects: from rest, or from its first readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from pipeline.results import HardwareCheck, Record
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Replay:
-    """One cart under the measured input: the linear model, and the one with effects, (n,).
+    """One cart under the measured input: the linear model, and the model with effects, (n,).
 
-    `rest` is where it rests, about which its motion counts.
+    `rest` is its rest position, about which its motion counts.
     """
 
     check: HardwareCheck
@@ -30,13 +30,13 @@ class Replay:
 def replay_driven(
     record: Record, checks: Sequence[HardwareCheck], model: AugmentedChain
 ) -> list[Replay]:
-    """Simulate a run with the measured input; [] where the carts run away or nothing drives.
+    """Simulate a run with the measured input; [] if the carts diverge or nothing drives them.
 
     Parameters
     ----------
     checks : the linear model under the same input, cart by cart.
     """
-    # Compiled code: the linear report never needs it.
+    # Compiled code, which the linear report never needs.
     from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 
     if record.u is None:
@@ -58,7 +58,7 @@ def replay_driven(
         return []
     as_logged, *others = found
     best = min(others, key=run.misfit, default=as_logged)
-    # A factor on the logged input is believed where 0.6 of the error goes with it.
+    # A factor on the logged input is believed if it removes 0.6 of the error.
     chosen = best if run.misfit(best) < 0.6 * run.misfit(as_logged) else as_logged
     replays = []
     for check in checks:
@@ -71,7 +71,7 @@ def replay_driven(
 
 
 def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
-    """Return one record as the gap's fits see it: of a decay, from where the hand has let go.
+    """Return one record as the gap's fits see it; a decay starts when the hand has let go.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the gap workflow finds."""
+"""The result types of the gap workflow."""
 
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -68,7 +68,7 @@ class RecordGap:
 
 @result()
 class GapWindow:
-    """Where a run departs from a model most."""
+    """A stretch in which a run departs most from a model."""
 
     experiment: str = written()
     cart: int = written()
@@ -90,7 +90,7 @@ class FreeRun:
 class Trace:
     """One cart in one run, for figures: measured, the linear model, the final model (n,).
 
-    `zero` is the encoder's zero in that run, as the final model has it.
+    `zero` is the encoder's zero in that run, according to the final model.
     """
 
     experiment: str
@@ -106,12 +106,12 @@ class Trace:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LeftForce:
-    """The force that the model does not explain, on one cart in one run: a mean over each window.
+    """The unexplained force on one cart in one run: a mean over each window.
 
     Attributes
     ----------
-    t, x, v, u (windows, samples) : times, position, velocity, input (0 on other carts than 1).
-    weight (windows, samples) : of each sample in the mean; they add up to one.
+    t, x, v, u (windows, samples) : times, position, velocity, input (0 for carts other than 1).
+    weight (windows, samples) : of each sample in the mean; the weights of a window add up to one.
     acceleration, force (windows,) : means.
     """
 
@@ -142,7 +142,7 @@ class FormulaTerm:
 
 @result()
 class ForceFormula:
-    """The shortest formula for the force that is left, by regression over a library of terms."""
+    """The shortest formula for the unexplained force, by regression over a library of terms."""
 
     @property
     @computed()
@@ -163,7 +163,7 @@ class ForceFormula:
 
 @result()
 class ForceAgainst:
-    """The force that the model does not explain against one quantity, bin by bin."""
+    """The unexplained force against one quantity, bin by bin."""
 
     quantity: Quantity = written()
     unit: str = written()
@@ -177,7 +177,7 @@ class ForceAgainst:
 
 @result()
 class Residual:
-    """What is left on one cart."""
+    """The residual of one cart."""
 
     cart: int = written()
     unit: str = written("of the force")
@@ -194,11 +194,11 @@ class Contender(AugmentedChain):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prediction:
-    """What the contenders predict of the recording that is proposed.
+    """The contenders' predictions of the proposed recording.
 
     Attributes
     ----------
-    pair : the two, from 0, that decided: by their weights it tells them apart best.
+    pair : the two, from 0, that decide: by their weights the recording separates them best.
     t, u : (n,) s and the input; `positions` (contenders, n) of `cart`.
     """
 
@@ -211,15 +211,15 @@ class Prediction:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Proposal:
-    """The recording that would tell the contenders apart best.
+    """The recording that best distinguishes the contenders.
 
     Attributes
     ----------
     recording : a table of plan.toml.
-    limits : the plan's in which it was chosen, by name.
-    separation : root mean square of the difference between the two that decided, as far as no
-        refit of the other takes it up, in noises.
-    prediction : None where it was read from a file.
+    limits : the plan's limits for which it was chosen, by name.
+    separation : root mean square of the difference between the deciding two that no refit of the
+        other absorbs, in units of the noise.
+    prediction : None if it was read from a file.
     """
 
     recording: dict[str, Any]
@@ -239,7 +239,7 @@ class GapErrors:
 
 @result()
 class GapSubmission:
-    """Which submission it is about."""
+    """The submission that the gap belongs to."""
 
     title: str = written()
     carts: int = written()
@@ -247,15 +247,15 @@ class GapSubmission:
 
 @result(eq=False)
 class Gap:
-    """What the linear model leaves out. A number that could not be had is null.
+    """The gap of the linear model. A number that could not be determined is null.
 
     Attributes
     ----------
-    bench : what its numbers are about.
-    traces, left_forces : for the figures; not in a gap that was read from a file.
-    chain_covariance : (n_p, n_p) of what `chain_std` has the standard errors of, None where it
-        could not be had or was read from a file.
-    proposal : what to record next, as a plan has it; None where nothing was weighed.
+    bench : the set-up that the numbers refer to.
+    traces, left_forces : for the figures; missing in a gap that was read from a file.
+    chain_covariance : (n_p, n_p) covariance of the parameters in `chain_std`; None if it could not
+        be computed or was read from a file.
+    proposal : the next recording, as in a plan; None if no candidate was evaluated.
     """
 
     schema: Literal["cartlab-gap/1"] = written(default="cartlab-gap/1")
@@ -300,19 +300,19 @@ class Gap:
     @property
     @computed(older=None)
     def next_recording(self) -> dict[str, Any] | None:
-        """What tells the contenders apart best, as a table of plan.toml."""
+        """The recording that best distinguishes the contenders, as a table of plan.toml."""
         return self.proposal and self.proposal.recording
 
     @property
     @computed(older=None)
     def next_limits(self) -> dict[str, float] | None:
-        """The limits of plan.toml that it keeps."""
+        """The limits of plan.toml that it respects."""
         return self.proposal and self.proposal.limits
 
     @property
     @computed(older=None)
     def separation(self) -> float | None:
-        """Of the two that decided, in noises that no refit takes up."""
+        """The separation of the deciding two, in noises, after refits."""
         return self.proposal and self.proposal.separation
 
     training: tuple[str, ...] = written("ids of the runs")
@@ -334,7 +334,7 @@ class Gap:
     @property
     @computed()
     def units(self) -> Units:
-        """The submission's own."""
+        """The submission's units."""
         return self.bench.units
 
     @property
@@ -355,7 +355,7 @@ class Gap:
     @property
     @computed()
     def submission(self) -> GapSubmission:
-        """Which submission it is about."""
+        """The submission."""
         return GapSubmission(title=self.title, carts=self.bench.n)
 
     @property
@@ -367,7 +367,7 @@ class Gap:
     @property
     @computed()
     def chain(self) -> ChainWithUnits:
-        """That of the model."""
+        """The chain of the model."""
         return ChainWithUnits.of(self.model.chain, self.bench.units)
 
     chain_std: dict[str, Number] = written(
@@ -425,5 +425,5 @@ def read_gap(text: str) -> Gap:
         return read_json(Gap, text, readers={Effect: find_effect})
     except ValidationError as error:
         raise ConfigError(f"not what cartlab gap writes: {first_refusal(error)}") from None
-    except (ValueError, KeyError, TypeError) as error:  # null where a number is needed, say
+    except (ValueError, KeyError, TypeError) as error:  # null in place of a number, say
         raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None

@@ -1,1 +1,1 @@
-"""Records made ready: what is used, who teaches and who judges, where a run begins."""
+"""Records prepared for fitting: which are used, training or held out, where a run begins."""

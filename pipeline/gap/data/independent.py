@@ -1,4 +1,4 @@
-"""How many readings of a residual tell as much as independent ones."""
+"""How many readings of a residual count as independent."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from pipeline.arrays import Array
 
 
 def independent(residual: Array) -> float:
-    """Return the number of independent readings that a residual (samples,) is worth.
+    """Return the number of independent readings in a residual (samples,).
 
     Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a mean
-    square of n correlated points is as sure as one of n / (1 + 2 Σ ρ²). This holds for what swings,
-    not for a drift.
+    square of n correlated points is as certain as one of n / (1 + 2 Σ ρ²). This holds for
+    oscillations, not for a drift.
     """
     power = np.abs(np.fft.rfft(residual - residual.mean(), 2 * residual.size)) ** 2
     covariance = np.fft.irfft(power)[: residual.size]

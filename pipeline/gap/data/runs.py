@@ -1,4 +1,4 @@
-"""Records made ready for fitting: free motion only, rest and start found, noise estimated."""
+"""Records prepared for fitting: free motion only, rest and start found, noise estimated."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,36 +14,37 @@ from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
-_STILL = 2.6  # encoder steps, peak to peak, that count as lying still
+_STILL = 2.6  # encoder steps, peak to peak, that count as rest
 _SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
 _HELD_SAMPLES = 4  # fewer samples at the top are no hold …
-_HELD_TIME = 2.0  # … nor is a stay there within this many times what free motion takes
+_HELD_TIME = 2.0  # … nor is a stay there within this many times that of free motion
 _RESTING = 1.5  # encoder steps within which a cart at rest reads …
-_ONE_READING = 0.07  # … and the time (s, at the usual pace) of which counts as independent
+_ONE_READING = 0.07  # … and the time (s, at the usual pace) that counts as one independent reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GapRun:
-    """One record as the fits see it.
+    """One record as the fits use it.
 
     Attributes
     ----------
     t (samples,), y (rows, samples) : times from the first sample used, and readings.
     rows : (rows,) cart index (from 0) of each row; held carts are left out.
     free : (n,) which carts move.
-    guided : (n, samples) how held carts move that are not held firmly; 0 for all others.
+    guided : (n, samples) motion of held carts that are not held firmly; 0 for all others.
     knots, command : the input, held from knot to knot.
     at_rest : the carts do not move at the first sample.
-    start_known : the first readings tell the start; else it is fitted, as springs forget it.
+    start_known : the first readings determine the start; else it is fitted, since springs forget
+        it.
     start, slope : (n,) first reading and velocity of each cart.
-    rest : (n,) where the carts rest, as read.
-    zero, zero_std : (n,) where the encoder's zero is expected, and how far off it may be.
+    rest : (n,) rest positions, as read.
+    zero, zero_std : (n,) expected encoder zero, and its uncertainty.
     sigma : (rows,) noise of one sample.
-    weight : (rows, samples) square root of how much each sample counts, at most 1.
-    block : samples averaged to one residual, in `thin`.
-    pace : 1 for a bench of carts, less in proportion for what swings faster.
-    shots : (shots + 1,) bounds of the pieces that start afresh; (0, samples) is the whole run.
-    shot_x, shot_v : (shots, n) smoothed states at the start of each shot, zeros not taken off.
+    weight : (rows, samples) square root of the weight of each sample, at most 1.
+    block : number of samples averaged to one residual, in `thin`.
+    pace : 1 for a bench of carts, smaller in proportion for faster systems.
+    shots : (shots + 1,) bounds of pieces with a start of their own; (0, samples) is the whole run.
+    shot_x, shot_v : (shots, n) smoothed states at the start of each shot, encoder zeros included.
     """
 
     id: str
@@ -72,7 +73,10 @@ class GapRun:
 
     @property
     def start_std(self) -> tuple[Array, Array]:
-        """(n,) how well the first readings tell `start` and `slope`; infinite where fitted."""
+        """(n,) Uncertainty of `start` and `slope` from the first readings;
+
+        infinite where fitted.
+        """
         known = np.full(self.zero.size, np.inf)
         if self.start_known:
             known[list(self.rows)] = self.sigma
@@ -80,18 +84,21 @@ class GapRun:
 
     @property
     def swing(self) -> Array:
-        """(rows,) root-mean-square of the reading about its rest."""
+        """(rows,) Root-mean-square of the reading about its rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
     @property
     def input(self) -> Array:
-        """(samples,) the input at each of them."""
+        """(samples,) The input at each sample."""
         if self.knots.size == self.t.size:
             return self.command
         return np.interp(self.t, self.knots, self.command)
 
     def by_cart(self, rows: Array, zero: Array) -> Array:
-        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples); else 0."""
+        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples);
+
+        0 for other carts.
+        """
         x = np.zeros((zero.size, self.t.size))
         x[list(self.rows)] = rows - zero[list(self.rows)][:, None]
         return x
@@ -102,22 +109,22 @@ class GapRun:
         return replace(self, sigma=np.array(own))
 
     def with_zeros(self, *, width: float) -> "GapRun":
-        """Return the run with the encoders' zeros those of the file, within `width` noises."""
+        """Return the run with the encoder zeros of the file, within `width` times the noise."""
         std = np.full(self.zero.size, 1.0)
         std[list(self.rows)] = width * self.sigma
         return replace(self, zero=np.zeros(self.zero.size), zero_std=std)
 
     @cached_property
     def thin(self) -> "GapRun":
-        """The run as the fits see it: fast samples block by block, the pieces as they are."""
+        """Return the run as the fits use it: fast samples averaged in blocks, pieces unchanged."""
         return _thin(self) if self.block > 1 else self
 
 
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
 
-    A decay starts after the hand has let go; a slow or held beginning is cut. One that begins in
-    motion starts at its first turning point: no hand follows that far.
+    A decay starts after the hand has let go; a slow or held beginning is cut. A decay that begins
+    in motion starts at its first turning point, where no hand can still act.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
@@ -125,7 +132,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     guided = _guided(record, n=n)
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
-    # The last eighth must lie still to tell the rest point.
+    # The rest point is known only if the last eighth is at rest.
     tail = y[:, -max(3, int(0.12 * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     frequency = _dominant_frequency(t, y)
@@ -167,7 +174,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
         weight=np.array([_weight(*row, length) for row in zip(y, resolution, strict=True)]),
-        block=max(1, int(rate * pace / 250.0)),  # Hz; what is faster is averaged for the fits
+        block=max(1, int(rate * pace / 250.0)),  # Hz; faster samples are averaged for the fits
         pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
@@ -176,27 +183,27 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
 
 
 def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tuple[bool, bool]:
-    """Tell whether a run starts at rest, and whether in equilibrium without an input."""
-    # The input may already act between the samples: the first two are before its effect.
+    """Return whether a run starts at rest, and whether in equilibrium without an input."""
+    # The input may already act between the samples; the first two come before its effect.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
     # 20 ms without motion: the run starts at rest.
     look = max(2, min(quiet, round(0.02 / sample_time)))
     at_rest = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
-    # What moves before the input does was not in equilibrium, only held.
+    # A cart that moves before the input does was held, not in equilibrium.
     in_place = bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
     return at_rest, at_rest and in_place and bool(u[0] == 0.0)
 
 
 def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return knots and an input held between them, its mean that of the smooth one."""
+    """Return knots and an input held between them, with the mean of the smooth input."""
     knots, smooth = interpolate_band_limited(t, u)
     return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
 
 
 def _guided(record: Record, *, n: int) -> Array:
-    """Return (n, samples) the smoothed motion of held carts, where it is more than a reading's."""
+    """Return (n, samples) the smoothed motion of held carts, if it exceeds that of a reading."""
     guided = np.zeros((n, record.t.size))
-    # A local cubic over 20 ms to either side: what a hand holds moves no faster.
+    # A local cubic over 20 ms to either side: a hand holds no faster motion.
     half = max(2, round(0.02 / record.sample_time))
     for cart in record.carts:
         y = record.position(cart)
@@ -209,8 +216,8 @@ def _thin(run: GapRun) -> GapRun:
     """Return one reading for each block of samples, at the middle of its times.
 
     The mean of a smooth motion exceeds its value in the middle by half the curvature times the
-    spread of the times: that is taken off, so the model need not be simulated sample by sample.
-    The first sample of each piece, where its state belongs, stays without weight.
+    spread of the times. This is subtracted, so the model need not be simulated sample by sample.
+    The first sample of each piece, which defines its state, has no weight.
     """
     q = run.block
     t, y, weight, shots = [], [], [], [0]
@@ -219,7 +226,7 @@ def _thin(run: GapRun) -> GapRun:
         times = run.t[first:last].reshape(-1, q)
         middle = times.mean(axis=1)
         mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
-        if middle.size >= 3:  # they tell a curvature
+        if middle.size >= 3:  # enough for a curvature
             slope = np.diff(mean, axis=1) / np.diff(middle)
             curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
             mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
@@ -244,8 +251,8 @@ def _thin(run: GapRun) -> GapRun:
 def _weight(readings: Array, step: float, length: int) -> Array:
     """Return the weight of each reading of one encoder.
 
-    A cart at rest repeats one rounding error: however long it lies there, that counts as
-    `length` readings.
+    A cart at rest repeats one rounding error: however long it rests, that counts as `length`
+    readings.
     """
     weight = np.ones(readings.size)
     if step <= 0.0:
@@ -261,7 +268,7 @@ def _weight(readings: Array, step: float, length: int) -> Array:
 
 
 def cut_shots(run: GapRun, *, length: float) -> GapRun:
-    """Cut a run into pieces that each start from a state of their own.
+    """Cut a run into pieces, each with a start state of its own.
 
     `length` is in s at the usual pace.
     """
@@ -292,9 +299,9 @@ def _dominant_frequency(t: Array, y: Array) -> float:
 
 
 def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
-    """Return the first sample of free motion of a decay that turns by `radians` a sample.
+    """Return the first sample of a decay's free motion, which turns by `radians` a sample.
 
-    None: it begins in motion; then the first sample at which the cart that moves most turns.
+    None: it begins in motion. Then the largest motion's first turning point is used.
     """
     leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
     if radians is None:
@@ -309,9 +316,9 @@ def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
     last = top + int(held[gaps[0]] if gaps.size else held[-1])
     passing = _HELD_TIME * np.sqrt(2.0 * slack / peak) / radians
     if last - top < max(_HELD_SAMPLES, passing):
-        # Shaken, or let go as the file begins: the largest swing is where the hand has gone.
+        # Shaken, or released as the file begins: the largest swing is free of the hand.
         return last if top > 0 else 0
-    # The first turning point after the release: no hand follows that far.
+    # The first turning point after the release, where no hand can still act.
     side = np.sign(offset[leader, top])
     return last + int(np.argmin(side * offset[leader, last:]))
 

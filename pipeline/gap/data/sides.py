@@ -1,4 +1,4 @@
-"""Which records are used, cut to what the fits need, and which of them judge."""
+"""Which records are used, cut to the fits' needs, and which of them are held out."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from pipeline.results import Intervention, LeftOut, Record
 from pipeline.words.numbers import by_note
 from pipeline.words.phrases import phrases
 
-_MOST_DWELLS = 4  # sine dwells used; they say little beyond their frequency
+_MOST_DWELLS = 4  # sine dwells used; further ones add little beyond their frequency
 _LEAST_MOTION = 8.0  # encoder steps
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 
@@ -21,7 +21,7 @@ _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 def drop_left_out(
     records: Sequence[Record], *, left_out: Sequence[LeftOut]
 ) -> tuple[list[Record], list[str]]:
-    """Return the records without those that the identification left out, and a note a reason.
+    """Return the records that the identification used, and a note for each other reason.
 
     Raises
     ------
@@ -43,9 +43,9 @@ def prepare(
     interventions: Sequence[Intervention] = (),
     notes: list[str],
 ) -> list[GapRun]:
-    """Return the runs worth fitting; what is left out is noted.
+    """Return the runs worth fitting, with notes on those left out.
 
-    What a record shows behind an intervention is a run of its own.
+    The part of a record after an intervention is a run of its own.
 
     Raises
     ------
@@ -88,7 +88,7 @@ def prepare(
 
 
 def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int) -> list[GapRun]:
-    """Return the record between interventions, each stretch that shows motion as a run."""
+    """Return the parts of a record between interventions that show motion, each as a run."""
     runs = []
     for piece in between(record, interventions):
         if _is_usable(piece):
@@ -101,9 +101,9 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
 
 
 def _on_no_spring(run: GapRun) -> GapRun:
-    """Return a run whose readings are positions, as no rest tells a zero, and tell the start.
+    """Return a run whose readings are absolute positions, as no rest defines a zero, and its start.
 
-    No spring forgets a start: a free one would take up what a model lacks.
+    Without springs a start is never forgotten: a free start would absorb missing effects.
     """
     # A known zero may be off by a thousandth of the noise.
     known = np.full(run.zero.size, 1e-3 * float(run.sigma.min()))
@@ -111,10 +111,10 @@ def _on_no_spring(run: GapRun) -> GapRun:
 
 
 def _is_usable(record: Record) -> bool:
-    """Does a free cart move, for a known reason, for long enough?"""
+    """Return whether a free cart moves, for a known reason, for long enough."""
     if not record.free or record.t.size < _FEWEST or record.t[-1] - record.t[0] < _SHORTEST:
         return False
-    # Without its input only a release or a held cart 1 is understood.
+    # Without its input only a release or a run with cart 1 held is usable.
     known = record.u is not None or record.kind == "decay" or 1 not in record.free
     return known and _moves(record)
 
@@ -129,9 +129,9 @@ def _span(record: Record, cart: int) -> float:
 
 
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
-    """Return the records with the carts held that none of them moves, whatever they say."""
+    """Return the records, with carts marked as held that move in no record."""
     seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
-    # Within three encoder steps a cart stands still.
+    # A cart that stays within three encoder steps is at rest.
     moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}
     still = {cart for _, cart in seen} - moving
     if not still:
@@ -142,7 +142,7 @@ def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[R
 
 
 def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], list[GapRun]]:
-    """Return training and held-out runs; where none is to spare the longest is cut in time."""
+    """Return training and held-out runs; if no run can be spared, the longest is cut in time."""
     teach, judge_by = split(runs)
     if judge_by:
         return [runs[i] for i in teach], [runs[i] for i in judge_by]
@@ -154,7 +154,7 @@ def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], l
     for piece in (slice(0, cut), slice(cut, None)):
         record = replace(
             run.record,
-            # A later piece of a decay has no hand in it.
+            # A later piece of a decay is free of hands.
             kind=run.record.kind if piece.start == 0 and run.record.kind != "decay" else "sweep",
             t=run.t[piece],
             u=None if run.record.u is None else run.record.u[-run.t.size :][piece],
@@ -178,7 +178,7 @@ def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], l
 
 
 def _last_motion(run: GapRun) -> int:
-    """Return how many samples there are up to the last motion of a run."""
+    """Return the number of samples up to the last motion of a run."""
     step = run.sigma * np.sqrt(12.0)
     away = np.abs(run.y - run.y[:, -1:]) > _LEAST_MOTION * step[:, None]
     last = int(np.flatnonzero(away.any(axis=0))[-1]) + 1 if away.any() else run.t.size
@@ -186,7 +186,7 @@ def _last_motion(run: GapRun) -> int:
 
 
 def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:
-    """Return the runs without those whose samples are those of an earlier one."""
+    """Return the runs without exact copies of earlier ones."""
     kept: list[GapRun] = []
     for run in runs:
         if not any(k.y.shape == run.y.shape and np.array_equal(k.y, run.y) for k in kept):
@@ -197,9 +197,10 @@ def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:
 def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
     """Return the indices of training and held-out runs.
 
-    Whole runs are held out. Of repeats one goes to each side; of three sizes of a kind the middle
-    one is held out, so that both extremes teach; of two free decays one. Every kind keeps one
-    run in training. Nothing is held out of a single run, or of two sweeps: cut one in time instead.
+    Whole runs are held out. Of repeats, one goes to each side. Of three sizes of a kind the middle
+    one is held out, so that both extremes are trained on. Of two free decays one is held out. Every
+    kind keeps one run in training. Nothing is held out of a single run, or of two sweeps, which
+    must be cut in time instead.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):
@@ -219,22 +220,22 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
             held += cluster[1::2]
         sizes_apart = [cluster[0] for cluster in clusters]
         if len(sizes_apart) >= 3:
-            # In order of signed size: the extremes of both signs teach.
+            # In order of signed size: the extremes of both signs are trained on.
             held.append(sizes_apart[len(sizes_apart) // 2])
         elif len(sizes_apart) == 2 and kind == "decay" and len(members) == 2:
             held.append(min(sizes_apart, key=lambda i: abs(sizes[i])))
         elif len(sizes_apart) == 2:
             pairs.append(sizes_apart)
-    # Of two sweeps and nothing else each may pass where the other does not: both teach.
+    # Of two sweeps alone, each may cover what the other does not, so both are trained on.
     if not held and any(runs[i].record.kind != "sweep" for pair in pairs for i in pair):
         held = [min(pair, key=lambda i: abs(_size(runs[i]))) for pair in pairs[:1]]
     return [i for i in range(len(runs)) if i not in held], sorted(held)
 
 
 def _size(run: GapRun) -> float:
-    """How hard a run was driven: its extreme input, or where a free decay starts.
+    """Return how hard a run was driven: its extreme input, or the start of a free decay.
 
-    Of a run under feedback its reference: the input is the controller's answer.
+    Under feedback it is the reference, as the input is only the controller's response.
     """
     if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))

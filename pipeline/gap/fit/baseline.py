@@ -32,10 +32,10 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
         # Free decays alone: forces are per unit of the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
         first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
-        # The equation m_1 = 1 weighs much: nothing else sets a scale.
+        # The equation m_1 = 1 has a large weight: nothing else sets a scale.
         A[-1, first] = b[-1] = 1e3 * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
-    scale[scale == 0.0] = 1.0  # a cart that no run shows keeps the smallest values
+    scale[scale == 0.0] = 1.0  # a cart that moves in no run keeps the smallest values
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
     m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
     k = np.zeros(n + 1)
@@ -47,7 +47,10 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
 
 
 def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]]:
-    """Yield what each window of a run says of each cart that moves: equation and right side."""
+    """Yield the equations of each moving cart from each window of a run:
+
+    equation and right side.
+    """
     # Windows of 0.3 s, every 50 ms, at the usual pace.
     step = max(1, round(0.05 * run.pace / run.record.sample_time))
     width = max(8, round(0.3 * run.pace / run.record.sample_time))
@@ -78,10 +81,10 @@ def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]
 def fit_baseline(
     runs: Sequence[GapRun], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
 ) -> tuple[GapFit, list[GapRun]]:
-    """Fit the linear chain; returns it with the runs, their noise now measured.
+    """Fit the linear chain; return it with the runs, whose noise is now measured.
 
-    Short pieces with states of their own first, then whole runs; the better of the stages'
-    chain and a first estimate of its own is kept.
+    First short pieces with states of their own, then whole runs. It starts from the stages' chain
+    and from an estimate of its own; the better result is kept.
     """
     structure = Structure(springs=tuple(springs))
     # Over 0.6 s a wrong structure does little harm.
@@ -117,7 +120,7 @@ def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) 
 
 
 def fit_nuisance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
-    """Fit only what belongs to the runs: for runs the model has not seen."""
+    """Fit only the nuisance parameters of runs that the model was not fitted to."""
     how = Fitting(mapper=mapper, shared=False, iterations=10)
     fresh = tuple(fresh_nuisance(run) for run in runs)
     found = fit_model(replace(fit, nuisance=fresh), runs, how)

@@ -15,11 +15,11 @@ def bounded_step(
     solve: Callable[[np.ndarray], Array],
     rounds: int,
 ) -> Array:
-    """Return a step of the parameters `at` (size,), inside their bounds and their reach.
+    """Return a step of the parameters `at` (size,) within their bounds and step limits.
 
-    `bounds` are lower, upper, and how far each may go at once. `solve` gives the step of those that
-    are `active`, by index. One at a bound, with the step pointing outward, stays, and the others
-    are solved for again, for as many `rounds`.
+    `bounds` are the lower bounds, the upper bounds, and the largest step of each parameter. `solve`
+    returns the step of the parameters that are `active`, by index. A parameter at a bound whose
+    step points outward is fixed, and the others are solved again, at most `rounds` times.
     """
     low, high, reach = bounds
     delta = np.zeros(at.size)
@@ -34,5 +34,5 @@ def bounded_step(
             delta[active] = step
             break
         active = active[~out]
-    # One long step must not carry the others with it: each is clipped by itself.
+    # One long step must not shorten the others: each is clipped separately.
     return np.clip(at + np.clip(delta, -reach, reach), low, high) - at

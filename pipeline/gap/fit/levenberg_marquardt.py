@@ -1,4 +1,4 @@
-"""Fit a model to all runs at once: Levenberg-Marquardt, the nuisance parameters eliminated.
+"""Fit a model to all runs at once: Levenberg-Marquardt, with the nuisance parameters eliminated.
 
 Reference: J. Nocedal, S. J. Wright, Numerical Optimization, 2nd ed., section 10.3.
 """
@@ -38,8 +38,8 @@ class GapFit(GapModel):
     covariance : (size, size) of the vector, or None before the end.
     nuisance : one for each run, in their order.
     cost : sum of squared residuals over their noise, prior terms included.
-    chi_square : without the prior terms; n_points the residuals behind it.
-    run_chi : (runs,) chi-square per residual of each run; run_prior its prior terms.
+    chi_square : the same without prior terms; n_points is the number of residuals.
+    run_chi : (runs,) chi-square per residual of each run; run_prior: its prior terms.
     """
 
     nuisance: tuple[Nuisance, ...]
@@ -59,32 +59,32 @@ class GapFit(GapModel):
 
     @property
     def inflation(self) -> float:
-        """By how much the misfit of a model that is still wrong widens the noise."""
+        """Factor by which the misfit of a model that is still wrong widens the noise."""
         return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
 
     @property
     def scattered(self) -> bool:
-        """Whether the dry friction was let differ from run to run."""
+        """Whether dry friction may differ between runs."""
         return any(bool(np.any(nuisance.scatter != 1.0)) for nuisance in self.nuisance)
 
     @property
     def anew(self) -> GapModel:
-        """The model alone: a fit of it begins where runs are expected, not where this one left."""
+        """The model alone: a fit of it starts each run at its expected values."""
         return GapModel(structure=self.structure, theta=self.theta)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fitting:
-    """How a fit goes.
+    """Options of a fit.
 
     Attributes
     ----------
     mapper : maps work over runs.
-    iterations : the most there are.
+    iterations : the largest number of them.
     tolerance : relative fall of the cost below which it has converged.
     shared : whether the shared parameters move, or only those of the runs.
-    scatter_free : whether the dry friction may differ from run to run; `learn_spread`: by how much
-        it does is then learnt.
+    scatter_free : whether dry friction may differ between runs; with `learn_spread` its spread is
+        fitted too.
     """
 
     mapper: Mapper = map
@@ -104,7 +104,7 @@ def evaluate(
     inflate: float = 1.0,
     mapper: Mapper = map,
 ) -> GapFit:
-    """Return the fit at given parameters, shared and nuisance, without moving either."""
+    """Return the fit at given shared and nuisance parameters, without moving them."""
 
     def cost(pair: tuple[GapRun, Nuisance]) -> tuple[float, float]:
         return run_cost(model, *pair, spread=spread)
@@ -140,13 +140,13 @@ def _fit_at(
 def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     """Fit the shared parameters and every run's nuisance parameters.
 
-    `start` is where to begin; a fit goes on from where it left the same runs.
+    `start` is the initial point; a fit continues from its state in the same runs.
     """
     structure = start.structure
     low, high = structure.bounds()
     bounds = low, high, structure.reach()
     goes_on = start if isinstance(start, GapFit) else None
-    # Until something is known friction differs by 5 % from run to run.
+    # The initial guess: friction differs by 5 % between runs.
     best = evaluate(
         GapModel(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
@@ -161,10 +161,10 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
         linear = _linearise_all(best, runs, how)
         reduced = [part.reduced for part in linear]
         stacked = np.concatenate([*reduced, anchor(runs, reduced[0].shape[1] - 1)])
-        # Where a parameter lets the simulation run away the square of its slope is no number.
+        # If the simulation diverges, the square of its slope is not a number.
         if not np.all(np.abs(stacked) < 1e100):
             break
-        # Shorter steps, each six times as damped, until none is left to try: it has converged.
+        # Shorter steps, each six times as damped. If none helps, the fit has converged.
         for _attempt in range(5):
             delta = _step(stacked, best.theta, bounds, damp=damp)
             trial = _follow(best, runs, linear, delta, how)
@@ -184,7 +184,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
 
 
 def _linearise_all(fit: GapFit, runs: Sequence[GapRun], how: Fitting) -> list[Linear]:
-    """Return every run's share of a step from a fit."""
+    """Return the contribution of every run to a step from a fit."""
 
     def share(job: tuple[GapRun, Nuisance]) -> Linear:
         run, nuisance = job
@@ -198,37 +198,38 @@ def _linearise_all(fit: GapFit, runs: Sequence[GapRun], how: Fitting) -> list[Li
 def _step(
     stacked: Array, theta: Array, bounds: tuple[Array, Array, Array], *, damp: float
 ) -> Array:
-    """Return the damped step of the shared parameters, inside their bounds and their reach.
+    """Return the damped step of the shared parameters, within their bounds and step limits.
 
-    `stacked` (rows, moving + 1) has the Jacobian and the residual; with nothing moving it is 0.
+    `stacked` (rows, moving + 1) has the Jacobian and the residual; with nothing moving the step is
+    0.
     """
     J, r = stacked[:, :-1], stacked[:, -1]
 
     def solve(active: np.ndarray) -> Array:
         scale = np.linalg.norm(J[:, active], axis=0)
-        # A column weaker than this share of the strongest is rounding.
+        # A column below this share of the strongest is rounding error.
         scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
         A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
         right = np.concatenate([r, np.zeros(active.size)])
         return np.asarray(np.linalg.lstsq(A, right, rcond=None)[0], dtype=np.float64)
 
-    # Parameters at their bounds are rarely more than one.
+    # Rarely more than one parameter is at its bound.
     return bounded_step(theta, bounds, np.arange(J.shape[1]), solve=solve, rounds=3)
 
 
 def _follow(
     fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear], delta: Array, how: Fitting
 ) -> GapFit:
-    """Return the fit after a step, the nuisance parameters moved with it.
+    """Return the fit after a step, with the nuisance parameters moved accordingly.
 
-    Less far in a run where that is no gain.
+    In a run whose cost would rise, they move less far.
     """
     model, inflate = GapModel(structure=fit.structure, theta=fit.theta + delta), fit.inflation
 
     def move(job: tuple[Linear, GapRun, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
         tried = []
-        # A share of the run's own step, where the whole one raises its cost.
+        # The share of the run's own step, if the full one raises its cost.
         for scale in (1.0, 0.3, 0.05):
             moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
             cost = run_cost(model, run, moved, spread=fit.spread)
@@ -251,7 +252,7 @@ def _follow(
 
 
 def anchor(runs: Sequence[GapRun], size: int) -> Array:
-    """Return a row that holds the first free mass where no input gives forces a scale."""
+    """Return a row that fixes the first free mass if no input sets the scale of forces."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
     if not size:
@@ -263,7 +264,7 @@ def anchor(runs: Sequence[GapRun], size: int) -> Array:
 
 
 def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear]) -> GapFit:
-    """Learn how much the friction of each cart varies."""
+    """Estimate the run-to-run spread of each cart's friction."""
     spread = fit.spread.copy()
     factors = np.array([nuisance.scatter for nuisance in fit.nuisance])
     noise = max(1.0, fit.chi)
@@ -277,7 +278,7 @@ def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear])
         ]
         if not there:
             continue
-        weight, prior = 3.0, 0.04  # of the prior on that spread: in runs, and its size
+        weight, prior = 3.0, 0.04  # of the prior on that spread: its weight in runs, and its size
         total = weight * prior**2
         for r, j in there:
             column = linear[r].run_wide[j, j]

@@ -1,9 +1,9 @@
-"""One run: its nuisance parameters, its readings under a model, and its share of a step.
+"""One run: its nuisance parameters, its readings under a model, and its contribution to a step.
 
-The nuisance parameters of a run are the carts' start (and restart) states, those of hidden masses
-where the carts already move, the encoders' zeros, and a factor on the dry friction of each cart,
-which varies from run to run. They enter the residual almost linearly, so a QR factorisation of
-each run leaves a small problem in the shared parameters (variable projection).
+The nuisance parameters of a run are the start (and restart) states of the carts, those of hidden
+masses if the carts already move, the encoder zeros, and a factor on the dry friction of each cart,
+which varies between runs. They enter the residual almost linearly, so a QR factorisation of each
+run leaves a small problem in the shared parameters (variable projection).
 
 Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares).
 """
@@ -20,15 +20,15 @@ from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
 
 _START_STEP = 1e-3  # for differences, of the swing or of the friction
-_HOME = 0.1  # how firmly the priors hold starts that the data do not show …
+_HOME = 0.1  # how firmly the priors hold starts that the data do not determine …
 _HELD = 1e6  # … and a velocity that is known to be zero
-_FACTOR_STEP = 0.3  # of a friction factor, at a time: beyond, the friction is another one …
-_FACTORS = (0.3, 3.0)  # … and of no study, whose factors are within some 20 % of one
+_FACTOR_STEP = 0.3  # largest step of a friction factor: further away, the friction is another one …
+_FACTORS = (0.3, 3.0)  # … and without a study the factors stay within some 20 % of one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Nuisance:
-    """What belongs to one run: start states (shots, 2 n), zeros (n,), friction factors (n,).
+    """The parameters of one run: start states (shots, 2 n), zeros (n,), friction factors (n,).
 
     The start states are those of the carts, then those of their hidden masses relative to them.
     """
@@ -40,12 +40,12 @@ class Nuisance:
 
     @property
     def start(self) -> StartState:
-        """What of it the simulator starts from."""
+        """The part that the simulator starts from."""
         return StartState(self.x0, self.v0, self.scatter)
 
 
 def fresh_nuisance(run: GapRun) -> Nuisance:
-    """Return a run's nuisance parameters where they are expected."""
+    """Return a run's nuisance parameters at their expected values."""
     n = run.zero.size
     free = np.array(run.free)
     hidden = np.zeros((len(run.shots) - 1, n))
@@ -71,9 +71,9 @@ def _simulate_variants(
     *,
     lanes: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array]:
-    """Return (b, rows, samples) readings of one run for many vectors and starts, zeros left out.
+    """Return (b, rows, samples) readings of one run for many vectors and starts, without zeros.
 
-    And the derivatives (lanes, rows, samples) of the first, by what `lanes` tell: a kind of
+    Also return the derivatives (lanes, rows, samples) of the first. `lanes` says by what: a kind of
     `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
     """
     y, by = simulate(
@@ -99,7 +99,10 @@ def _simulate_variants(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linear:
-    """One run's share of a step: what is left for the shared parameters, and the way back."""
+    """One run's contribution to a step:
+
+    the reduced system of the shared parameters, and the way back.
+    """
 
     reduced: Array  # (rows, size + 1) of R: shared parameters and residual
     run_wide: Array  # R of friction factors and zeros: [they | shared | residual]
@@ -109,9 +112,9 @@ class Linear:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """What moves in a step: the nuisance parameters of a run, and the shared ones or not.
+    """The parameters that move in a step: a run's own, and possibly the shared ones.
 
-    Cart indices of each, n more for a hidden mass.
+    Cart indices of each kind, plus n for a hidden mass.
     """
 
     x0: tuple[int, ...]
@@ -125,7 +128,7 @@ class Layout:
 def layout_of(
     structure: Structure, run: GapRun, *, scatter_free: bool, shared: bool = True
 ) -> Layout:
-    """Return which nuisance parameters a run has under a structure."""
+    """Return the nuisance parameters that a run has under a structure."""
     free = tuple(i for i, moves in enumerate(run.free) if moves)
     multiple = len(run.shots) > 2
     dry = structure.dry if scatter_free else (False,) * structure.n
@@ -141,7 +144,7 @@ def layout_of(
 
 
 def _by_shot(residual: Array, run: GapRun) -> Array:
-    """Weigh (…, rows, samples) and cut it into shots, padded with zeros to one length.
+    """Weight (…, rows, samples) and cut it into shots, padded with zeros to one length.
 
     Returns (…, shots, rows * longest).
     """
@@ -155,19 +158,19 @@ def _by_shot(residual: Array, run: GapRun) -> Array:
 
 
 def residual_points(run: GapRun) -> float:
-    """Return how many residuals a run adds to a fit, each by its weight."""
+    """Return the number of residuals of a run, each counted by its weight."""
     return float((run.thin.weight**2).sum())
 
 
 def triangle(matrix: Array) -> Array:
     """Return R of the QR factorisation of one matrix or a stack of them.
 
-    Tall ones part by part, each small enough for the processor's cache, then of what they leave.
+    Tall matrices are factorised in parts that fit the processor's cache, then their results.
 
     Reference: J. Demmel, L. Grigori, M. Hoemmen, J. Langou, SIAM J. Sci. Comput. 34 (2012), A206.
     """
     *stack, rows, columns = matrix.shape
-    # So many rows are factorised at once.
+    # This many rows are factorised at once.
     parts = rows // 400
     if parts > 1:
         even = rows // parts * parts
@@ -192,8 +195,7 @@ def linearise(
 ) -> Linear:
     """Return a run's residual and its Jacobian, with its nuisance parameters eliminated.
 
-    `inflate` widens the noise to the misfit of a model that is still wrong, as far as priors are
-    concerned.
+    For the priors, `inflate` widens the noise to the misfit of a model that is still wrong.
     """
     run = run.thin
     columns = columns_of(model, run, nuisance, layout)
@@ -209,7 +211,7 @@ def linearise(
 
 
 def columns_of(model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout) -> Array:
-    """Return (., rows, samples) Jacobian by the starts, friction factors, zeros and shared …
+    """Return (., rows, samples): the Jacobian by starts, friction factors, zeros and shared …
 
     … parameters, and the residual last.
     """
@@ -247,8 +249,8 @@ def _derivatives(
 ) -> tuple[Array, Array, Array]:
     """Return the readings (rows, samples) and their derivatives (., rows, samples).
 
-    By the run's starts and friction factors, and by the shared parameters: of the chain they are
-    carried beside the state, of the effects they are differences.
+    The derivatives are by the run's starts and friction factors, and by the shared parameters.
+    Those of the chain are integrated with the state, those of the effects are differences.
     """
     structure, theta = model.structure, model.theta
     lanes = [(sensitivity.BY_POSITION, i) for i in layout.x0] + [
@@ -267,7 +269,7 @@ def _derivatives(
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)
     y, by = _simulate_variants(structure, thetas, run, [nuisance.start] * len(thetas), lanes=lanes)
-    # By the logarithm of a number: by itself, times the number.
+    # The derivative by a logarithm is the derivative by the number, times the number.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
     return y[0], by[:local], np.concatenate([by[local:], by_effects])
@@ -276,9 +278,9 @@ def _derivatives(
 def _differences(
     model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
-    """Return what `_derivatives` does, by differences alone.
+    """Return the same as `_derivatives`, by differences alone.
 
-    Behind a contact the misfit is full of narrow valleys: a finite step looks across them.
+    With contacts the misfit is full of narrow valleys: a finite difference looks across them.
     """
     structure, theta = model.structure, model.theta
     position, velocity = usual_sizes(model, run)
@@ -308,7 +310,7 @@ def _differences(
 
 
 def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
-    """Return the usual positions and velocities (2 n,) of the carts and what hides on them."""
+    """Return the usual positions and velocities (2 n,) of the carts and their hidden masses."""
     size = np.maximum(run.swing, 1e-9)
     chain = model.structure.chain(model.theta)
     position = np.full(chain.n, size.max())
@@ -320,14 +322,14 @@ def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
 def start_prior(
     layout: Layout, run: GapRun, sizes: tuple[Array, Array], *, inflate: float
 ) -> Array:
-    """Return (shots, starts, starts) weak priors that keep starts the data do not show at home.
+    """Return (shots, starts, starts) weak priors on starts that the data do not determine.
 
-    In units of the swing; where a run starts at rest, its first velocity stays zero.
+    In units of the swing; if a run starts at rest, its first velocity stays zero.
     """
     position, velocity = sizes
     weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
     prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
-    # What hides on a cart no reading tells.
+    # No reading shows the hidden mass on a cart.
     known = [np.append(1.0 / std, np.zeros(std.size)) for std in run.start_std]
     known_start = np.concatenate([known[0][list(layout.x0)], known[1][list(layout.v0)]])
     prior[0] += np.diag(inflate * known_start)
@@ -338,7 +340,7 @@ def start_prior(
 
 
 def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float = 1.0) -> Nuisance:
-    """Return the nuisance parameters that go with a step of the shared ones."""
+    """Return the nuisance parameters after a step of the shared ones."""
     layout = linear.layout
     n_wide, n_starts = linear.run_wide.shape[0], linear.shots.shape[1]
     tail = np.concatenate([-delta, [1.0]])

@@ -1,4 +1,4 @@
-"""Start the worst runs' nuisance parameters anew, from elsewhere in the friction band."""
+"""Restart the worst runs' nuisance parameters elsewhere in the friction band."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,15 +12,15 @@ from pipeline.gap.fit.linearise import Nuisance, residual_points
 from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
 from pipeline.plant.nonlinear.tables import Drive, Tables
 
-_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, to start a run anew
+_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, for a restart
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
 def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
-    """Start the worst runs' nuisance parameters anew, elsewhere in the band where carts may rest.
+    """Restart the worst runs' nuisance parameters elsewhere in the rest band of the carts.
 
-    A cart rests anywhere inside the band of friction or cogging, and is zeroed there, so a run's
-    misfit has several valleys in zero and friction. Shared parameters stay.
+    A cart may rest anywhere inside the band of friction or cogging, and is zeroed there. So a run's
+    misfit has several valleys in zero and friction. Shared parameters do not move.
     """
     if not fit.structure.many_rests:
         return fit
@@ -57,7 +57,7 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
 
 
 def _rest_band(fit: GapFit) -> Array:
-    """Return (n,) how far from its springs' equilibrium each cart may lie, about one sigma."""
+    """Return (n,) how far from its springs' equilibrium each cart may rest, about one sigma."""
     chain = fit.structure.chain(fit.theta)
     force = holding_force(fit.structure.model(fit.theta).tables())
     if not np.any(chain.k > 0):
@@ -67,7 +67,7 @@ def _rest_band(fit: GapFit) -> Array:
 
 
 def holding_force(tables: Tables) -> Array:
-    """Return (n,) the largest force against which friction or cogging still holds each cart."""
+    """Return (n,) the largest force that friction or cogging can hold on each cart."""
     cart, _, drive = tables
     dry = [sliding(cart, i, 0.0) + dropping(cart, i, 0.0, 0.0) for i in range(len(cart))]
     force = np.array(dry) + [settling(cart, i, 0.0)[0] for i in range(len(cart))]

@@ -1,4 +1,4 @@
-"""The parameters of a model as one vector: logarithms, or multiples where of either sign."""
+"""The parameters of a model as one vector: logarithms, or multiples if they may change sign."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from pipeline.plant.nonlinear.effects.base import (
 )
 from pipeline.plant.nonlinear.tables import Cart
 
-_SMALLEST = 1e-7  # of a parameter's scale; below, an effect is not there
+_SMALLEST = 1e-7  # of a parameter's scale; below this an effect is absent
 
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An effect at a place, with the signs its sided parameters keep and its typical sizes."""
+    """An effect at a place, with the signs of its sided parameters and its typical sizes."""
 
     effect: Effect
     place: int
@@ -56,10 +56,10 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """Which springs there are and which effects act: the shape of the parameter vector.
+    """The springs present and the effects acting: the shape of the parameter vector.
 
-    The vector holds log m, log c, log k (of the springs present; their sum for one cart), then
-    each effect's parameters: log |p| where the sign is known, p over its scale where it is not.
+    The vector holds log m, log c, log k (of the springs present; their sum for one cart), then each
+    effect's parameters: log |p| if the sign is known, p over its scale if not.
     """
 
     springs: tuple[bool, ...]
@@ -89,7 +89,7 @@ class Structure:
 
     @cached_property
     def many_rests(self) -> bool:
-        """Whether some cart may lie still elsewhere than where its springs would let it."""
+        """Whether some cart may rest away from the equilibrium of its springs."""
         return any(c.effect.many_rests for c in self.effects)
 
     @cached_property
@@ -103,7 +103,7 @@ class Structure:
         return tuple(sorted(c.place - 1 for c in self.effects if c.effect.hides_mass))
 
     def span(self, index: int) -> slice:
-        """Return where the parameters of an effect stand in the vector."""
+        """Return the place of an effect's parameters in the vector."""
         start = self.base_size + sum(len(c.effect.parameters) for c in self.effects[:index])
         return slice(start, start + len(self.effects[index].effect.parameters))
 
@@ -152,14 +152,14 @@ class Structure:
         return GapModel(structure=self, theta=np.concatenate(parts))
 
     def visible(self, theta: Array) -> bool:
-        """Do the hidden masses, if any, swing slowly enough to be told from the carts?"""
+        """Return whether all hidden masses swing slowly enough to differ from the carts."""
         cart = self.model(theta).tables().cart
         hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():
             return True
         of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
         rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
-        # A hidden mass that swings 20 times as fast as its cart moves as one with it.
+        # A hidden mass with 20 times its cart's frequency moves as one with it.
         return bool(np.all((of_cart[hidden] == 0.0) | (rate < 20.0**2 * of_cart[hidden])))
 
     def bounds(self) -> tuple[Array, Array]:
@@ -180,7 +180,7 @@ class Structure:
         """Return the difference step of each parameter, for derivatives."""
         steps = [np.full(self.base_size, 1e-4)]
         for c in self.effects:
-            # Contacts answer to small changes with noise of their own.
+            # Contacts respond irregularly to small changes.
             coarse = 5.0 if c.effect.contact else 1.0
             steps.append(
                 coarse * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters])
@@ -188,14 +188,14 @@ class Structure:
         return np.concatenate(steps)
 
     def reach(self) -> Array:
-        """Return how far each parameter may go in one step."""
+        """Return the largest step of each parameter."""
         reach = [np.full(self.base_size, 0.3)]
         for c in self.effects:
             reach.append(np.array([1.0 if p.signed else p.reach for p in c.effect.parameters]))
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:
-        """Return d(parameter)/d(coordinate) of the effects; the chain stays in logs."""
+        """Return d(parameter)/d(coordinate) of the effects; the chain stays in logarithms."""
         out = [np.ones(self.base_size)]
         for index, c in enumerate(self.effects):
             values = c.values(theta[self.span(index)])
@@ -214,7 +214,7 @@ class Structure:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class GapModel:
-    """A structure with its vector `theta` (size,): where a fit starts, or ends."""
+    """A structure with its vector `theta` (size,): the start or the result of a fit."""
 
     structure: Structure
     theta: Array
@@ -225,7 +225,7 @@ class GapModel:
         return self.structure.model(self.theta).terms
 
     def with_effect(self, candidate: Candidate, values: Sequence[float]) -> "GapModel":
-        """Return the model with one more effect, at the values of its parameters."""
+        """Return the model with one more effect at the given parameter values."""
         return GapModel(
             structure=self.structure.with_effect(candidate),
             theta=np.concatenate([self.theta, candidate.coordinates(values)]),
@@ -261,7 +261,7 @@ def bench_scales(
         velocity[: len(x)] = np.maximum(velocity[: len(x)], np.abs(speed).max(axis=1))
         level = max(level, float(np.abs(run.command).max()))
         sample_time = min(sample_time, run.record.sample_time)
-    # Time scales of a drive are physical, some milliseconds, however fast the sampling.
+    # Time constants of a drive are physical, some milliseconds, whatever the sampling.
     return chain_scales(
         chain,
         place=effect.place,

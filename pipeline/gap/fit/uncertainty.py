@@ -1,10 +1,10 @@
-"""How sure the parameters of a fitted model are, where what it leaves is not white.
+"""Standard errors of a fitted model whose residual is not white.
 
-An encoder reads the same for as long as a cart rests, and friction lets it rest anywhere: all
-those readings share one rounding error, which is what then limits how well the friction is known.
-So the covariance is H⁻¹ S H⁻¹: H is the information that the fit counts with, S what such encoders
-make of the fitted motion, drawn many times. No variance is less than white noise, or what the
-residual shows of its own correlation, would make of it.
+While a cart rests its encoder repeats one reading, and friction lets it rest anywhere. All those
+readings share one rounding error, which limits how well friction is known. So the covariance is H⁻¹
+S H⁻¹. H is the information of the fit. S is the effect of such encoder errors on the fitted motion,
+from many random draws. No variance is smaller than that of white noise, or that implied by the
+residual's own correlation.
 
 Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for the sandwich; B. Efron, R. J.
 Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5, for the drawing.
@@ -30,19 +30,19 @@ from pipeline.gap.fit.linearise import (
     usual_sizes,
 )
 
-_DRAWS = 60  # of the encoders' errors: a standard error is then known to 9 %
-_HIDDEN = 1e-9  # of the strongest: what no run shows is as good as unknown
+_DRAWS = 60  # draws of encoder errors: a standard error is then accurate to 9 %
+_HIDDEN = 1e-9  # of the strongest: weaker directions count as unknown
 
 
 def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
-    """Return the fit with the covariance of its parameters; without, where the model runs away.
+    """Return the fit with the covariance of its parameters, or without if the model diverges.
 
-    Where friction was fitted with one size for all runs, its spread is no part of the error.
+    If friction was fitted with one size for all runs, its spread is not part of the error.
     """
 
     def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> Array:
         index, (run, nuisance) = job
-        # Seeded by the run's place in their order: each has draws of its own.
+        # Seeded by the run's index, so that each run has draws of its own.
         rng = np.random.default_rng([0, index])
         return _weigh(fit, run, nuisance, rng=rng)
 
@@ -60,15 +60,15 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     least = np.maximum(np.diag(found), np.diag(inverse))
     more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), _HIDDEN * least)))
     cov = expected * np.outer(more, more)
-    # What no run shows gets no error from the encoders: it is as unknown as H says.
+    # Directions that no run determines get no error from the encoders: they are as unknown as in H.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
     return replace(fit, covariance=cov)
 
 
 def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> Array:
-    """Return H, and S (each (size, size)) as encoders make it and as the residual shows it.
+    """Return H, and S (each (size, size)) by encoder errors and by the residual's correlation.
 
-    All NaN where the model, or one a little beside it, runs away.
+    All NaN if the model, or one a little beside it, diverges.
     """
     thin, inflate = run.thin, fit.inflation
     layout = layout_of(fit.structure, thin, scatter_free=fit.scattered)
@@ -85,7 +85,7 @@ def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Gener
     for piece, firm in enumerate(pieces):
         at = slice(piece * starts, (piece + 1) * starts)
         prior[at, at] = firm
-    wide = 1 + local - starts  # the last column is the residual's
+    wide = 1 + local - starts  # the last column is the residual
     firm = run_prior(layout, thin, nuisance, wide, spread=fit.spread, inflate=inflate)
     prior[len(own) :, len(own) :] = firm[:, :-1]
     J = columns[local:-1].reshape(fit.theta.size, -1).T
@@ -110,7 +110,7 @@ def _by_piece(columns: Array, run: GapRun) -> Array:
 def _errors(
     fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator
 ) -> Iterator[Array]:
-    """Yield what encoders err by on the fitted motion, as the fit sees it (rows, samples)."""
+    """Yield random encoder errors of the fitted motion, as the fit sees them (rows, samples)."""
     x = simulate_run(fit, run, nuisance)
     steps = np.array([run.record.encoder_step(row + 1) for row in run.rows])
     noise = [noise_beyond_rounding(s, step=step) for s, step in zip(run.sigma, steps, strict=True)]

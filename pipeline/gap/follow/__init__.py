@@ -1,1 +1,1 @@
-"""Fit models while they follow the measurement: every law at every place at once, from nothing."""
+"""Fit models that follow the measurement: every law at every place at once, from zero."""

@@ -1,4 +1,7 @@
-"""Choose the laws: all at once from nothing, then those of a shape, then drop what is nothing."""
+"""Choose the laws:
+
+first all at once from zero, then those with a shape, then drop needless ones.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,12 +20,12 @@ from pipeline.words.progress import Progress, silent
 
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
 _FIRST = 25  # iterations of the first fit, from a chain that may be far off
-_FEW = 6  # … and of one that shows whether a rival comes near
+_FEW = 6  # … and of a fit that shows whether a rival comes near
 _SHORT_LIST = 4  # of laws with a shape, refitted
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
-    """Return the model with all laws that need no shape, fitted from nothing.
+    """Return the model with all laws that need no shape, fitted from zero.
 
     It starts from each of the `chains`.
     """
@@ -48,7 +51,7 @@ def choose_laws(
     chains: Sequence[Chain],
     progress: Progress = silent,
 ) -> Follow:
-    """Return the model that following finds: the laws that are left, fitted to free runs."""
+    """Return the model found by following: the remaining laws, fitted to free runs."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
     progress(f"all laws fitted together: {len(lean.laws.groups())} are left")
@@ -69,7 +72,7 @@ def choose_laws(
 
 
 def add_shaped(follow: Follow, records: Records) -> Follow | None:
-    """Return the model with one more law that has a shape, or None where none helps."""
+    """Return the model with one more law that has a shape, or None if no such law helps."""
     best: Follow | None = None
     trials = [one.law for one in shaped_trials(follow, records)[:_SHORT_LIST]]
     for law in (*trials, *backlash_laws(follow, records)):
@@ -79,27 +82,27 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
             best = trial
     if best is None or not is_better(best, follow):
         return None
-    # Behind a contact, whose own law is known to a factor, another would mop up the rest of it.
+    # Behind a contact, known only to a factor, another law would absorb its error.
     if is_rough(follow) and best.total > _half_way(follow):
         return None
     return best
 
 
 def _half_way(follow: Follow) -> float:
-    """Return the cost that leaves half of what is beyond the noise."""
+    """Return the cost at which half of the excess over the noise is left."""
     return follow.points + limits.CONTACT_GAIN * max(follow.total - follow.points, 0.0)
 
 
 def let_go(full: Follow, records: Records) -> Follow:
-    """Drop what is nothing, then loosen the gain to none, dropping again.
+    """Drop needless laws, then lower the gain to zero, dropping again at each step.
 
-    Where a looser model leaves more, something is missing: what it leaves then swings with the
-    carts, and would ask for laws that are not there.
+    If a looser model leaves a larger error, an effect is missing. That error swings with the carts,
+    and would be taken for laws that are not there.
     """
     lean = _one_friction(drop_needless(full, records), records)
     for gain in (0.02, FREE):
         loose = records.fit(lean, gain=gain)
-        # A looser model that leaves half as much again as a closer one lacks something.
+        # A looser model whose error is larger by a half lacks an effect.
         if not loose.chi < 1.5 * max(lean.chi, limits.AT_FLOOR):
             break
         lean = drop_needless(loose, records)
@@ -107,7 +110,7 @@ def let_go(full: Follow, records: Records) -> Follow:
 
 
 def _look_again(lean: Follow, records: Records) -> Follow:
-    """Fit all laws once more, now that a free run shows what adds up; drop what is nothing."""
+    """Fit all laws again, as a free run shows errors that add up; then drop needless ones."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     missing = [key for key in everything.keys if key not in lean.laws.keys]
     extra = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
@@ -118,7 +121,7 @@ def _look_again(lean: Follow, records: Records) -> Follow:
 
 
 def _one_friction(follow: Follow, records: Records) -> Follow:
-    """Leave each cart one law of dry friction where it has two that exclude each other."""
+    """Keep one law of dry friction on each cart where two exclude each other."""
     for place in range(follow.laws.bench.n):
         here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
         sides = [
@@ -134,7 +137,7 @@ def _one_friction(follow: Follow, records: Records) -> Follow:
 
 
 def rivals_of(lean: Follow, records: Records) -> list[Follow]:
-    """Return models with one law exchanged for another, fitted as fully, the best first."""
+    """Return models with one law exchanged for another, fitted equally well, the best first."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     out: list[Follow] = []
     for group in lean.laws.groups():

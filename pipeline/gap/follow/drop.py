@@ -1,4 +1,4 @@
-"""Drop the laws that are nothing, backwards, as far as the criterion does not feel it."""
+"""Drop needless laws one by one, as long as the Bayesian criterion allows."""
 
 import numpy as np
 
@@ -11,15 +11,15 @@ _CONTACTS = {Kind.BACKLASH}
 
 
 def is_rough(follow: Follow) -> bool:
-    """Whether bodies meet in a way that is not fully described."""
+    """Return whether there are contacts that the model does not fully describe."""
     meets = _CONTACTS & {kind for kind, _ in follow.laws.keys}
     return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
 def criterion(follow: Follow, news: float) -> float:
-    """Return the Bayesian criterion of `news` independent readings, each effect's price included.
+    """Return the Bayesian criterion of `news` independent readings, with the cost of each effect.
 
-    Compared are models by the news of the fuller one: only what it leaves counts as chance.
+    Models are compared by the independent residuals of the fuller one: only its residual is chance.
     """
     low, high, _ = follow.laws.bounds()
     size = int(np.sum(low < high))
@@ -31,12 +31,12 @@ def criterion(follow: Follow, news: float) -> float:
 
 
 def is_better(fuller: Follow, other: Follow) -> bool:
-    """Whether the criterion is for the fuller of two models."""
+    """Return whether the criterion prefers the fuller of two models."""
     return criterion(fuller, fuller.news) < criterion(other, fuller.news)
 
 
 def drop_needless(follow: Follow, records: Records) -> Follow:
-    """Drop every law whose loss the criterion does not feel, the least first; refit the rest."""
+    """Drop every law that the criterion does not need, the least needed first; refit the rest."""
     while order := _needless(follow, records):
         here, rough = criterion(follow, follow.news), is_rough(follow)
         while order:
@@ -52,7 +52,7 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
 
 
 def _needless(follow: Follow, records: Records) -> list[int]:
-    """Return the groups that may go, in order, judged by the quadratic form about the fit."""
+    """Return the groups that may be dropped, in order, by the quadratic form at the fit."""
     slope = records.slope(follow, factors=False)
     if not slope.sound:
         return []
@@ -60,7 +60,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
     off = follow.p - follow.laws.neutral()
     low, high, _ = follow.laws.bounds()
     power = np.maximum(np.diag(slope.H), 0.0)
-    # A parameter weaker than this share of the strongest one's power is not shown.
+    # A parameter below this share of the strongest one's power is undetermined.
     usable = (power > 1e-20 * power.max()) & (low < high)
     order = [g for g, at in groups.items() if not np.any(np.abs(off[at]) > 0.0)]
     for g in order:
@@ -84,7 +84,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.SAME_LAW + len(follow.laws.whole_group(g)) * np.log(count)
             if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
-                # Without it, twice of what is now beyond the noise would be left, at least.
+                # Without it, at least twice the present excess over the noise would be left.
                 beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)
                 price = max(price, count * float(np.log1p(beyond / cost)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price

@@ -1,4 +1,4 @@
-"""Fit all parameters at once to the errors of a model that follows, by Levenberg-Marquardt."""
+"""Fit all parameters at once to the errors of a following model, by Levenberg-Marquardt."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -13,15 +13,15 @@ from pipeline.gap.follow.laws import COLUMNS, Column, LawSet, TrialLaw, column_s
 from pipeline.gap.follow.track import Own, Track, errors_of
 
 _DAMP, _CHANGE, _LEAST_DAMP = 1e-4, 8.0, 1e-9
-_RIDGE = 1e-12  # of the diagonal of what a run alone has
+_RIDGE = 1e-12  # of the diagonal of a run's own block
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Follow:
-    """A model that follows: its laws and vector, every run's own parameters, what it leaves.
+    """A following model: its laws and vector, every run's own parameters, and its errors.
 
-    `cost` is the sum of squared errors over their noise; `points` how many they are, `news` how
-    many of them are independent.
+    `cost` is the sum of squared errors over their noise; `points` is their number, `news` the
+    number of independent ones.
     """
 
     laws: LawSet
@@ -35,25 +35,25 @@ class Follow:
 
     @property
     def chi(self) -> float:
-        """Squared error per reading, in noises."""
+        """Mean squared error per reading, in units of the noise."""
         return self.cost / self.points
 
     @property
     def inflate(self) -> float:
-        """By how much the misfit of a model that is still wrong widens the noise."""
+        """Factor by which the misfit of a model that is still wrong widens the noise."""
         return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
 
     @property
     def total(self) -> float:
-        """With the priors."""
+        """Cost with the priors."""
         return self.cost + self.inflate**2 * self.prior
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slope:
-    """The normal equations of a step: H and b of the vector, each run's own eliminated.
+    """The normal equations of a step: H and b of the vector, the runs' own parameters eliminated.
 
-    `back` leads from a step of the vector to those of the runs' own.
+    `back` computes the steps of the runs' own parameters from a step of the vector.
     """
 
     H: Array
@@ -62,20 +62,20 @@ class Slope:
 
     @property
     def sound(self) -> bool:
-        """Whether the model runs away nowhere."""
+        """Whether the model diverges nowhere."""
         return bool(np.all(np.isfinite(self.H)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Records:
-    """What models follow: the runs, who maps over them, and the columns that laws may fill."""
+    """The data of following models: the runs, their mapper, and the columns that laws may fill."""
 
     tracks: tuple[Track, ...]
     mapper: Mapper
     columns: frozenset[Column]
 
     def allows(self, law: TrialLaw) -> bool:
-        """Whether the catalogue has an effect that fills the columns of a law."""
+        """Return whether the catalogue has an effect that fills the columns of a law."""
         return column_set(COLUMNS[law.kind]) <= self.columns
 
     def begin(self, laws: LawSet, p: Array, *, gain: float) -> Follow:
@@ -84,7 +84,7 @@ class Records:
         return self.weigh(Follow(laws=laws, p=p, own=own, gain=gain, cost=np.inf, points=1.0))
 
     def weigh(self, follow: Follow) -> Follow:
-        """Return it with its cost: infinite where the model runs away."""
+        """Return it with its cost, which is infinite if the model diverges."""
         laws, dry = follow.laws, follow.laws.dry
         on_springs = any(laws.bench.springs)
 
@@ -102,19 +102,19 @@ class Records:
         costs = np.array(list(self.mapper(one, zip(self.tracks, follow.own, strict=True))))
         points = sum(track.points for track in self.tracks)
         cost, prior, news = costs.sum(axis=0).tolist()
-        # Four readings of a track tell as much as one independent, or more.
+        # Four readings of a track count as one independent reading, or more.
         news = min(news, points / 4.0)
         return replace(follow, cost=cost, points=points, prior=prior, news=news)
 
     def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
-        """Return the normal equations; without `factors` dry friction is alike in all runs."""
+        """Return the normal equations; without `factors` dry friction is equal in all runs."""
         laws, size, inflate = follow.laws, follow.p.size, follow.inflate
         dry = laws.dry & factors
 
         def one(pair: tuple[Track, Own]) -> tuple[Array, Array, Array]:
             track, own = pair
             run = errors_of(laws, follow.p, track, own, gain=follow.gain, derive=True)
-            # A slope that is next to infinite has no square.
+            # A nearly infinite slope has no finite square.
             if run is None or not np.all(np.abs(run[1]) < 1e100):
                 nothing = np.full((size, size), np.nan)
                 return nothing, nothing[0], nothing
@@ -135,11 +135,11 @@ class Records:
         return Slope(H=np.sum(H, axis=0), b=np.sum(b, axis=0), back=back)
 
     def refit(self, follow: Follow, laws: LawSet, p: Array, **options: Any) -> Follow:
-        """Fit a model with other laws, the runs' own parameters as they are."""
+        """Refit a model with other laws, keeping the runs' own parameters."""
         return self.fit(replace(follow, laws=laws, p=p), **options)
 
     def fit(self, start: Follow, *, gain: float | None = None, iterations: int = 12) -> Follow:
-        """Fit from a start, at a gain of its own or another."""
+        """Fit from a start, at its own gain or another."""
         best = self.weigh(start if gain is None else replace(start, gain=gain))
         bounds = best.laws.steps_of_shape(best.p)
         damp = _DAMP
@@ -170,7 +170,7 @@ class Records:
 
 
 def _step(slope: Slope, p: Array, bounds: tuple[Array, Array, Array], *, damp: float) -> Array:
-    """Return the damped step inside bounds and reach."""
+    """Return the damped step within bounds and step limits."""
     low, high, _ = bounds
     power = np.maximum(np.diag(slope.H), 0.0)
 

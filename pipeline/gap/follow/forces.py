@@ -1,4 +1,4 @@
-"""The forces of the laws that a following model has, and what they are by each parameter."""
+"""The forces of the laws of a following model, and their derivatives by each parameter."""
 
 from math import exp
 from typing import NamedTuple
@@ -19,15 +19,16 @@ from pipeline.plant.nonlinear.simulator.terms import (
 )
 
 DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
-OWN = 2  # numbers of a law's own state, its friction's or a body's; behind them its terms
+OWN = 2  # size of a law's own state, that of its friction or of a body; its terms follow
 ROOM = OWN + TERMS
 
 
 class ActingLaws(NamedTuple):
-    """Which laws act, of which kind, where, and with which parameters.
+    """The laws that act: their kinds, places and parameters.
 
-    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters, those of
-    each law from `first` (laws,) on. `play` is the law of a play between motor and cart 1, or -1.
+    `p` holds masses, dampings, springs (n + 1), the drive (4) and the laws' parameters; those of
+    each law begin at `first` (laws,). `play` is the index of the law of a play between motor and
+    cart 1, or -1.
     """
 
     p: Array
@@ -38,13 +39,13 @@ class ActingLaws(NamedTuple):
 
 
 class FollowedRun(NamedTuple):
-    """One run that a model follows, n carts.
+    """One run of n carts that a model follows.
 
-    `t` (samples,), `y` (samples, n) are its readings; `seen` and `free` (n,) which carts are
-    compared and which move; `guided` (samples, n) is how held carts move. `held` (3, 2, knots) is
-    the shaped input and its derivatives by dead zone and limit, with their integrals. `zero` and
-    `factor` (n,) are the encoders' zeros and the factors on dry friction of this run. `gain` is the
-    share of the error that corrects the state, `longest` a step, s.
+    `t` (samples,), `y` (samples, n) are its readings. `seen` and `free` (n,) mark compared and
+    moving carts. `guided` (samples, n) is the motion of held carts. `held` (3, 2, knots) is the
+    shaped input and its derivatives by dead zone and limit, with their integrals. `zero` and
+    `factor` (n,) are this run's encoder zeros and factors on dry friction. `gain` is the share of
+    the error that corrects the state, `longest` the longest step, s.
     """
 
     t: Array
@@ -64,9 +65,9 @@ class FollowedRun(NamedTuple):
 class FollowedState(NamedTuple):
     """Positions and velocities (n,), the laws' own states and terms `aux` (laws, ROOM).
 
-    And their derivatives by every lane: `DX`, `DV` (n, lanes), `DA` (2 laws, lanes); no lanes where
-    none are wanted. The lanes are the parameters `p`, then those of the run: zeros, starts,
-    velocities, factors on dry friction (n each).
+    Also their derivatives by every lane: `DX`, `DV` (n, lanes), `DA` (2 laws, lanes); without
+    derivatives there are no lanes. The lanes are the parameters `p`, then those of the run: zeros,
+    starts, velocities, factors on dry friction (n each).
     """
 
     x: Array
@@ -78,11 +79,11 @@ class FollowedState(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Room to work in during one step.
+    """Work arrays of one step.
 
-    Positions `xm` in its middle, forces `f`, sliding friction `R` (n,); slopes of the forces by x
-    and v, `K` and `C` (n, n). `du` (4,) are the derivatives of the input by the drive's parameters,
-    `dlag` (4,) of what a lag leaves. `DF`, `DR` (n, lanes): forces and friction by every lane.
+    Positions `xm` at mid-step, forces `f`, sliding friction `R` (n,); slopes of the forces by x and
+    v, `K` and `C` (n, n). `du` (4,) are the derivatives of the input by the drive's parameters,
+    `dlag` (4,) those of the lag's state. `DF`, `DR` (n, lanes): forces and friction by every lane.
     """
 
     xm: Array
@@ -97,7 +98,7 @@ class Room(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step of `h` s: the input that arrives, and whether the drive is powered (1) or not."""
+    """One step of `h` s: the arriving input, and whether the drive is powered (1) or not."""
 
     u: float
     on: float
@@ -124,13 +125,13 @@ def pull_lane(DF, lane, j, n, value):
 
 @inlined
 def reach(x, j, n):
-    """Return by how much spring j of n carts is stretched."""
+    """Return the stretch of spring j of n carts."""
     return (x[j] if j < n else 0.0) - (x[j - 1] if j > 0 else 0.0)
 
 
 @inlined
 def add_forces(laws, run, state, work, step):
-    """Add the laws' forces in the middle of a step, and their slopes by x and v."""
+    """Add the laws' forces at mid-step, and their slopes by x and v."""
     p, factor, aux, v, xm, h = laws.p, run.factor, state.aux, state.v, work.xm, step.h
     n, f, K, C = v.size, work.f, work.K, work.C
     for law in range(laws.kinds.size):
@@ -163,9 +164,9 @@ def add_forces(laws, run, state, work, step):
 
 @inlined
 def add_slopes(laws, run, state, work, h, crossing):
-    """Fill DF and DR: forces and friction by every lane, through the state or not.
+    """Fill DF and DR: forces and friction by every lane, directly and through the state.
 
-    The input's parameters act but where a play is crossed.
+    The input's parameters act unless a play is being crossed.
     """
     p, factor, aux, v, xm = laws.p, run.factor, state.aux, state.v, work.xm
     DX, DV, DA, DF, DR = state.DX, state.DV, state.DA, work.DF, work.DR
@@ -241,7 +242,7 @@ def add_slopes(laws, run, state, work, h, crossing):
 
 @inlined
 def settle_friction(laws, state, h):
-    """Let the states of presliding friction move on by a step of h s, at its last velocities."""
+    """Advance the states of presliding friction by a step of h s, at its last velocities."""
     p, aux, DV, DA, L = laws.p, state.aux, state.DV, state.DA, laws.kinds.size
     for law in range(L):
         kind, at, o, out = laws.kinds[law], laws.places[law], laws.first[law], aux[law, OWN:]

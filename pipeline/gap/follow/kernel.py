@@ -4,12 +4,12 @@ At every sample the simulated state is corrected by a share `gain` of the error,
 
     e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt,
 
-and then moves on freely to the next. A model that follows is never far from the data, so the
-errors have one valley where a free run has many; with `gain` 0 it is the free run. Derivatives by
-all parameters are carried beside the state: those of the numerical map itself.
+and then moves on freely to the next. A following model is never far from the data, so the errors
+have one valley where a free run has many; with `gain` 0 it is the free run. Derivatives by all
+parameters are integrated with the state: they are exact for the numerical map.
 
-Steps are those of the leapfrog; dry friction is set-valued, and a cart that turns inside a step
-turns at the instant at which it does.
+Steps are those of the leapfrog. Dry friction is set-valued, and a cart that turns inside a step
+turns at that instant.
 
 References: H. Abarbanel, D. Creveling, R. Farsian, M. Kostuk, SIAM J. Applied Dynamical Systems 8
 (2009) 1341-1381; L. Ljung, System Identification, 2nd ed., chapter 7 (fixed-gain predictors).
@@ -29,15 +29,15 @@ from pipeline.gap.follow.forces import (
 from pipeline.plant.nonlinear.simulator.state import jit, tie
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_LEAST_SHARE = 0.02  # of cart 1's mass: what is left of it without the motor's
+_LEAST_SHARE = 0.02  # of cart 1's mass: the least that is left of it without the motor's
 _BLOWN_UP = 1e6  # times the record's span
 
 
 @jit
 def follow_run(laws, run, state, work, E, J):
-    """Fill the errors E (samples, n) and, of its lanes, J (lanes, samples, n); False: diverged.
+    """Fill the errors E (samples, n) and the lanes of J (lanes, samples, n); False: it diverged.
 
-    The state is where the run starts, and is used up.
+    The state is the start of the run, and is overwritten.
     """
     p, kinds, places, first, play = laws.p, laws.kinds, laws.places, laws.first, laws.play
     t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
@@ -52,7 +52,7 @@ def follow_run(laws, run, state, work, E, J):
     lagged = held[0, 0, 0]
     position = 0
     on = 0
-    # A play: the motor is a body of its own while it crosses it; touching, it is one with cart 1.
+    # A play: the motor is a separate body while it crosses; in contact it is one with cart 1.
     side_of = 0.0
     gap = p[first[play]] if play >= 0 else 0.0
     motor = p[first[play] + 1] if play >= 0 else 0.0
@@ -77,7 +77,7 @@ def follow_run(laws, run, state, work, E, J):
                 if lane_gain >= 0:
                     J[lane_gain, sample, i] += x[i]
             if gain > 0.0:
-                # Whoever is a little off may rest where dry friction holds it: no jolt then.
+                # A cart slightly off may be held there by dry friction, so it gets no jolt.
                 x[i] += gain * e
                 # A little over critical.
                 kick = 0.3 * gain * gain / step
@@ -87,7 +87,7 @@ def follow_run(laws, run, state, work, E, J):
                         DX[i, q] -= gain * J[q, sample, i]
                         DV[i, q] -= kick * J[q, sample, i]
                 if i == 0 and play >= 0:
-                    # The motor with it: a cart corrected alone would knock on it.
+                    # The motor with it: a correction of the cart alone would cause impacts.
                     aux[play, 0] += gain * e
                     aux[play, 1] += kick * e
                     if derive:

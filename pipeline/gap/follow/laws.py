@@ -1,4 +1,4 @@
-"""Which laws a following model has, and its parameters as one vector in physical units."""
+"""The laws of a following model, and its parameters as one vector in physical units."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,22 +15,22 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw
 from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS, Kind
 from pipeline.plant.nonlinear.tables import TABLES, Drive
 
-_CHAIN = (0.005, 20.0)  # times the largest first estimate: how far masses and springs may go
+_CHAIN = (0.005, 20.0)  # times the largest first estimate: limit for masses and springs
 _REACH = 0.3  # of a mass or spring, in one step, …
-_SMALL = 0.1  # … or of this share of the largest, from which on a first estimate is believed
+_SMALL = 0.1  # … or of this share of the largest, above which a first estimate is trusted
 _DELAY = (-0.05, 0.1)  # s
-_SHORT = 0.01  # s: how far a delay or lag may go in one step
-# By kind, the order of the catalogue: in which coordinates each grows from nothing.
+_SHORT = 0.01  # s: the largest step of a delay or lag
+# For each kind, in the order of the catalogue: the coordinates in which it grows from zero.
 GROWTHS = tuple(effect.grown for effect in CATALOGUE)
 SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
 POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
 DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
 SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # with a position whose sign is the side
-# The columns of the simulator's tables that the laws fill.
+# The columns that the laws fill in the simulator's tables.
 COLUMNS = tuple(
     tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
 )
-# The laws that need no shape: they can start from nothing.
+# The laws that need no shape can start from zero.
 PLAIN = tuple(
     kind
     for kind, effect in enumerate(CATALOGUE)
@@ -66,20 +66,20 @@ class TrialLaw:
 
     @property
     def sided(self) -> tuple[int, int, float]:
-        """Kind, place and, where it has one, side."""
+        """Kind, place and side, if it has one."""
         return self.kind, self.place, float(np.sign(self.values[1]) if self.kind in SIDED else 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FollowedBench:
-    """What bounds the laws on one bench.
+    """Limits of the laws on one bench.
 
     Attributes
     ----------
-    chain : the first estimate; springs (n + 1,) which there are.
-    largest : of the input, 0 where there is none.
+    chain : the first estimate; springs (n + 1,): the springs present.
+    largest : of the input, 0 without one.
     free : which carts move, by run.
-    pinned : the mass that sets the scale where no input does.
+    pinned : the mass that sets the scale if no input does.
     """
 
     chain: Chain
@@ -90,12 +90,12 @@ class FollowedBench:
 
     @cached_property
     def shown(self) -> tuple[bool, ...]:
-        """(n,) which carts move in any run."""
+        """(n,) The carts that move in some run."""
         return tuple(any(moves) for moves in zip(*self.free, strict=True))
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
-        """The springs that any run shows; of those that always stretch alike, one."""
+        """The springs stretched in some run; of springs with equal stretch, one."""
         shown: dict[tuple, int] = {}
         for j in (j for j, there in enumerate(self.springs) if there):
             ends = [i for i in (j - 1, j) if 0 <= i < self.n]
@@ -112,9 +112,10 @@ class FollowedBench:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LawSet:
-    """Which laws act: the shape of the vector `p`.
+    """The laws that act, which define the shape of the vector `p`.
 
-    It holds masses, dampings, springs (n + 1), the four values of the drive, then each law's.
+    The vector holds masses, dampings, springs (n + 1), the four values of the drive, then each
+    law's parameters.
     """
 
     bench: FollowedBench
@@ -123,28 +124,28 @@ class LawSet:
 
     @cached_property
     def kinds(self) -> np.ndarray:
-        """(laws,) the kind of each."""
+        """(laws,) Kinds."""
         return np.array([kind for kind, _ in self.keys], dtype=np.int64)
 
     @cached_property
     def places(self) -> np.ndarray:
-        """(laws,) the cart or spring of each, from 0."""
+        """(laws,) Carts or springs, from 0."""
         return np.array([place for _, place in self.keys], dtype=np.int64)
 
     @cached_property
     def base(self) -> int:
-        """Parameters of chain and drive."""
+        """Number of parameters of chain and drive."""
         return 3 * self.bench.n + 1 + forces.DRIVE
 
     @cached_property
     def first(self) -> np.ndarray:
-        """(laws,) where the parameters of each begin."""
+        """(laws,) First parameter of each law."""
         sizes = [SIZES[kind] for kind, _ in self.keys]
         return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
 
     @cached_property
     def size(self) -> int:
-        """How long the vector is."""
+        """Length of the vector."""
         return self.base + sum(SIZES[kind] for kind, _ in self.keys)
 
     @cached_property
@@ -155,7 +156,7 @@ class LawSet:
 
     @property
     def drive_at(self) -> int:
-        """Where the values of the drive begin."""
+        """Index of the drive's first value."""
         return 3 * self.bench.n + 1
 
     def neutral_drive(self) -> Array:
@@ -163,7 +164,7 @@ class LawSet:
         return np.array([0.0, self.bench.largest, 0.0, 0.0])
 
     def start(self, chain: Chain) -> Array:
-        """Return the vector of a chain without any law, no mass or spring next to nothing."""
+        """Return the vector of a chain without laws, with no mass or spring near zero."""
         p = np.zeros(self.size)
         n = self.bench.n
         p[:n] = np.maximum(chain.m, _SMALL * chain.m.max())
@@ -207,14 +208,14 @@ class LawSet:
             if kind in POSITIVE:
                 low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
             if kind == Kind.SLACK_SPRING:
-                # A spring that goes slack keeps a twentieth.
+                # A slack spring keeps a twentieth of its stiffness.
                 low[o] = -0.95 * max(chain.k[place], _SMALL * chain.k.max())
             elif kind == Kind.SENSOR_GAIN:
                 low[o], high[o] = -0.5, 0.5
         return low, high, reach
 
     def steps_of_shape(self, p: Array) -> tuple[Array, Array, Array]:
-        """Return bounds and steps with the shapes of the laws kept near where they are."""
+        """Return bounds and steps that keep the shapes of the laws near their values."""
         low, high, reach = self.bounds()
         for (kind, _), o in zip(self.keys, self.first, strict=True):
             for q in range(SIZES[kind]):
@@ -234,7 +235,10 @@ class LawSet:
         return laws, np.concatenate([p, *(law.values for law in extra)])
 
     def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
-        """Return the laws and vector without some groups: laws by index, drive from -1 to -4."""
+        """Return the laws and vector without some groups:
+
+        laws by index, the drive's as -1 to -4.
+        """
         kept = [i for i in range(len(self.keys)) if i not in groups]
         drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
         laws = LawSet(bench=self.bench, keys=tuple(self.keys[i] for i in kept), drive=drive)
@@ -246,7 +250,7 @@ class LawSet:
         return laws, np.concatenate([base, *parts])
 
     def groups(self) -> dict[int, np.ndarray]:
-        """Return what may be dropped: by its number the indices of its coefficients."""
+        """Return the groups that may be dropped: by number, the indices of their coefficients."""
         out = {-1 - q: np.array([self.drive_at + q]) for q, free in enumerate(self.drive) if free}
         for i, ((kind, _), o) in enumerate(zip(self.keys, self.first, strict=True)):
             out[i] = np.array([o + q for q in COEFFICIENTS[kind]])
@@ -276,7 +280,10 @@ class LawSet:
         return {s: 0.0 if there is None else float(p[there + q]) for q, s in enumerate(symbols)}
 
     def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
-        """Return what the laws fill of the simulator's tables: by table and row (0 for a drive)."""
+        """Return the values of the laws in the simulator's tables:
+
+        by table and row (0 for a drive).
+        """
         n = self.bench.n
         out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}
         for q, column in enumerate(DRIVE_COLUMNS):
@@ -297,9 +304,10 @@ class LawSet:
         return out
 
     def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
-        """Return stiffness and damping of a contact from which bodies part as they should.
+        """Return stiffness and damping of a contact at which bodies part as they should.
 
-        What follows is rigid; a bench is not quite. W. Goldsmith, Impact (1960), chapter 4.
+        The follower's contact is rigid; a real one is not quite. W. Goldsmith, Impact (1960),
+        chapter 4.
         """
         firm = 40.0 * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
         fall = -float(np.log(np.clip(bounce, 0.02, 0.9)))
@@ -308,14 +316,14 @@ class LawSet:
 
 
 def smooth_laws(bench: FollowedBench, *, columns: frozenset[Column]) -> LawSet:
-    """Return every law that needs no shape, at every place: all to start from nothing.
+    """Return every law that needs no shape, at every place, as the start of a fit.
 
-    `columns` are those that effects may fill.
+    `columns` are those that the effects of the catalogue may fill.
     """
     n, driven = bench.n, bench.largest > 0.0
 
     def here(place: str) -> list[int]:
-        """Return the kinds of a place that the runs may show."""
+        """Return the kinds of law that the runs may show at a place."""
         return [
             kind
             for kind in PLAIN

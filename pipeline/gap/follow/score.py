@@ -1,7 +1,7 @@
-"""Score laws that need a shape: how much each would lower the cost beside all that is fitted.
+"""Score laws that need a shape: how much each would lower the cost of the fitted model.
 
-A law without effect moves nothing, yet what it would move to first order is known from the same
-derivatives; beside the other parameters the best multiple of it is a small linear problem.
+A law of size zero moves nothing, but the same derivatives give its first-order effect. Beside the
+other parameters its best size is a small linear problem.
 
 Reference: T. Söderström, P. Stoica, System Identification, section 11.5 (score tests).
 """
@@ -19,7 +19,7 @@ from pipeline.plant.nonlinear.simulator.terms import Kind
 
 @dataclass(frozen=True, kw_only=True)
 class Scored:
-    """A law with the values the data ask for, and by how much it would lower the cost."""
+    """A law with the best values for the data, and the cost it would save."""
 
     law: TrialLaw
     drop: float
@@ -36,7 +36,7 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
     power = np.maximum(np.diag(slope.H), 0.0)
     base = np.arange(follow.p.size)
     at_bound = (follow.p <= low) | (follow.p >= high)
-    # A parameter weaker than this share of the strongest one's power is not shown.
+    # A parameter below this share of the strongest one's power is undetermined.
     base = base[(power[base] > 1e-20 * power.max()) & (low < high) & ~at_bound]
     size = np.sqrt(power[base])
     A = slope.H[np.ix_(base, base)] / np.outer(size, size) + 1e-10 * np.eye(base.size)
@@ -52,11 +52,11 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
         taken = np.linalg.solve(A, np.column_stack([across, slope.b[base] / size]))
         S = slope.H[np.ix_(mine, mine)] - across.T @ taken[:, :-1]
         b = slope.b[mine] - across.T @ taken[:, -1]
-        # The other parameters must leave that much of a law's power.
+        # The other parameters must leave this share of a law's power.
         S = S + 1e-9 * np.diag(np.diag(slope.H)[mine])
         found = np.linalg.solve(S, b)
         if law.kind in POSITIVE and np.any(found < 0.0):
-            # The second, the damping of a contact, may be nothing.
+            # The second value, the damping of a contact, may be zero.
             found = np.array([b[0] / S[0, 0], *np.zeros(mine.size - 1)])
             if found[0] <= 0.0:
                 continue
@@ -69,7 +69,7 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
 
 
 def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return laws that need a shape, without effect: close enough for a fit to find its way."""
+    """Return laws that need a shape, with size zero, close enough for a fit to converge."""
     bench = follow.laws.bench
     n = bench.n
     chain = follow.laws.chain(follow.p)
@@ -90,7 +90,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
         if reach <= 0.0:
             continue
         omega = np.sqrt(max(diagonal[i], 1e-12) / chain.m[i])
-        # Of a frequency of its own; a hidden mass rings off by 3 % of critical.
+        # With a frequency of its own; a hidden mass decays with 3 % of critical damping.
         rates = [part * omega for part in (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3)]
         stops = _to_both_sides(position[:, i], (0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.93, 0.97))
         shapes |= {
@@ -113,26 +113,26 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
 
 
 def _to_both_sides(most: Array, parts: Sequence[float]) -> list[float]:
-    """Return shares of the largest positions of either sign; none of a side hardly reached."""
+    """Return shares of the largest positions of either sign; a side hardly reached gets none."""
     sides = [(side, most[k]) for k, side in enumerate((1.0, -1.0)) if most[k] > 0.1 * most.max()]
     return [side * part * size for side, size in sides for part in parts]
 
 
 def cogging_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return cogging at trial pitches, close enough for its phase over the whole travel."""
+    """Return cogging at trial pitches, spaced so that its phase fits over the whole travel."""
     span = 0.0
     for track, own in zip(records.tracks, follow.own, strict=True):
         if track.free[0]:
             span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
     if span == 0.0 or (Kind.COGGING, 0) in follow.laws.keys:
         return []
-    # So many pitches of a motor are in the travel, by less than half a one.
+    # The number of motor pitches in the travel changes by less than one half.
     counts = np.arange(1.5, 25.0, 0.4).tolist()
     return [TrialLaw(kind=Kind.COGGING, place=0, values=(0.0, 0.0, span / n)) for n in counts]
 
 
 def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return a play between motor and cart 1, which no trial from nothing can show."""
+    """Return trial plays between motor and cart 1, which no fit from zero can find."""
     spans = [
         float(np.ptp(track.y[:, 0]))
         for track in records.tracks
@@ -140,16 +140,16 @@ def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
     ]
     if not spans or (Kind.BACKLASH, 0) in follow.laws.keys:
         return []
-    # Of the travel, of cart 1's mass, of the speed.
+    # In units of the travel, of cart 1's mass, of the speed.
     values = 0.03 * max(spans), 0.15 * float(follow.p[0]), 0.4
     law = TrialLaw(kind=Kind.BACKLASH, place=0, values=values)
     return [law] if records.allows(law) else []
 
 
 def shaped_trials(follow: Follow, records: Records) -> list[Scored]:
-    """Return the laws with a shape that would help beside those of the model, the best first.
+    """Return the laws with a shape that would help the model, the best first.
 
-    Of each law at each place and side the best shape.
+    For each law at each place and side, the best shape.
     """
     trials = score(follow, records, shaped_laws(follow, records))
     moving = [i for i, t in enumerate(records.tracks) if t.free[0] and np.any(t.command)]

@@ -1,4 +1,4 @@
-"""One run as a following model sees it: its readings thinned, its own parameters, its errors."""
+"""One run as a following model sees it: thinned readings, its own parameters, its errors."""
 
 from dataclasses import dataclass, replace
 
@@ -12,15 +12,15 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
 _LONGEST = 2.5e-3  # s, of a step, at the usual pace …
-_FREELY = 0.4  # … times this where the model runs on, and the errors of the steps add up
-_KNOCK = 0.25  # … or this where bodies meet in between
-_SURE = 1e6  # weight of what is known
+_FREELY = 0.4  # … times this in a free run, whose step errors add up
+_KNOCK = 0.25  # … or this if bodies meet in between
+_SURE = 1e6  # weight of known quantities
 _FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Own:
-    """What belongs to one run: (n,) zeros, shifts of the start, start velocities, factors."""
+    """The parameters of one run: (n,) zeros, shifts of the start, start velocities, factors."""
 
     zero: Array
     shift: Array
@@ -30,7 +30,7 @@ class Own:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """One run, thinned: y, weight over noise, and `guided` motion of held carts (samples, n)."""
+    """One thinned run: y, weight over noise, and `guided` motion of held carts (samples, n)."""
 
     t: Array
     y: Array
@@ -51,12 +51,12 @@ class Track:
 
     @property
     def points(self) -> float:
-        """How many readings there are, each by its weight."""
+        """The number of readings, each counted by its weight."""
         largest = np.maximum(self.weight.max(axis=0), 1e-300)
         return float(((self.weight / largest) ** 2).sum())
 
     def fresh(self) -> Own:
-        """Return the run's own parameters where they are expected."""
+        """Return the run's own parameters at their expected values."""
         n = self.free.size
         return Own(
             zero=self.zero.copy(), shift=np.zeros(n), v0=self.slope.copy(), factor=np.ones(n)
@@ -69,10 +69,10 @@ class Track:
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))
         speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
         start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
-        factor = np.where(dry, 1.0 / 0.05, _SURE)  # dry friction differs by 5 % from run to run
+        factor = np.where(dry, 1.0 / 0.05, _SURE)  # dry friction differs by 5 % between runs
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
-        # An unknown velocity needs some hold, or a run that is followed closely has none.
+        # An unknown velocity needs a weak prior, as a closely followed run does not determine it.
         weight[2 * n : 3 * n] = np.maximum(weight[2 * n : 3 * n], 1e-3 / max(self.swing, 1e-12))
         return weight, weight * np.concatenate(off)
 
@@ -89,10 +89,10 @@ class Track:
 
 
 def make_track(run: GapRun) -> Track:
-    """Thin a run to what a swing needs."""
+    """Thin a run to the rate that a swing needs."""
     n = run.zero.size
     sampled = 1.0 / float(np.median(np.diff(run.t)))
-    # 100 Hz, at the usual pace: some twenty readings in a swing.
+    # 100 Hz, at the usual pace: some twenty readings a swing.
     thin = replace(run, block=max(1, int(sampled * run.pace / 100.0))).thin
     y, weight = np.zeros((thin.t.size, n)), np.zeros((thin.t.size, n))
     seen, free = np.zeros(n, dtype=np.bool_), np.array(run.free)
@@ -124,7 +124,7 @@ def errors_of(
 ) -> tuple[Array, Array] | None:
     """Return errors (samples, n) and derivatives of the model's readings (lanes, samples, n).
 
-    None where the model runs away. Lanes: the vector, then zeros, shifts, velocities, factors.
+    None if the model diverges. Lanes: the vector, then zeros, shifts, velocities, factors.
     """
     n, count = laws.bench.n, len(laws.keys)
     lanes = p.size + 4 * n if derive else 0
@@ -139,7 +139,7 @@ def errors_of(
             aux[law, : forces.OWN] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     play = max(np.flatnonzero(laws.kinds == Kind.BACKLASH), default=-1)
-    # At such a gain nothing adds up.
+    # At such a gain step errors do not add up.
     longest = track.longest * (1.0 if gain > 0.05 else _FREELY)
     if play >= 0:
         longest = min(longest, _KNOCK * track.longest)
@@ -165,7 +165,7 @@ def errors_of(
 
 
 def _shaped(track: Track, dead: float, limit: float) -> Array:
-    """Return (3, 2, knots): the input behind dead zone and limit, its derivatives by them, each …
+    """Return (3, 2, knots): the input behind dead zone and limit, its derivatives by both, each …
 
     … with its integral.
     """
@@ -181,7 +181,10 @@ def _shaped(track: Track, dead: float, limit: float) -> Array:
 
 
 def compile_follower() -> None:
-    """Follow a record of two readings once, so that it is compiled: seconds, where nobody has."""
+    """Follow a record of two readings, so that the code is compiled:
+
+    seconds, unless it is stored.
+    """
     one, two = np.ones(1), np.array([0.0, 0.01])
     track = Track(
         t=two, y=np.zeros((2, 1)), weight=np.ones((2, 1)), free=one > 0.0, seen=one > 0.0,

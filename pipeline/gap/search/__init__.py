@@ -1,1 +1,1 @@
-"""What following finds, as effects of the catalogue, fitted to whole runs and judged."""
+"""The laws found by following, as effects of the catalogue, fitted to whole runs and judged."""

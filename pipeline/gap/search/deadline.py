@@ -1,4 +1,4 @@
-"""The time a search may take: past it, the best answer so far."""
+"""The time limit of a search: when it is over, the best answer so far is used."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -8,17 +8,17 @@ from pipeline.gap.fit.levenberg_marquardt import Mapper
 
 
 class OutOfTime(Exception):
-    """The time allowed is over; whoever searches keeps what it has found."""
+    """The time limit is over; the caller keeps its best result."""
 
 
 class Deadline:
-    """Maps work over runs until the time is over; all that takes long goes through here.
+    """Maps work over runs until the time is over; all slow work goes through here.
 
-    `cut` tells whether anything was refused: whether the answer depends on the machine.
+    `cut` says whether any work was refused, so that the answer depends on the machine.
     """
 
     def __init__(self, mapper: Mapper, *, seconds: float | None) -> None:
-        """Start the clock; None waits for ever."""
+        """Start the clock; None means no limit."""
         self.cut = False
         self._mapper = mapper
         self._end = None if seconds is None else time.monotonic() + seconds

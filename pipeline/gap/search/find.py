@@ -1,9 +1,9 @@
 """Search the catalogue: laws chosen while the model follows, then fitted to free runs, judged.
 
-Nothing is tried one by one: all laws at all places are fitted together from nothing to a model
-that follows the measurement, and those that are nothing are dropped (`gap.follow`). What is left
-is fitted to whole runs, each effect must be worth it on runs the fit has not seen, and rivals
-come from the same fit with one law exchanged.
+Nothing is tried one by one. All laws at all places are fitted together, from zero, to a model that
+follows the measurement, and needless ones are dropped (`gap.follow`). The rest is fitted to whole
+runs. Each effect must pay on runs that the fit has not seen. Rivals come from the same fit with one
+law exchanged.
 """
 
 from contextlib import suppress
@@ -23,9 +23,9 @@ from pipeline.gap.search.whole import fit_whole
 
 
 def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
-    """Return the hypothesis chosen and all that were judged, the baseline first.
+    """Return the chosen hypothesis and all that were judged, the baseline first.
 
-    Past the time allowed, the best of those so far.
+    After the time limit, the best of those so far.
     """
     found = [baseline]
     with suppress(OutOfTime):
@@ -46,7 +46,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         for rival in rivals_of(lean, records):
             found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]
-        # What ends at a bound is often nothing: it goes, and what remains is sound.
+        # An effect at a bound is often no effect: it is removed, and a sound rest is kept.
         chosen = prune(min(found, key=lambda h: h.bic_of_all), study, found)
         sound = [h for h in found if h.sound and np.isfinite(h.error)]
         if not chosen.sound:
@@ -59,9 +59,9 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
 
 
 def _as_model(follow: Follow, study: Study, records: Records) -> GapModel:
-    """Return what a following model says, in effects of the catalogue."""
+    """Return the laws of a following model as effects of the catalogue."""
     if not any(study.springs):
-        # On no spring errors add up: what a model lacks misleads a fit that is free at once.
+        # Without springs errors add up: a missing effect misleads a fit that starts free.
         for gain in (0.02, 0.01, 0.005, 0.002, 0.0):
             follow = records.fit(follow, gain=gain) if gain < follow.gain else follow
     return as_model(follow, springs=study.springs, catalogue=study.catalogue, runs=study.training)

@@ -1,4 +1,4 @@
-"""A hypothesis: effects at places, fitted, and judged on runs the fit has not seen."""
+"""A hypothesis: effects at places, fitted, and judged on runs that the fit has not seen."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -22,10 +22,10 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A model with its fit on training runs and what it leaves on held-out ones.
+    """A model with its fit on training runs and its error on held-out ones.
 
-    `at_floor`: nothing is left but noise, on training and on held-out runs. `news` and
-    `held_news` are how many of the residuals are independent.
+    `at_floor`: only noise is left, on training and on held-out runs. `news` and `held_news` are the
+    numbers of independent residuals.
     """
 
     fit: GapFit
@@ -44,23 +44,23 @@ class Hypothesis:
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
-        """Which effects act where."""
+        """Effects and places."""
         return frozenset(c.key for c in self.fit.structure.effects)
 
     @property
     def has_contact(self) -> bool:
-        """Whether bodies meet."""
+        """Whether it has contacts."""
         return self.fit.structure.has_contact
 
     @property
     def size(self) -> int:
-        """How many laws act: one of dry friction counts once, on however many carts it acts."""
+        """The number of laws; dry friction counts once, on however many carts it acts."""
         effects = self.fit.structure.effects
         return len({c.effect.key if c.effect.family else c.key for c in effects})
 
     @property
     def sound(self) -> bool:
-        """Is every effect what its name says, and no estimate at a bound of the search?"""
+        """Return whether every effect matches its name, with no estimate at a search bound."""
         structure, theta = self.fit.structure, self.fit.theta
         low, high = structure.bounds()
         at_bound = (theta <= low + _BOUND_MARGIN) | (theta >= high - _BOUND_MARGIN)
@@ -76,11 +76,11 @@ class Hypothesis:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Study:
-    """What every step of the search needs: runs, springs, catalogue, and how fits go.
+    """The context of the search: runs, springs, catalogue, and options of fits.
 
-    `repeatability` is the relative error between runs with the same input, 0 without any. `whole`
-    are the training runs with the end of the one whose end is held out, where what adds up over a
-    whole run must show in the numbers: on no spring.
+    `repeatability` is the relative error between runs with the same input, 0 without repeats.
+    `whole` are the training runs, with the run that was cut restored to its end: without springs,
+    errors that add up over a whole run must show in the parameters.
     """
 
     training: tuple[GapRun, ...]
@@ -94,11 +94,11 @@ class Study:
 
     @property
     def mapper(self) -> Mapper:
-        """Who maps over runs."""
+        """The mapper over runs."""
         return self.fitting.mapper
 
     def fit(self, start: GapModel, **how: Any) -> GapFit:
-        """Fit a model to the training runs, as `Fitting` says but for the changes in `how`."""
+        """Fit a model to the training runs with the options `Fitting`, changed by `how`."""
         return fit_model(start, self.training, replace(self.fitting, **how))
 
     def with_noise(self, training: Sequence[GapRun]) -> "Study":
@@ -110,23 +110,23 @@ class Study:
 
     @property
     def floor(self) -> float:
-        """Relative error that the noise of the encoders alone makes on the held-out runs."""
+        """Relative error on the held-out runs that encoder noise alone causes."""
         noise = sum(float((run.sigma**2).sum()) * run.t.size for run in self.held_out)
         motion = sum(float((run.swing**2).sum()) * run.t.size for run in self.held_out)
         return float(np.sqrt(noise / motion))
 
     def explains(self, hypothesis: Hypothesis) -> bool:
-        """Tell whether so little is left that the gap has its name."""
+        """Return whether the remaining error is small enough to call the gap named."""
         enough = max(limits.ENOUGH_NOISE * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error <= enough
 
     def may_be_half(self, hypothesis: Hypothesis) -> bool:
-        """Tell whether more is left than a contact's own law, or what repeats do, explains."""
+        """Return whether more is left than a contact's approximate law, or repeats, explain."""
         enough = max(limits.FURTHER * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error > enough and not hypothesis.has_contact
 
     def is_noise(self, hypothesis: Hypothesis) -> bool:
-        """Tell whether nothing is left: of any run, or on held-out ones beyond what repeats do."""
+        """Return whether only noise is left in every run, or repeatability in held-out ones."""
         quiet = hypothesis.error < limits.NOTHING * self.floor
         quiet = quiet and hypothesis.fit.chi < limits.AT_FLOOR
         as_repeats = hypothesis.error < limits.AS_REPEATS * self.repeatability
@@ -134,7 +134,7 @@ class Study:
 
 
 def judge(fit: GapFit, study: Study) -> Hypothesis:
-    """Return the hypothesis a fit stands for."""
+    """Return the hypothesis of a fit."""
     held = fit_nuisance(fit, study.held_out, study.mapper)
     errors, sizes = [], []
     for run, left in zip(study.held_out, _residuals(held, study.held_out), strict=True):
@@ -161,12 +161,12 @@ def _residuals(fit: GapFit, runs: Sequence[GapRun]) -> list[Array]:
 
 
 def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
-    """Return how many residuals tell as much as independent ones.
+    """Return the number of independent residuals.
 
-    What a model leaves that is not noise swings with the carts: few of its points are news.
+    A residual beyond the noise swings with the carts, so few of its points are independent.
     """
     most = fit.n_points / limits.THINNING
-    # Without springs errors add up to a drift; a model that ran away has no residuals.
+    # Without springs errors add up to a drift; a diverged model has no residuals.
     if not any(fit.structure.springs) or not np.isfinite(fit.cost):
         return most
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
@@ -174,10 +174,10 @@ def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
 
 
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
-    """Return by how much a hypothesis is the likelier, in units of the criterion.
+    """Return by how much a hypothesis is more likely, in units of the criterion.
 
-    Only what the fuller one leaves counts as chance; runs held out, to which neither is fitted,
-    count alike.
+    Only the residual of the fuller one counts as chance; held-out runs, to which neither is fitted,
+    count equally.
     """
     share = fuller.news / (fuller.fit.n_points / limits.THINNING)
     taught = (other.bic - fuller.bic) * share
@@ -185,12 +185,12 @@ def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
 
 
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Is the held-out error lower, and by a tenth where too much for a name is left?"""
+    """Return whether the held-out error falls; by a tenth if too much is left for a name."""
     gain = 1.0 if study.explains(child) else limits.PARTIAL_GAIN
     return child.error < gain * parent.error
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Do further effects help, on runs the model has not seen too?"""
+    """Return whether further effects help, also on runs that the model has not seen."""
     drop = limits.BIC_DROP * (child.size - parent.size) or limits.SAME_LAW
     return lowers_error(child, parent, study) and evidence(child, parent) > drop

@@ -1,7 +1,7 @@
-"""A constant force: what the rest points of differently held runs have in common.
+"""A constant force: the common cause of rest points in runs with different carts held.
 
-A constant force only displaces the rest of a linear chain, as a wrong encoder zero would; but
-the springs that carry it change with the carts that are held, and the force does not.
+On a linear chain a constant force only shifts the rest, as a wrong encoder zero would. But the
+springs that carry it change with the held carts, while the force does not.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ class Offset:
 def find_offset(
     chain: Chain, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> Offset | None:
-    """Return the constant force that the fitted zeros ask for, or None."""
+    """Return the constant force implied by the fitted zeros, or None."""
     if not np.any(chain.k > 0):
         return None
     if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):
-        return None  # neither other springs nor a start where it was zeroed: a zero like any other
+        return None  # neither other springs nor a known start: a zero like any other
     best: tuple[float, Offset] | None = None
     total, step = 0.0, 0.0
     for run, one in zip(runs, nuisance, strict=True):

@@ -1,4 +1,4 @@
-"""Leave out what is not needed, and order what is left: the one that helps most first."""
+"""Remove needless effects, and order the others: the most helpful first."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import finish, fit_on
 from pipeline.plant.nonlinear.effects import find_effect
 
-_FEW = 4  # effects tried at a time: least sure means only roughly least missed
+_FEW = 4  # effects tried at a time: the least certain are only roughly the least needed
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
-    """Drop effects, and richer laws, that the others have made needless; all tried are `found`.
+    """Drop effects, and richer laws, that others have made needless; all tried are in `found`.
 
-    And those that are nothing within their error. Of the least sure few, what is missed least
-    goes first; what is lost adds up, so each is compared with the best so far.
+    Effects that may be zero within their error are dropped too. Of the few least certain, the least
+    needed goes first. Losses add up, so each is compared with the best so far.
     """
     best = chosen
     while chosen.key:
@@ -37,7 +37,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
                     found.append(without)
-                nothing = sure[index] < SURE  # it goes, wherever that leads the others
+                nothing = sure[index] < SURE  # it is dropped, whatever follows for the others
                 if nothing or (without.sound and _as_good(without, best, study)):
                     needless.append(without)
             if needless:
@@ -50,7 +50,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
 
 def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
-    """Return a hypothesis without its least sure effect, where that may be nothing; or None.
+    """Return a hypothesis without its least certain effect, if that may be zero; or None.
 
     `final` is its fit with the covariance.
     """
@@ -61,10 +61,10 @@ def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothes
 
 
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
-    """Does a hypothesis without one of the effects do about as well?
+    """Return whether a hypothesis without one of the effects does about as well.
 
-    Where much is left for another reason, the criterion's drop is small: an effect that lowers the
-    error of runs not seen by a tenth is kept there, if the criterion is for it at all.
+    If much is left for another reason, the criterion hardly changes. Then an effect that lowers the
+    error of unseen runs by a tenth stays, if the criterion favours it at all.
     """
     if worth_it(chosen, without, study):
         return False
@@ -74,7 +74,7 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
 
 
 def sureness(fit: GapFit) -> list[float]:
-    """Return how many standard errors each effect is from nothing, by its least sure parameter."""
+    """Return each effect's distance from zero in standard errors, by its least certain one."""
     structure = fit.structure
     if fit.covariance is None:
         return [np.inf] * len(structure.effects)
@@ -95,13 +95,13 @@ def sureness(fit: GapFit) -> list[float]:
 
 
 def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothesis:
-    """Return the hypothesis without one of its effects, fitted from where it is."""
+    """Return the hypothesis without one of its effects, refitted from its present values."""
     index = hypothesis.fit.structure.effects.index(effect)
     return judge(fit_on(hypothesis.fit, hypothesis.fit.without(index), study), study)
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with the law that a richer one grew from in its place."""
+    """Return the hypothesis with the plainer law from which a richer one grew."""
     if rich.effect.grows_from is None:
         return None
     index = hypothesis.fit.structure.effects.index(rich)
@@ -117,7 +117,7 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesi
 def steps_to(
     chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
 ) -> tuple[Hypothesis, ...]:
-    """Return the linear model, one effect, … chosen: what helps most by itself comes first."""
+    """Return the linear model, one effect, … chosen: the most helpful one alone comes first."""
     steps = [chosen]
     while effects := steps[0].fit.structure.effects:
         known = {h.key: h for h in found}

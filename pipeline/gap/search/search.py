@@ -1,4 +1,4 @@
-"""One search for what acts on a bench, step by step."""
+"""One search for the effects on a bench, step by step."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -22,17 +22,17 @@ from pipeline.words.phrases import phrases
 
 
 class Search:
-    """A search: each of its steps goes on from what the last one left.
+    """A search, whose steps each continue from the last one's state.
 
     Attributes
     ----------
-    study : the runs, and how fits go; another one where another noise or other sides serve better.
+    study : runs and options of fits; replaced if another noise or split is better.
     linear : the linear chain that fits the training runs.
     chosen, found : the best hypothesis so far, and all that were judged, the linear one first.
     path : from the linear model to the chosen one, an effect at a time.
-    verdict, close : what it amounts to; under `ambiguous` the rivals.
-    final : the chosen fit with its covariance, its numbers from whole runs to their end.
-    notes : what a reader must know.
+    verdict, close : the result; under `ambiguous`, its rivals.
+    final : the chosen fit with its covariance, with parameters from whole runs to their end.
+    notes : notes for the reader.
     """
 
     chosen: Hypothesis
@@ -54,9 +54,9 @@ class Search:
         self.chosen, self.found = self._look(self.study)
 
     def measure_noise_anew(self) -> None:
-        """Search again where less is left than was taken for noise.
+        """Search again if less is left than the assumed noise.
 
-        The misfit of the linear model was in it.
+        The noise had included the misfit of the linear model.
         """
         for _ in range(2):
             if self.chosen.fit.chi > limits.TOO_GOOD or self.deadline.cut:
@@ -65,9 +65,9 @@ class Search:
             self._try(self.study.with_noise(measure_noise(self.chosen.fit, training, training)))
 
     def change_sides(self) -> None:
-        """Search again where nothing is missing but on the held-out runs.
+        """Search again if an effect is missing in the held-out runs only.
 
-        An effect that acts only in those cannot be found from the training runs.
+        An effect that acts only in the held-out runs cannot be found from the training runs.
         """
         left = self.chosen.fit.chi, self.chosen.held.chi
         if not left[0] < limits.NEAR_FLOOR**2 < left[1] or self.deadline.cut:
@@ -77,17 +77,17 @@ class Search:
             self.notes.append(phrases("gap").text("note_sides"))
 
     def add_constant_force(self) -> None:
-        """Add a constant force, where the rest points ask for one.
+        """Add a constant force if the rest points imply one.
 
-        With the force in the model the encoders' zeros are those of the file, within half a noise:
-        then all is judged so.
+        With the force in the model the encoder zeros are those of the file, within half the noise;
+        everything is then judged so.
         """
         self.path = steps_to(self.chosen, self.found, self.study)
         with suppress(OutOfTime):
             self._add_constant_force(self._timed(self.study))
 
     def reach_verdict(self) -> None:
-        """Settle what is chosen, and say what it amounts to."""
+        """Complete the chosen fit, and set the verdict."""
         study = self.study
         sample_time = max(run.record.sample_time for run in study.training)
         while True:
@@ -101,7 +101,7 @@ class Search:
             without = without_nothing(self.chosen, self.final, study)
             if without is None:
                 break
-            # Fitted to its end, an effect may turn out to be nothing.
+            # Fitted to its end, an effect may turn out to be zero.
             self.found = [*self.found, *self.path, without]
             self.path = steps_to(without, self.found, study)
         if not study.whole:
@@ -114,7 +114,7 @@ class Search:
 
     @property
     def judged(self) -> list[tuple[GapRun, Nuisance]]:
-        """The runs by which the final model is judged, each with its nuisance parameters."""
+        """The runs on which the final model is judged, each with its nuisance parameters."""
         study = self.study
         if study.whole:
             return list(zip(study.whole, self.final.nuisance, strict=True))
@@ -124,11 +124,11 @@ class Search:
     # ------------------------------------------------------------------------- inside
 
     def _timed(self, study: Study) -> Study:
-        """Return a study whose fits end with the time allowed."""
+        """Return a study whose fits obey the time limit."""
         return replace(study, fitting=replace(study.fitting, mapper=self.deadline.map))
 
     def _look(self, study: Study) -> tuple[Hypothesis, list[Hypothesis]]:
-        """Return the hypothesis chosen and all that were judged in time, the linear one first."""
+        """Return the chosen hypothesis and all that were judged in time, the linear one first."""
         baseline = judge(self.linear, study)
         if baseline.at_floor or baseline.error < limits.AS_REPEATS * study.repeatability:
             return baseline, [baseline]
@@ -136,7 +136,7 @@ class Search:
         return find_hypotheses(baseline, self._timed(study))
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
-        """Search under another study; tell whether it was kept: not if the time was over."""
+        """Search in another study; return whether it was kept, which needs time."""
         self.linear = fit_model(self.linear.anew, study.training, study.fitting)
         chosen, found = self._look(study)
         kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)
@@ -154,7 +154,8 @@ class Search:
             return
         holding = holding_force(structure.model(chosen.fit.theta).tables())
         if abs(offset.force) < holding[offset.cart - 1]:
-            # What holds a cart as far from its equilibrium is there: no proof of a constant force.
+            # Effects that can hold a cart so far from its equilibrium: no proof of a constant
+            # force.
             return
         pinned, loose = (
             replace(
@@ -162,7 +163,7 @@ class Search:
                 training=tuple(run.with_zeros(width=width) for run in study.training),
                 held_out=tuple(run.with_zeros(width=width) for run in study.held_out),
             )
-            for width in (1e-4, 0.5)  # noises: not off at all; off by the rounding
+            for width in (1e-4, 0.5)  # noises: exact; off by the rounding
         )
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
@@ -173,14 +174,14 @@ class Search:
         as_good = limits.OFFSET_AS_FREE * chosen.error
         if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):
             return
-        # The others were judged with the encoders' zeros free.
+        # The others were judged with free encoder zeros.
         self.path, self.found = (*without, final), [*without, final]
         self.study = replace(loose, fitting=self.study.fitting)
 
     def _settle(self, study: Study) -> None:
-        """Go on until the cost falls no more: a search ends within some standard errors.
+        """Continue until the cost falls no more, as a search ends within some standard errors.
 
-        The `bic` stays: rivals are compared as the search left them, and so is the chosen one.
+        The `bic` stays: rivals and the chosen one are compared as the search left them.
         """
         fit = self.chosen.fit
         # A hundredth of chi-square is a tenth of a standard error.

@@ -1,4 +1,4 @@
-"""From the laws that a following model has left to effects of the catalogue, and their values."""
+"""From the laws left in a following model to effects of the catalogue, and their values."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
@@ -22,9 +22,9 @@ def filled(effect: Effect) -> frozenset[Column]:
 
 
 def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, ...]:
-    """Return the parameter values that fill columns so: what `effect.columns` does, undone.
+    """Return the parameter values for given columns: the inverse of `effect.columns`.
 
-    Its columns are sums of the parameters, so values at a point and a unit from it tell all.
+    The columns are sums of the parameters, so values at one point and a unit away suffice.
     """
     order = list(effect.columns(dict.fromkeys(effect.names, 1.0)))
     base = np.arange(1.0, 1.0 + len(effect.names))
@@ -39,7 +39,7 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 def as_model(
     follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
 ) -> GapModel:
-    """Return the model with the effects that the laws are: of those that fit the largest first."""
+    """Return the model with the effects for these laws, the largest that fit first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
     chain = follow.laws.chain(follow.p)
     candidates: list[Candidate] = []
@@ -61,7 +61,7 @@ def as_model(
 def make_candidate(
     effect: Effect, place: int, values: Sequence[float], *, runs: Sequence[GapRun], chain: Chain
 ) -> Candidate:
-    """Return an effect at a place, with the signs of values and its typical sizes there."""
+    """Return an effect at a place, with the signs of its values and its typical sizes there."""
     scales = bench_scales(runs, chain, effect=effect, place=place)
     return Candidate(
         effect=effect,

@@ -1,4 +1,4 @@
-"""The verdict on a search: how much is explained, and how surely."""
+"""The verdict on a search: how much is explained, and how certainly."""
 
 from collections.abc import Sequence
 
@@ -12,11 +12,11 @@ from pipeline.plant.nonlinear.effects import find_effect
 def reach_verdict(
     steps: tuple[Hypothesis, ...], found: Sequence[Hypothesis], *, study: Study, sample_time: float
 ) -> tuple[Verdict, tuple[Hypothesis, ...], list[Hypothesis]]:
-    """Return the verdict, the steps that stand, and under `ambiguous` the rivals.
+    """Return the verdict, the accepted steps, and under `ambiguous` the rivals.
 
-    `steps` lead from the linear model to the one chosen; `found` are all hypotheses judged. Where
-    much is left, a step that another could stand in for is taken back, and so is every effect
-    without which a hypothesis does about as well.
+    `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If much
+    is left, a step that another effect could replace is withdrawn, and so is every effect without
+    which a hypothesis does about as well.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
@@ -54,7 +54,7 @@ def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> 
 def _stand_ins(
     rival: Hypothesis, chosen: Hypothesis
 ) -> list[tuple[tuple[str, int], tuple[str, int]]]:
-    """Return the effects of the chosen that the rival lacks, each with what it has instead."""
+    """Return the chosen effects that the rival lacks, each with the rival's substitute."""
     mine = sorted(chosen.key - rival.key, key=_place)
     other = sorted(rival.key - chosen.key, key=_place)
     return list(zip(mine, other, strict=True))
@@ -65,7 +65,7 @@ def _place(key: tuple[str, int]) -> tuple[int, str]:
 
 
 def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
-    """Are the laws of one family at the same places, dry friction on one cart, say?"""
+    """Return whether the laws have one family and the same places, as dry friction does."""
     return all(
         mine[1] == other[1] and find_effect(mine[0]).family == find_effect(other[0]).family != ""
         for mine, other in _stand_ins(rival, chosen)
@@ -73,7 +73,7 @@ def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
 
 
 def _same_thing(rival: Hypothesis, chosen: Hypothesis, *, sample_time: float) -> bool:
-    """Is a rival a richer form of the same laws, or one the data provably cannot tell from it?"""
+    """Return whether a rival is a richer form of the same laws, or provably indistinguishable."""
     return all(
         _same_law(mine, other, chosen, sample_time=sample_time)
         for mine, other in _stand_ins(rival, chosen)

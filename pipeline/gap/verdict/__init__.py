@@ -1,1 +1,1 @@
-"""What the search amounts to: the verdict, its account, and where the model still departs."""
+"""The result of a search: the verdict, its account, and where the model still departs."""

@@ -37,13 +37,13 @@ def list_effects(
         (added,) = after.key - before.key
         index = places.index(added)
         term, rest = final.terms[index], chosen.key - {added}
-        # One effect instead of this one, or none of those chosen.
+        # A rival has one effect in place of this one, or none of the chosen ones.
         rivals = [
             h
             for key, h in same_size.items()
             if key != chosen.key and (rest < key or not key & chosen.key)
         ]
-        # In one of many narrow valleys the curvature says nothing of the error.
+        # In one of many narrow valleys the curvature does not give the error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
         known = None if std is None or rugged else std[structure.span(index)]
         values = _named_values(term, known, units)
@@ -67,7 +67,7 @@ def list_effects(
 
 
 def _stand_in(effect: tuple[str, int], others: frozenset[tuple[str, int]]) -> tuple[str, int]:
-    """Return which of the others is at the effect's place, or the first."""
+    """Return the rival's effect at the same place, or its first one."""
     return min(others, key=lambda other: (other[1] != effect[1], other))
 
 
@@ -117,7 +117,7 @@ def chain_std(fit: GapFit) -> dict[str, float]:
 
 
 def chain_covariance(fit: GapFit) -> Array | None:
-    """Return the covariance of what `chain_std` has the standard errors of."""
+    """Return the covariance of the parameters in `chain_std`."""
     if fit.covariance is None:
         return None
     size, std = fit.structure.base_size, np.array(list(chain_std(fit).values()))
@@ -136,7 +136,7 @@ def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[GapRun, Nuisan
 
 
 def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Trace, ...]:
-    """Return every cart of every run beside the model before and after."""
+    """Return every cart of every run beside the models without and with effects."""
     out = []
     for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
         _sides_of(before, study), _sides_of(after, study), strict=True
@@ -164,7 +164,7 @@ def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Tr
 def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
     """Return the relative error of every cart in every record, before and after, as traced.
 
-    What was held out of a record stands apart; its runs between interventions are pooled.
+    The held-out part of a record is separate; its runs between interventions are pooled.
     """
     order = (*study.training, *study.held_out)
     rows = [(run, j) for run in order for j in range(len(run.rows))]
@@ -196,10 +196,10 @@ def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap,
 
 
 def repeatability(runs: Sequence[GapRun]) -> float | None:
-    """Return the relative difference of runs with the same input, or None without such.
+    """Return the relative difference of runs with the same input, or None without repeats.
 
-    Of two runs the second is read at the times of the first, their inputs' first edges together.
-    Two pieces of one record are no repeats: the later one begins in motion.
+    The second of two runs is read at the times of the first, with their inputs' first edges
+    aligned. Two pieces of one record are no repeats, as the later one begins in motion.
     """
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
@@ -213,7 +213,7 @@ def repeatability(runs: Sequence[GapRun]) -> float | None:
             difference = [
                 x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
             ]
-            # Encoders are zeroed for every run: a constant is no difference.
+            # Encoders are zeroed for every run, so a constant is no difference.
             squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
             sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
     return float(np.sqrt(squares / sizes)) if sizes else None
@@ -225,7 +225,7 @@ def _edge(run: GapRun) -> float:
 
 
 def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
-    """Tell whether two inputs are one over most of the runs, but for samples at their edges."""
+    """Return whether two inputs agree over most of the runs, except for samples at their edges."""
     if t_a.size < _SAME_LENGTH * max(a.t.size, b.t.size):
         return False
     u, v = (
@@ -237,15 +237,15 @@ def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
 
 
 def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
-    """Return the models that may be true, the chosen first, then the likeliest of the others.
+    """Return the models that may be true: the chosen one, then the likeliest others.
 
-    One that lacks some effects of the chosen is no other explanation; nor is one that has more,
-    where the chosen leaves no more than noise.
+    A model that lacks some of the chosen effects is no alternative. Nor is one with more effects,
+    if the chosen one leaves only noise.
     """
     rivals = [one for one in others if one.key and not one.key <= chosen.key]
     if chosen.at_floor:
         rivals = [one for one in rivals if not one.key > chosen.key]
-    # Three, among which an experiment is to decide.
+    # At most three, which an experiment can distinguish.
     kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[:2]]
     likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
     return tuple(

@@ -1,8 +1,8 @@
-"""The shortest formula for the force that a model does not explain, by regression in weak form.
+"""The shortest formula for the unexplained force, by regression in weak form.
 
-The force is known as its mean over windows; so is each term of a library. Masses, dampings and
-springs, and the encoders' zeros, were fitted without what is missing, so they are fitted again
-beside the terms. The formula is the sum of a few terms with the best criterion, if any beats none.
+The force is known as a mean over windows, and so is each term of a library. Masses, dampings,
+springs and encoder zeros were fitted without the missing law, so they are fitted again beside the
+terms. The formula is the sum of a few terms with the best criterion, if it beats having no term.
 
 References: S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113 (2016), 3932-3937 (sparse regression
 for laws of motion); D. A. Messenger, D. M. Bortz, J. Computational Physics 443 (2021), 110525 (in
@@ -22,7 +22,7 @@ from pipeline.gap.types import ForceFormula, FormulaTerm, LeftForce
 
 @dataclass(frozen=True)
 class _Term:
-    """A law that a force may follow, and the powers of x, v and u in it, for its unit."""
+    """A candidate law of force, and its powers of x, v and u, for its unit."""
 
     name: str
     law: Callable[[Array, Array, Array], Array]
@@ -65,10 +65,10 @@ LIBRARY = (
 def find_formula(
     forces: Sequence[LeftForce], *, on_springs: bool, position: str, drive: str
 ) -> tuple[ForceFormula | None, Array]:
-    """Return the formula for the force on one cart, and what it says of every window (n,).
+    """Return the formula for the force on one cart, and its value in every window (n,).
 
-    Without one, nothing is said: zeros. `on_springs` : an encoder's zero that is off is a constant
-    force in its run.
+    Without a formula the values are zero. `on_springs` : a wrong encoder zero is a constant force
+        in its run.
     """
     force = np.concatenate([one.force for one in forces])
     linear = np.concatenate(
@@ -88,11 +88,11 @@ def find_formula(
     left = force - basis @ (basis.T @ force)
     alone = columns - basis @ (basis.T @ columns)
     size = np.linalg.norm(columns, axis=0)
-    # Of a column the others must leave something.
+    # The other columns must not explain all of a column.
     usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > 1e-8 * size[j] > 0]
     best, lowest = (), _criterion(left, 0)
     free = force.size - linear.shape[1]
-    # Ten windows a term, and three terms at the most.
+    # Ten windows for each term, and at most three terms.
     for count in range(1, min(3, free // 10) + 1):
         for chosen in combinations(usable, count):
             A = alone[:, chosen]
@@ -121,7 +121,7 @@ def find_formula(
 
 
 def _criterion(rest: Array, terms: int) -> float:
-    """Return the Bayesian criterion, with what the best of many trials must gain by each term."""
+    """Return the Bayesian criterion, with the gain that each of many trial terms must exceed."""
     count = rest.size
     cost = count * float(np.log(max(float(rest @ rest), 1e-300) / count))
     return cost + terms * (float(np.log(count)) + BIC_DROP)

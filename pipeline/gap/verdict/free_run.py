@@ -1,4 +1,4 @@
-"""How far one simulation of a whole record strays, started from its first readings."""
+"""The error of one simulation over a whole record, started from its first readings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -17,8 +17,8 @@ def free_runs(
 ) -> tuple[FreeRun, ...]:
     """Return the error of each record, all carts together, in the order of their ids.
 
-    Of what was fitted to a record only its encoders' `zeros` (n,) are used. What a hand divides is
-    simulated piece by piece, and counts as one.
+    Of the values fitted to a record only its encoder `zeros` (n,) are used. A record divided by a
+    hand is simulated piece by piece, and counts as one.
     """
     squares: dict[str, list[Array]] = {}
     for run in runs:

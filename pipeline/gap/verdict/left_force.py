@@ -1,8 +1,8 @@
-"""The force that a model does not explain: where it is, how fast the carts are, what drives them.
+"""The unexplained force: by position, velocity and input.
 
-The model is started from the measurement again and again and runs freely over a short stretch. In
-the second part of each, what it is off by has the curvature of the force it lacks: an average of
-that force, by modulating functions, in which neither the start nor the noise counts for much.
+The model is restarted from the measurement again and again, and runs freely over a short stretch.
+In the second part of each stretch its error has the curvature of the missing force. Modulating
+functions average that force, with little influence of the start and the noise.
 """
 
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from pipeline.gap.fit.linearise import Nuisance, fresh_nuisance, simulate_run
 from pipeline.gap.fit.structure import GapModel
 from pipeline.gap.types import LeftForce
 
-_DEGREE = 4  # of the polynomial through what a model is off by in a window
+_DEGREE = 4  # of the polynomial through the model's error in a window
 
 
 def left_forces(
     model: GapModel, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> tuple[LeftForce, ...]:
-    """Return the force left on each cart of each run whose neighbours were measured."""
+    """Return the unexplained force on each cart of each run whose neighbours were measured."""
     found = []
     for run, own in zip(runs, nuisance, strict=True):
         best: list[LeftForce] = []
@@ -43,11 +43,11 @@ def left_forces(
 def _of_run(
     model: GapModel, run: GapRun, own: Nuisance, *, length: float
 ) -> list[tuple[LeftForce, float]]:
-    """Return the force left on each cart, by windows of `length` s, and what noise makes of it."""
+    """Return the unexplained force on each cart in windows of `length` s, and its noise."""
     width = round(length / run.record.sample_time) + 1
     if not 9 <= width <= run.t.size // 3:
         return []
-    # Half a window more: what hides (a lag, a bent bristle) finds its place before one begins.
+    # Half a window more, in which hidden states (a lag, a bent bristle) settle before one begins.
     cut = cut_shots(run, length=(1.0 + 0.5) * length / run.pace)
     cut = replace(cut, zero=np.where(run.free, own.zero, 0.0))
     read = simulate_run(model, cut, replace(fresh_nuisance(cut), scatter=own.scatter))
@@ -70,7 +70,7 @@ def _of_run(
         for k, spring in ((i - 1, i), (i + 1, i + 1)):
             if 0 <= k < n:
                 force -= chain.k[spring] * (w * off[k][windows]).sum(1)
-        # Within four noises a cart stands still: friction then answers any force.
+        # Within four noises a cart is at rest, where friction answers any force.
         moves = np.ptp(x[i][windows], axis=1) > 4.0 * run.sigma[j]
         if not moves.any():
             continue

@@ -1,7 +1,7 @@
-"""The force on each cart that masses, dampings and springs do not account for.
+"""The force on each cart that masses, dampings and springs do not explain.
 
-Measured positions give no acceleration worth having. What modulating functions give is the exact
-mean of the force over a short window, with the mean velocity, position and input beside it.
+Measured positions do not give a useful acceleration. Modulating functions give the exact mean of
+the force over a short window, together with the mean velocity, position and input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,11 +23,12 @@ class ResidualForce:
 
     Attributes
     ----------
-    measured, model : what the linear part leaves of the measured motion, and of the motion that
-        the model with its effects gives: alike where the effects are right.
+    measured, model : residual force of the linear part for the measured motion, and for the motion
+        of the model with its effects; both agree if the effects are right.
     u : the logged input, on cart 1; 0 elsewhere.
-    arriving : what the model's dead zone and saturation leave of it, which is taken off the forces.
-    velocity, position : of the measured cart, its encoder's zero taken off.
+    arriving : the input behind the model's dead zone and saturation, which is subtracted from the
+        forces.
+    velocity, position : of the measured cart, without its encoder zero.
     neighbours : (2, n) positions of the carts before and after, 0 for a wall or a held cart.
     neighbours_velocity : (2, n) their velocities.
     """
@@ -49,7 +50,7 @@ class ResidualForce:
 def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[ResidualForce, ...]:
     """Return the residual force of every cart in every run whose neighbours were measured.
 
-    A run sampled too slowly for the longest window has none.
+    A run sampled too slowly for the longest window is left out.
 
     `free` tells which carts move in each run.
     """
@@ -79,7 +80,7 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     i, chain = cart - 1, model.chain
     before, after = chain.k[i], chain.k[i + 1]
     best = None
-    # Windows in s; half of one weighs anything.
+    # Windows in s; the middle half carries most of the weight.
     for length in (0.05, 0.07, 0.1, 0.15, 0.2, 0.3):
         if (windows := _cut(t, length=length)) is None:
             continue
@@ -117,7 +118,7 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
 
 
 def _arriving(u: Array, model: AugmentedChain) -> Array:
-    """Return what the drive passes on of the input, delays and lags apart."""
+    """Return the input that the drive passes on, without delays and lags."""
     drive = model.tables().drive
     return np.array([arriving(drive, float(one)) for one in u])
 

@@ -1,4 +1,4 @@
-"""What is left on each cart, bin by bin against position, velocity and input, and its formula."""
+"""The residual of each cart, bin by bin against position, velocity and input, with its formula."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from pipeline.set_up import Bench
 
 
 def map_residual(forces: Sequence[LeftForce], bench: Bench) -> tuple[Residual, ...]:
-    """Return what is left on each cart, the first first."""
+    """Return the residual of each cart, in order."""
     found, position, drive = [], bench.units.position, bench.units.input
     for cart in sorted({force.cart for force in forces}):
         own = [force for force in forces if force.cart == cart]

@@ -1,4 +1,4 @@
-"""Where a run departs from a model, what the cart does there, and what would show more of it."""
+"""Where a run departs from a model, what the cart does there, and which run would show more."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.words.phrases import phrases
 
-# Which recording shows more of what is left, by what the cart does there: a key of the words.
+# The recording that shows more of the residual, by what the cart does there: a key of the words.
 _SHOWS = {
     "velocity near zero": "show_rest",
     "fast motion": "show_motion",
@@ -26,7 +26,7 @@ _SHOWS = {
 
 
 def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
-    """Return the windows that hold most of the misfit, the worst first.
+    """Return the windows with most of the misfit, the worst first.
 
     `share` is the window's part of that cart's squared misfit in that run.
     """
@@ -78,7 +78,7 @@ def _what(run: GapRun, x: Array, energy: Array) -> str:
     if not edges.size or edges.size > 6:
         del masks["after an edge of the input"]
     total = float(energy.sum())
-    best, score = "throughout", 1.3  # a third above chance is worth a word
+    best, score = "throughout", 1.3  # a third above chance is worth mentioning
     for what, mask in masks.items():
         if 0.02 < mask.mean() < 0.98:
             excess = float(energy[mask].sum()) / total / float(mask.mean())
@@ -95,10 +95,10 @@ def choose_experiment(
     *,
     repeated: bool,
 ) -> str:
-    """Return what to record next: what tells the rivals apart, settles the name, or shows more.
+    """Return the next recording: it distinguishes the rivals, settles the name, or shows more.
 
-    `left` are the windows in which the chosen model still departs, the worst first; `repeated`:
-    runs of one input tell already by how much they differ.
+    `left` are the windows in which the chosen model still departs, the worst first. `repeated`:
+    some runs share an input, so the scatter between runs is known.
     """
     if verdict == "ambiguous":
         texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
