@@ -1,1 +1,1 @@
-"""What the stages share: noise, peaks, level and transform estimators, least squares."""
+"""Methods that several stages share: noise, peaks, levels and transforms, least squares."""

@@ -1,8 +1,9 @@
-"""Residuals that are not white: what their correlation does to standard errors.
+"""The effect of correlated residuals on standard errors.
 
-A chain fitted to carts with dry friction leaves smooth residuals, and an encoder at rest rounds
-the same way for seconds: neighbouring samples then tell the same thing, and counting each as new
-would make every standard error too small. Here is the middle of the sandwich that puts it right.
+A chain fitted to carts with dry friction leaves smooth residuals, and an encoder at rest rounds the
+same way for seconds. Neighbouring samples then carry the same information, and counting each as new
+would make every standard error too small. This module computes the middle factor of the sandwich
+estimator that corrects for it.
 
 Reference: W. Newey & K. West, Econometrica 55, 1987; the lag window is Parzen's.
 """
@@ -17,18 +18,19 @@ _LAGS_SHARE = 1 / 3  # of the samples; a rest after a step is correlated as long
 
 
 def _parzen(x: Array) -> Array:
-    """Return Parzen's window at lags x, of the last."""
+    """Return Parzen's window at lags x, relative to the last."""
     return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
 
 
 def colour(residual: Array, *, angle: float) -> float:
     """Return the residual's spectral density at `angle` (rad per sample) over its mean; >= 1.
 
-    The variance of a fitted sinusoid's coefficients is that of white noise times this factor.
-    Parzen's lag window; never below one, because the fit itself takes power out at `angle`.
+    The variance of a fitted sinusoid's coefficients is that of white noise times this factor. It
+    uses Parzen's lag window, and is never below one, because the fit itself removes power at
+    `angle`.
     """
     n = residual.size
-    # Lags of the residual's correlation that are always looked at.
+    # The smallest number of lags of the residual's correlation.
     lags = min(max(8, int(np.sqrt(n))), n // 2)
     power = float(residual @ residual)
     if power == 0 or lags < 2:
@@ -45,9 +47,9 @@ def _window(lags: int) -> Array:
 
 
 def long_run_variance(residual: Array) -> float:
-    """Return the variance (of zero-mean residuals (p, n)) that an average would shrink from.
+    """Return the variance (of zero-mean residuals (p, n)) that governs the error of a mean.
 
-    The mean square for white residuals, more where neighbours agree; never less.
+    The mean square for white residuals, more if neighbours agree, never less.
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)
@@ -58,14 +60,14 @@ def long_run_variance(residual: Array) -> float:
 def score_covariance(residual: Array, jacobian: Array) -> Array:
     """Return the covariance (n_p, n_p) of sum(jacobian * residual) over carts and samples.
 
-    `residual` (p, n) is taken as stationary, its carts as correlated; `jacobian` (n_p, p, n).
+    `residual` (p, n) is assumed stationary, with correlated carts; `jacobian` (n_p, p, n).
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)
     n_fft = correlation.shape[-1]
     spectrum = np.fft.rfft(correlation)  # (p, p, n_f)
     J = np.fft.rfft(jacobian, n_fft)  # (n_p, p, n_f)
-    weight = np.full(J.shape[-1], 2.0)  # each frequency stands for its negative too
+    weight = np.full(J.shape[-1], 2.0)  # each frequency also represents its negative
     weight[[0, -1]] = 1.0
     coloured = np.einsum("jkf,qkf->qjf", spectrum.conj(), J) * (weight / (n * n_fft))
     n_p = jacobian.shape[0]

@@ -1,9 +1,9 @@
 """Interventions: stretches in which a force that nobody measured, such as a hand, moves a cart.
 
-The force that a law of motion does not explain bursts where a hand acts. An effect that the law
-lacks shows as well, but it shows again and again: in proportion to the motion, wherever position,
-stretch, speed and input are the same. A knock of two bodies is over in an instant. So a burst is
-a hand if it lasts, moves the cart, and acts in a state in which the law holds at other times.
+Where a hand acts, the force that the law of motion does not explain bursts. An effect missing from
+the law shows as well, but repeatedly: whenever position, stretch, speed and input are the same. An
+impact of two bodies is over in an instant. So a burst is a hand if it lasts, moves the cart, and
+occurs in a state in which the law holds at other times.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,22 +20,22 @@ from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Intervention, Record
 
 _BULK = 2.0  # standard deviations, as in the law's fit
-_FAR, _BEGINS = 4.0, 1.5  # times the bulk: of a burst, and where it begins and ends
-_SHARE, _TYPICAL = 0.3, 3.0  # of what acts on the cart; times what the law leaves elsewhere
-_AROUND = 0.15  # s, before and after: what acts at that time
-_REACH = 0.02  # s to each side of its middle: what a window sees most of
-_GAP = 0.1  # s: nearer bursts are one
-_LASTS = 0.06  # s above half its peak; a knock has 0.04, the width of a window
-_KNOWN = 0.03  # s of a burst in a state that is known
-_SWINGS = 3  # times that the force of a hand changes sides: an effect's does so all the time
-_INSTANT = 0.03  # s: nobody pushes twice at the same time to within that
+_FAR, _BEGINS = 4.0, 1.5  # times the bulk: for a burst, and for its beginning and end
+_SHARE, _TYPICAL = 0.3, 3.0  # of the force acting on the cart; times the law's residual elsewhere
+_AROUND = 0.15  # s, before and after: the force acting at that time
+_REACH = 0.02  # s to each side of its middle: the effective part of a window
+_GAP = 0.1  # s: closer bursts are merged
+_LASTS = 0.06  # s above half its peak; an impact has 0.04, the width of a window
+_KNOWN = 0.03  # s of a burst in a known state
+_SWINGS = 3  # times that a hand's force changes sides; an effect's does so all the time
+_INSTANT = 0.03  # s: nobody pushes twice at exactly the same time
 _BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
 
 
 def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
-    """Return where a hand acts on a free cart, by record, cart and time.
+    """Return the interventions of hands on free carts, by record, cart and time.
 
-    Runs under feedback are not looked at: what drove their motor is often not what was logged.
+    Runs under feedback are skipped: the motor is often driven by something that was not logged.
     """
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
     first = {record.id: _first_alike(record, open_loop) for record in open_loop}
@@ -53,20 +53,20 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
 
 
 def _first_alike(record: Record, records: Sequence[Record]) -> str:
-    """Return the id of the first record with the same readings: a file may be listed twice."""
+    """Return the id of the first record with the same readings, as a file may be listed twice."""
     return next(other.id for other in records if np.array_equal(other.y, record.y))
 
 
 def but_releases(
     interventions: Sequence[Intervention], records: Sequence[Record]
 ) -> list[Intervention]:
-    """Return the interventions without the holds from which decays are let go, as they should."""
+    """Return the interventions except the proper holds from which decays are released."""
     released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
     return [one for one in interventions if (one.experiment, one.start) not in released]
 
 
 def between(record: Record, interventions: Sequence[Intervention]) -> list[Record]:
-    """Return what a record shows before, between and after the interventions, piece by piece."""
+    """Return the parts of a record before, between and after the interventions."""
     touched = np.zeros(record.t.size, dtype=np.bool_)
     for one in interventions:
         if one.experiment == record.id:
@@ -128,9 +128,9 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
 
 
 def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
-    """Tell whether it happens at the same instant in another driven run: no hand is as exact.
+    """Return whether it happens at the same instant in another driven run, unlike a hand.
 
-    Driven runs with their first instant, at which any hand that was there before begins.
+    Driven runs come with their first instant, at which an earlier hand's force begins.
     """
     if one.start == driven.get(one.experiment, one.start):
         return False
@@ -142,17 +142,17 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
 
 
 def _share(force: ForceLeft, size: float) -> Array:
-    """Return how much of what acts on the cart about that time the law leaves."""
+    """Return the share of the force on the cart at about that time that the law leaves."""
     acting = maximum_filter1d(force.acting, 2 * round(_AROUND / force.hop) + 1)
     return np.abs(force.left) / (acting + size)
 
 
 def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
-    """Return for each window whether the law holds wherever the cart is in such a state.
+    """Return for each window whether the law holds elsewhere in such a state.
 
-    Position, stretches, velocity and input are looked at one by one: most windows at about the
-    same value must be quiet. A cart that rests without an input can be held by friction
-    only, whatever the state.
+    Position, stretches, velocity and input are checked one by one: most windows at about the same
+    value must be quiet. Friction alone can hold a cart that rests without an input, whatever the
+    state.
     """
     state = np.concatenate([force.state for force in forces], axis=1)
     follows = np.concatenate([force.follows for force in forces])
@@ -177,7 +177,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
 
 
 def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
-    """Return first and last window of each stretch, those with a short gap between them as one."""
+    """Return first and last window of each stretch, merging those with a short gap."""
     found: list[tuple[int, int]] = []
     for first, last in _runs(above):
         if found and t[first] - t[found[-1][1]] < _GAP:
@@ -188,7 +188,7 @@ def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
 
 
 def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return the first and the last of each run of what holds."""
+    """Return the first and the last of each run of true values."""
     edges = np.flatnonzero(np.diff(np.pad(above.astype(int), 1))).tolist()
     return [(first, behind - 1) for first, behind in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -196,7 +196,7 @@ def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _is_hand(
     left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_], hop: float
 ) -> bool:
-    """Tell whether a burst, `left` being nothing below its beginning, is a hand.
+    """Return whether a burst is a hand; below its beginning `left` is negligible.
 
     Its windows are `hop` s apart.
     """

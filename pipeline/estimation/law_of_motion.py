@@ -1,8 +1,8 @@
-"""The law of motion of one cart, read off all records at once, and the force that it leaves.
+"""The law of motion of one cart, from all records at once, and the force that it does not explain.
 
-The acceleration of the cart by positions, velocities and input, with dry friction and drag, over
-short windows: linear in what is unknown, so that nothing is simulated and nothing searched. The
-loss lets go of what does not follow the law.
+The acceleration of the cart is regressed on positions, velocities and input, with dry friction and
+drag, over short windows. The problem is linear, so nothing is simulated or searched. The loss
+ignores data that do not follow the law.
 
 Reference: S. Geman and D. E. McClure, Bull. Int. Statistical Institute 52 (1987) 5-21 (the loss).
 """
@@ -19,25 +19,25 @@ from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
 from pipeline.results import Record
 
-_WINDOW = 0.1  # s; the middle 0.04 s weigh most
-_LAGS = (0.0, 0.02, 0.05)  # s that the input may come late
+_WINDOW = 0.1  # s; the middle 0.04 s carry most of the weight
+_LAGS = (0.0, 0.02, 0.05)  # s by which the input may be late
 # Columns of the law: rest and gain of a record, positions, inputs; dampers, drag, braking; dry
-# friction, alone and in proportion to the input.
+# friction, alone and proportional to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
-_ROUNDS, _SETTLED = 30, 1e-3  # of weighing anew; relative change of the bulk that ends it
-_BULK = 2.0  # standard deviations of the bulk: beyond, the loss lets go
+_ROUNDS, _SETTLED = 30, 1e-3  # of reweighting; relative change of the bulk at which it ends
+_BULK = 2.0  # standard deviations of the bulk above which data are ignored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ForceLeft:
-    """The force on one cart in one record that the law does not explain, over windows at `t` (n,).
+    """The unexplained force on one cart in one record, over windows at `t` (n,).
 
     Attributes
     ----------
-    left : (n,) acceleration that the law does not explain; in a cart at rest, that friction
-        does not hold either.
-    acting : (n,) size of the acceleration, or of what springs and input ask for, if larger.
+    left : (n,) unexplained acceleration; for a cart at rest, the part that friction cannot hold
+        either.
+    acting : (n,) size of the acceleration, or of that demanded by springs and input, if larger.
     state : (5, n) position about the rest, stretches of both springs, velocity, input.
     moves : the cart moves; `jumps`: so does the input, suddenly, in the window or just before.
     idle : (n,) the cart rests without an input.
@@ -59,7 +59,7 @@ class ForceLeft:
 
     @property
     def hop(self) -> float:
-        """The time from window to window, s."""
+        """The time between windows, s."""
         return _hop(self.record) * self.record.sample_time
 
 
@@ -81,10 +81,10 @@ class _Windows:
     def columns(self, *, driven: bool) -> Array:
         """Return (n, unknowns) the columns of the law: those of `_SPRINGS`, `_DAMPERS`, `_DRY`.
 
-        Each record has a rest of its own, and a gain: a drive does not treat all levels alike.
+        Each record has its own rest and gain, as a drive may treat levels differently.
         """
         v, u = self.v[1], driven * self.u
-        # Within a window in which the cart turns, it goes this way for longer.
+        # In a window in which the cart turns, this is its main direction.
         turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
         side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
         rest = np.ones(v.size)
@@ -117,7 +117,7 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
         asked = column[:, _SPRINGS] @ law[_SPRINGS]
         free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
         rubs, by_load = np.abs(law[_DRY])
-        # Times dry friction in motion: what may hold a cart at rest.
+        # Times dry friction in motion: the largest static friction.
         holds = 3.0 * (rubs + by_load * np.abs(one.u[0]))
         at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
         offset, stiffness = law[0], -law[_POSITION]
@@ -138,7 +138,7 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
 
 
 def _cut(record: Record, cart: int) -> _Windows | None:
-    """Return a record in windows, or None where it does not serve."""
+    """Return a record in windows, or None if it is not usable."""
     neighbours = (cart - 1, cart, cart + 1)
     if any(c in record.free and c not in record.carts for c in neighbours):
         return None
@@ -161,7 +161,7 @@ def _cut(record: Record, cart: int) -> _Windows | None:
     # Of the input's range from one sample to the next.
     jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
     lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
-    # Smallest changes in a window: with less the cart rests.
+    # Smallest changes in a window: below these the cart rests.
     return _Windows(
         record=record,
         t=means[0],
@@ -177,16 +177,16 @@ def _cut(record: Record, cart: int) -> _Windows | None:
 
 
 def _hop(record: Record) -> int:
-    """Return how many samples there are from window to window."""
-    # In s, from window to window.
+    """Return the number of samples between windows."""
+    # In s, between windows.
     return max(1, round(0.01 / record.sample_time))
 
 
 def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
     """Return (14, n) means over the windows whose samples are `at` (n, samples).
 
-    Time, positions, velocities, acceleration, inputs; how the acceleration scales white noise,
-    and by how much the reading moves.
+    Time, positions, velocities, acceleration, inputs; the acceleration's gain for white noise, and
+    the range of the reading.
     """
     local = t[at]
     w, w1, w2 = window_weights(local)
@@ -210,8 +210,8 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
 
     Parameters
     ----------
-    parts : columns (windows, unknowns) and accelerations (windows,) of each record; the first
-        columns belong to the record alone.
+    parts : columns (windows, unknowns) and accelerations (windows,) of each record; its first
+        columns are its own.
     """
     shared = parts[0][0].shape[1] - _OWN
     behind = np.arange(_OWN * len(parts), _OWN * len(parts) + shared)
@@ -228,7 +228,7 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
             weighed = columns.T * weight**2
             H[np.ix_(place, place)] += weighed @ columns
             b[place] += weighed @ target
-        # Of the normal equations: what is less is nothing.
+        # Of the normal equations: smaller values count as zero.
         law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=1e-12)[0]
         left = [target - columns @ law[place]
                 for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip

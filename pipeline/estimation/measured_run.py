@@ -1,4 +1,4 @@
-"""A record beside the chain that is to explain it: how it began, and where it steps."""
+"""A record prepared for comparison with a chain: how it began, and where it steps."""
 
 from dataclasses import dataclass, replace
 
@@ -12,7 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Record
 
-_STILL = 0.02  # of its range that a signal may vary while nothing happens
+_STILL = 0.02  # of its range that a signal may vary while it is constant
 _MIN_STEP_SAMPLES = 10
 
 
@@ -41,7 +41,10 @@ class MeasuredRun:
 
     @property
     def driven(self) -> bool:
-        """There is a logged input that moves the carts; its last sample comes too late to."""
+        """There is a logged input that moves the carts;
+
+        its last sample acts only after the record.
+        """
         return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
 
     def forced(self) -> Array:
@@ -52,12 +55,12 @@ class MeasuredRun:
         return self._simulated(record.u, x0=np.zeros(2 * len(self.free)))
 
     def unforced(self) -> Array:
-        """Return the readings (f, n) that the start alone would give."""
+        """Return the readings (f, n) caused by the start alone."""
         return self.rest[:, None] + self._ringing(self.x0)
 
     @property
     def noise_floor(self) -> float:
-        """The misfit of a simulation that is off by the noise alone."""
+        """The misfit of a simulation that is wrong by the noise only."""
         return self.misfit(self.y + self.noise[:, None])
 
     def input_scale(self) -> float:
@@ -67,7 +70,7 @@ class MeasuredRun:
         return float(np.sum(moved * forced) / np.sum(forced**2))
 
     def best_misfit(self) -> float:
-        """Return the misfit of the open loop, its input taken times the best factor."""
+        """Return the misfit of the open loop with its input times the best factor."""
         return self.misfit(self.unforced() + self.input_scale() * self.forced())
 
     def misfit(self, model: Array) -> float:
@@ -76,9 +79,10 @@ class MeasuredRun:
         return float(np.sqrt(np.sum(error[self.seen] ** 2) / np.sum(motion[self.seen] ** 2)))
 
     def begun_in_motion(self) -> "MeasuredRun":
-        """Return the run with its rest and starting state fitted to the whole record.
+        """Return the run with its rest and initial state fitted to the whole record.
 
-        Linear least squares, the input's factor free, so that a wrong one does not bend the start.
+        Linear least squares, with a free factor on the input, so that a wrong one does not affect
+        the start.
         """
         n = self.record.t.size
         states = np.eye(2 * len(self.free))
@@ -87,7 +91,7 @@ class MeasuredRun:
         columns += [np.outer(cart, np.ones(n)) for cart in np.eye(len(self.free))]
         rows = np.array([column[self.seen].ravel() for column in columns])
         size = np.linalg.norm(rows, axis=1)
-        known = size > 0  # a cart that was not measured has no rest to be found
+        known = size > 0  # an unmeasured cart has no rest to fit
         fitted = np.zeros(len(columns))
         target = self.y[self.seen].ravel()
         fitted[known] = np.linalg.lstsq((rows[known] / size[known, None]).T, target)[0]
@@ -98,8 +102,8 @@ class MeasuredRun:
         """Return the samples from the first step of `signal` (n,) to the next, or None."""
         if signal is None or not np.any(signal):
             return None
-        # Before the record the signal was zero, so one that stands from the start steps there.
-        # Of its range, within one sample: a step.
+        # Before the record the signal was zero, so one that is on from the start steps there. A
+        # step is this share of its range within one sample.
         edges = np.flatnonzero(np.abs(np.diff(signal, prepend=0.0)) > 0.3 * np.ptp([0.0, *signal]))
         if edges.size == 0:
             return None
@@ -118,7 +122,7 @@ class MeasuredRun:
 
         Raises
         ------
-        DataError : they are beyond arithmetic, as of a chain that fits nothing.
+        DataError : they overflow, as for a chain that fits nothing.
         """
         record = self.record
         with np.errstate(over="ignore", invalid="ignore"):
@@ -129,7 +133,7 @@ class MeasuredRun:
 
 
 def measured_run(record: Record, chain: Chain) -> MeasuredRun:
-    """Return the run, its rest read off its start or, where it begins in motion, fitted.
+    """Return the run, with its rest from its start or, if it begins in motion, fitted.
 
     Raises
     ------
@@ -142,14 +146,14 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
             f"found free {list(free)}"
         )
     run = _begin(record, chain, free=free)
-    # Six deviations, or as many encoder steps, of a rest are more than chance.
+    # Six deviations, or as many encoder steps, are more than chance.
     at_rest = np.all(np.ptp(run.y[:, : run.quiet], axis=1) <= 6 * run.noise)
-    # Samples at rest that show a rest.
+    # The fewest samples that define a rest.
     if not run.driven or (at_rest and run.quiet >= 5):
         return run
     moving = run.begun_in_motion()
     usual = at_rest and record.kind in ("step", "closed_loop")
-    # Of the misfit of a step from rest: what a start in motion must come down to.
+    # Relative to the misfit of a step from rest: the level that a start in motion must reach.
     return run if usual and moving.best_misfit() > 0.5 * run.best_misfit() else moving
 
 

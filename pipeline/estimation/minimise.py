@@ -1,4 +1,4 @@
-"""Nonlinear least squares in which residual and Jacobian come of one evaluation."""
+"""Nonlinear least squares with residual and Jacobian from one evaluation."""
 
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
@@ -20,11 +20,11 @@ def minimise(
     scale: float | Literal["jac"] = 1.0,
     tolerance: float = 1e-8,
 ) -> OptimizeResult:
-    """Minimise the sum of squares of the residual from `start` (n_p,) on.
+    """Minimise the sum of squares of the residual, starting from `start` (n_p,).
 
     `at` returns the residual (n,) and the Jacobian (n, n_p) at p.
 
-    `tolerance` is the relative change of the cost to stop at.
+    `tolerance` is the relative change of the cost at which it stops.
     """
     once = evaluated_once(at)
     return least_squares(
@@ -39,7 +39,7 @@ def minimise(
 
 
 def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
-    """Return `at`, not worked out twice for the same p (n_p,) in a row.
+    """Return `at`, evaluated once for the same p (n_p,) in a row.
 
     Scipy asks for the residual at p, and then often for its derivatives there.
     """
@@ -47,7 +47,7 @@ def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
 
     def once(p: Array) -> T:
         if not (last and np.array_equal(last[0][0], p)):
-            own = p.copy()  # MINPACK goes on in the array it hands over
+            own = p.copy()  # MINPACK continues in the array it hands over
             last[:] = [(own, at(own))]
         return last[0][1]
 

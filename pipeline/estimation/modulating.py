@@ -1,8 +1,8 @@
 """Modulating functions: an equation of motion averaged over windows, the data never differentiated.
 
 The equation is multiplied by a bump that vanishes at both ends of a window with its first three
-derivatives, and integrated by parts: the derivatives move from the data to the bump, which is
-known. What remains is linear in masses, dampings and springs.
+derivatives, and integrated by parts: the derivatives move from the data to the known bump. The
+result is linear in masses, dampings and springs.
 
 References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin,
 Computers & Chemical Engineering 17 (1993).
@@ -32,7 +32,7 @@ def bump_integral(s: Array) -> Array:
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
     """Return the weights (windows, samples) that give mean, minus mean slope and mean curvature.
 
-    Few samples integrate the bump's derivatives badly: the weights are made exact for parabolas.
+    Few samples integrate the bump's derivatives badly, so the weights are made exact for parabolas.
 
     Parameters
     ----------

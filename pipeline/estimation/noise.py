@@ -1,4 +1,4 @@
-"""The noise of a measured signal, from sample to sample, and what rounding adds to it."""
+"""The noise of a measured signal, from sample to sample, and the error added by rounding."""
 
 from functools import lru_cache
 from math import comb
@@ -7,7 +7,7 @@ import numpy as np
 
 from pipeline.arrays import Array
 
-_NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any motion we sample
+_NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any sampled motion
 MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
 
 
@@ -22,7 +22,7 @@ def local_noise(t: Array, y: Array) -> float:
     weights, size = _weights(t.tobytes())
     predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
     scaled = (y[3:-3] - predicted) / size
-    moving = scaled[scaled != 0]  # a cart at rest on one count says nothing about the noise
+    moving = scaled[scaled != 0]  # a cart at rest on one count does not show its noise
     return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
 
 
@@ -46,20 +46,20 @@ def _neighbours(x: Array) -> Array:
 def difference_noise(y: Array, *, order: int) -> Array:
     """Return the noise's standard deviation of evenly sampled signals (…, n), by differences.
 
-    The higher the order the less of a smooth motion is in it. By their median: jumps do not count,
-    nor does a cart that rests on one count show any noise.
+    The higher the order, the less of a smooth motion remains. The median ignores jumps, and shows
+    no noise for a cart that rests on one count.
     """
     differences = np.diff(y, n=order, axis=-1)
     return MEDIAN_TO_SIGMA * np.median(np.abs(differences), axis=-1) / difference_gain(order)
 
 
 def difference_gain(order: int) -> float:
-    """Return how many times the standard deviation of white noise its differences have."""
+    """Return the ratio of a difference's standard deviation to that of the white noise."""
     return float(np.sqrt(comb(2 * order, order)))
 
 
 def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
-    """Estimate the white part of a residual: what a moving quadratic cannot follow."""
+    """Estimate the white part of a residual, which a moving quadratic cannot follow."""
     width = 2 * half_width + 1
     if residual.size < 2 * width:
         return float(residual.std())
@@ -73,17 +73,17 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
 
 
 def grain(t: Array, y: Array, *, step: float) -> float:
-    """Return the smallest change that means something: encoder step or noise, if larger.
+    """Return the smallest significant change: encoder step or noise, if larger.
 
-    Noise counts by the step that would round as coarsely, sqrt(12) sigma. `step` is the encoder
-    step, 0 where none is known.
+    Noise counts as the step that would round as coarsely, sqrt(12) sigma. `step` is the encoder
+    step, 0 if unknown.
     """
     arithmetic = 1e-6 * float(np.ptp(y))  # a noise-free simulation has neither
     return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)
 
 
 def rounding_left(sigma: float, *, step: float) -> float:
-    """Return which part (0 to 1) of the rounding error averaging leaves, with noise `sigma`.
+    """Return the share (0 to 1) of the rounding error that averaging leaves, with noise `sigma`.
 
     Noise before the rounding acts as dither: the first harmonic of the rounding error shrinks
     by exp(-2 pi² sigma²/step²) (Widrow & Kollár, Quantization Noise, 2008, chapter 4).
@@ -92,5 +92,5 @@ def rounding_left(sigma: float, *, step: float) -> float:
 
 
 def noise_beyond_rounding(rms: float, *, step: float) -> float:
-    """Return the noise that a residual's root-mean-square holds on top of the rounding."""
+    """Return the noise in a residual's root-mean-square beyond the rounding."""
     return float(np.sqrt(max(rms**2 - step**2 / 12, 0.0)))

@@ -1,4 +1,4 @@
-"""Where a measured signal turns, and where an input stands still."""
+"""Where a measured signal turns, and where an input is constant."""
 
 import numpy as np
 
@@ -35,15 +35,15 @@ def extrema(y: Array, *, prominence: float) -> list[int]:
             first = last = i
             direction = -direction
     if direction:
-        found.append(first)  # a cart that has come to rest: where it got there
+        found.append(first)  # a cart that has come to rest: the sample at which it did
     return found
 
 
 def plateaus(u: Array) -> list[tuple[int, int]]:
     """Return [start, stop) of each stretch of constant input, in order.
 
-    Constant means: within 2 % of the input's range, or within its noise. A sine gives many short
-    stretches, a slow edge a few; how long a stretch must be, the caller knows.
+    Constant means within 2 % of the input's range, or within its noise. A sine gives many short
+    stretches, a slow edge a few; the caller decides how long a stretch must be.
     """
     noise = float(difference_noise(u, order=2)) if u.size > 2 else 0.0
     # Of the input's range: smaller changes are noise of the logged input.

@@ -1,8 +1,8 @@
 """The transfer ratio of one step or sweep record, whatever its ends.
 
 A record that begins and ends at rest, even displaced, needs no window: the transforms of the
-derivatives, FT(y')/FT(u'), are exact. Any other goes by local polynomials: the unknown motion
-before and after the record adds something smooth in frequency, which is fitted along.
+derivatives, FT(y')/FT(u'), are exact. Any other record is evaluated by local polynomials: the
+unknown motion before and after the record adds a smooth term in frequency, which is fitted too.
 
 Reference: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
 section 7.2 (the local polynomial method).
@@ -18,9 +18,9 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import difference_gain
 from pipeline.results import Record
 
-_LEAST_INPUT_SHARE = 0.01  # of its strongest line; below, the input does not excite the plant
+_LEAST_INPUT_SHARE = 0.01  # of its strongest line; below this the input does not excite the plant
 # … and of its strongest neighbour: in a null of the input's spectrum (every second harmonic of a
-# step on and off) whatever is not linear is divided by next to nothing.
+# step on and off) any nonlinearity would be divided by almost zero.
 _LEAST_NEIGHBOUR_SHARE = 0.25
 _NEIGHBOURS = 2  # frequencies on each side
 # A step at the first sample has moved its cart by u t²/2m after two: 3 % of the travel even with
@@ -37,16 +37,16 @@ class TransferRatio(NamedTuple):
 
 
 def transfer_ratio(run: Record, *, omega: Array) -> TransferRatio:
-    """Return the frequency response that one driven record shows at `omega` (n_w,), rad/s."""
+    """Return the frequency response of one driven record at `omega` (n_w,), rad/s."""
     if run.u is None:
         raise ValueError(f"{run.id}: a transfer ratio needs the input")
     return _at_rest_ratio(run, run.u, omega) or _local_ratio(run, run.u, omega)
 
 
 def visible_band(run: Record) -> float:
-    """Return the highest frequency, rad/s, at which some cart's motion stands out of its noise.
+    """Return the highest frequency, rad/s, at which some cart's motion exceeds its noise.
 
-    Only a bound for a grid: it takes the mean sample interval for all.
+    It is only a bound for a grid, so it uses the mean sample interval.
     """
     dt, duration = run.sample_time, run.t[-1] - run.t[0]
     omega = 2 * np.pi * np.fft.rfftfreq(run.t.size - 1, dt)
@@ -96,7 +96,7 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     U, Y = _derivative_transforms(run, u, omega, u_before=float(u[0]) if waits else 0.0)
     excess = np.maximum(ring - quiet, 0.0) / 2
     duration = run.t[-1] - run.t[0]
-    # A swing r left at the end errs by up to r / 2ζ, here with ζ = 0.05.
+    # A remaining swing r at the end errs by up to r / 2ζ, here with ζ = 0.05.
     std = np.sqrt(
         noise[:, None] ** 2 * (2 + omega**2 * run.sample_time * duration) / 2
         + (10.0 * excess[:, None]) ** 2
@@ -119,10 +119,10 @@ def _noise(run: Record) -> Array:
 
 
 def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
-    """Return G by local polynomials: FT(y') = G FT(u') + what the ends left, both smooth.
+    """Return G by local polynomials: FT(y') = G FT(u') + the effect of the ends, both smooth.
 
-    What two widths of the polynomials differ by is added to the error: near a sharp resonance
-    of a short record it is the larger part.
+    The difference between two widths of the polynomials is added to the error: near a sharp
+    resonance of a short record it is the larger part.
     """
     base = 2 * np.pi / (run.t[-1] - run.t[0])
     lines = np.arange(1, int(omega[-1] / base) + max(_HALF_WINDOWS) + 2)
@@ -138,9 +138,9 @@ def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
 def _line_transforms(
     run: Record, u: Array, lines: NDArray[np.intp]
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Return FT(u') and FT(y') at harmonics of the record length; by FFT where time is uniform."""
+    """Return FT(u') and FT(y') at harmonics of the record length; by FFT if time is uniform."""
     dt, base = run.sample_time, 2 * np.pi / (run.t[-1] - run.t[0])
-    # Of an interval: what rounding leaves of a uniform time axis.
+    # Of an interval: the rounding error of a uniform time axis.
     if np.max(np.abs(np.diff(run.t) - dt)) > 1e-3 * dt:
         return _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
     smooth = 1.0 / np.sinc(lines * base * dt / (2 * np.pi))

@@ -1,7 +1,7 @@
-"""What a log looks like that is in another unit, or whose clock runs wrong: factors, with words."""
+"""Typical factors, with words, of a log in another unit or with a wrong clock."""
 
 LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
-# Units of a time column that counts so many times as much as it should: in full, and as headed.
+# Factors of a time column that counts in other units: in full, and as in headings.
 TIME_UNITS = {1e3: ("milliseconds", "ms"), 1e6: ("microseconds", "us")}
 TIME_FACTORS = {
     **{factor: f"its time looks to be in {unit}" for factor, (unit, _) in TIME_UNITS.items()},
@@ -10,4 +10,4 @@ TIME_FACTORS = {
     2.0: "its clock looks to run twice too fast",
     0.5: "its clock looks to run at half its speed",
 }
-FASTEST = 1e-4  # s between samples: no bench reads its encoders more often
+FASTEST = 1e-4  # s between samples: no bench reads its encoders faster

@@ -12,7 +12,7 @@ THINNING = 10.0
 # 0.045; this is three times that. Of 60 linear benches the largest was 1.07; of 300 none gave an
 # alarm.
 AT_FLOOR = 1.15
-TOO_GOOD = 0.7  # … and that no fit to noise of the right size falls to, six of that below one
+TOO_GOOD = 0.7  # … and a value six standard deviations below one
 NOTHING = 1.05  # times the noise: the excess, √(1.05² - 1), is a third of the noise
 # For runs with one input: an error below this multiple of their difference is theirs. Two or three
 # repeats determine that difference to no better than a tenth.

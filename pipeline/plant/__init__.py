@@ -1,1 +1,1 @@
-"""The carts: linear, under feedback, and with what the linear model leaves out."""
+"""The carts: linear, under feedback, and with effects that the linear model lacks."""

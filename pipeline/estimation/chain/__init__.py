@@ -1,1 +1,1 @@
-"""Fitting one chain: its parameters, how it answers, and what records leave of it."""
+"""Fitting one chain: its parameters, its response, and the residuals of records."""

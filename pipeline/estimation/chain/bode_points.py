@@ -1,4 +1,4 @@
-"""What the Bode fit compares: the measured points in one row, and the chain's response at them."""
+"""The data of the Bode fit: the measured points in one row, and the chain's response at them."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,7 +19,8 @@ Scale = Literal["log", "magnitude", "polar"]
 class Points:
     """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0).
 
-    `decays`: what decays say of a cart's own damping ratio, by cart (from 1), one more point each.
+    `decays`: estimates of a cart's own damping ratio from decays, by cart (from 1), one more point
+    each.
     """
 
     omega: Array  # (n_w,) the distinct frequencies
@@ -34,7 +35,7 @@ class Points:
 
     @classmethod
     def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "Points":
-        """Gather the responses of some of the n carts; numbers without an error get one."""
+        """Gather the responses of some of the n carts; numbers without a standard error get one."""
         if not responses:
             raise DataError("Bode fit: needs a frequency response, found none")
         for response in responses:
@@ -48,7 +49,7 @@ class Points:
             raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
         std = np.concatenate([r.magnitude_std for r in responses])
         stated = np.isfinite(std) & (std > 0)
-        # Of a magnitude that comes without an error.
+        # Relative error of a magnitude that comes without one.
         std = np.where(stated, std, 0.01 * np.maximum(magnitude, np.median(magnitude) / 1e3))
         phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
         phase_std = [
@@ -56,7 +57,7 @@ class Points:
         ]
         spread = np.concatenate(phase_std)
         distinct, at = np.unique(omega, return_inverse=True)
-        # In rad: a worse phase tells nothing.
+        # In rad: a phase with a larger error is not used.
         return cls(
             omega=distinct,
             at=at,
@@ -70,27 +71,27 @@ class Points:
 
     @property
     def size(self) -> int:
-        """How many points there are, N."""
+        """The number of points, N."""
         return self.magnitude.size
 
     @property
     def n_phases(self) -> int:
-        """How many points have a phase to go by."""
+        """The number of points with a usable phase."""
         return int(np.count_nonzero(np.isfinite(self.phase_std)))
 
     @property
     def level(self) -> Array:
-        """ln|G|; a magnitude lost in its error counts as half that error."""
+        """ln|G|; a magnitude below its error counts as half that error."""
         return np.log(np.maximum(self.magnitude, self.std / 2))
 
     @property
     def level_weight(self) -> Array:
         """One over the error of the level, (N,)."""
-        # Added to the error of ln|G|: on the way there no point should rule.
+        # Added to the error of ln|G|: early in the fit no point should dominate.
         return 1.0 / np.hypot(self.std / np.exp(self.level), 0.05)
 
     def widened(self, share: float) -> "Points":
-        """Return the points with a relative error added to those they have."""
+        """Return the points with a relative error added to their own."""
         return replace(
             self,
             std=np.hypot(self.std, share * self.magnitude),
@@ -98,7 +99,7 @@ class Points:
         )
 
     def of_cart(self, cart: int) -> NDArray[np.bool_]:
-        """Tell which points are those of a cart (from 1), (N,)."""
+        """Return which points are those of a cart (from 1), (N,)."""
         return self.cart == cart - 1
 
 
@@ -111,7 +112,7 @@ def response_at(
     Z = ((powers * physical)[:, None, :] * b.T) @ b  # Σ p s^order b bᵀ
     try:
         inverse = np.linalg.inv(Z).astype(np.complex128, copy=False)
-    except np.linalg.LinAlgError:  # a step of the fit that goes astray: no number, it steps back
+    except np.linalg.LinAlgError:  # a step of the fit went astray: no number, so it steps back
         inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]
     stretch = (G @ b.T) * -powers  # (n_w, n_p)
@@ -134,7 +135,7 @@ def weighted_residuals(
 def _decay_residuals(
     P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
 ) -> tuple[Array, Array]:
-    """Return ln ζ_i over the decay's, in standard errors, and its derivatives; ζ² = c² / 4mk."""
+    """Return ln ζ_i minus the decay's, in standard errors, and its derivatives; ζ² = c² / 4mk."""
     chain = P.chain(physical)
     residuals, jacobian = [], []
     for cart, measured in decays.items():

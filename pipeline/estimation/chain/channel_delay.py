@@ -1,14 +1,14 @@
-"""By how much one channel is read later than its neighbour's, from the carts' own law of motion.
+"""The delay of one channel against its neighbour's, from the carts' own law of motion.
 
-A cart that no motor drives is moved by its neighbours alone, whatever the input is and however
-late it comes:
+A cart without a motor is moved by its neighbours alone, whatever the input is and however late it
+comes:
 
     k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}
 
-So each cart's channel has one delay against that of the cart before it with which its own law
-holds best. No derivative is taken: both sides are weighed with a bump that slides along the
-records (`modulating`). The weights are free in sign and size, so a cart in another unit, or
-turned, has the same delay.
+So each cart's channel has one delay against that of the cart before it for which this law fits
+best. No derivative is taken: both sides are weighted with a bump that slides along the records
+(`modulating`). The coefficients are free in sign and size, so a cart in another unit, or reversed,
+has the same delay.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from pipeline.estimation.modulating import bump, motion_period
 from pipeline.results import Record
 
 _FEWEST_PLACES = 30
-_MOST_LATE = 15  # steps of the grid that are tried, either way
-_PARTS = 8  # that the error is found from, at least: records, or parts of them
+_MOST_LATE = 15  # grid steps that are tried to either side
+_PARTS = 8  # smallest number of records, or parts of them, for a standard error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,10 +32,10 @@ class ChannelDelay:
 
     Attributes
     ----------
-    delay, std : s; positive where it is read later; the standard error by jackknife over records.
-    better : how many times less of the motion the carts' law leaves with this delay than with
-        none: friction, play and stops look like a small delay, but none takes them away.
-    experiments : the records it was found from.
+    delay, std : s; positive if it is read later; standard error by jackknife over records.
+    better : factor by which this delay lowers the residual of the carts' law. Friction, play and
+        stops look like a small delay, but no delay removes them.
+    experiments : the records used.
     """
 
     cart: int
@@ -46,9 +46,9 @@ class ChannelDelay:
 
 
 def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
-    """Return by cart the delay of its channel against that of the cart before, where it shows.
+    """Return, by cart, the delay of its channel against that of the cart before, if it shows.
 
-    The last cart comes first: the law of one before it needs to know when the next one was read.
+    The last cart comes first: the law of the one before needs its true times.
     """
     found: dict[int, ChannelDelay] = {}
     for cart in range(n, 1, -1):
@@ -61,7 +61,7 @@ def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, Chann
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Normal:
-    """Normal equations of the law in a part of a record, for every delay that is tried.
+    """Normal equations of the law in a part of a record, for every trial delay.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class _Normal:
     square: Array
 
     def without(self, other: "_Normal") -> "_Normal":
-        """Return the equations of what is left without a part."""
+        """Return the equations without one part."""
         return _Normal(
             power=self.power - other.power,
             cross=self.cross - other.cross,
@@ -81,7 +81,7 @@ class _Normal:
         )
 
     def left(self) -> Array:
-        """Return the power (n_d,) that the law leaves of the left side at its best."""
+        """Return the power (n_d,) of the left side that the best law does not explain."""
         used = np.diag(self.square) > 0
         size = np.sqrt(np.diag(self.square)[used])
         cross = self.cross[:, used] / size
@@ -95,7 +95,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     periods = [motion_period(one.position(cart)) * one.sample_time for one in usable]
     if not usable:
         return None
-    # Steps of the grid in a period of the motion, where it is sampled more often.
+    # Grid steps in a period of the motion, if it is sampled more often.
     finest = float(np.median(periods)) / 240
     step = max(float(np.median([record.sample_time for record in usable])), finest)
     parts = -(-_PARTS // len(usable))
@@ -114,7 +114,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     )
     left = total.left()
     best, least = _lowest(left)
-    if abs(best) >= _MOST_LATE:  # the longer the better: no delay, but motion that is not the law's
+    if abs(best) >= _MOST_LATE:  # the longer the better: not a delay, but motion outside the law
         return None
     others = np.array([_lowest(total.without(one).left())[0] for one in equations])
     spread = float(np.sum((others - others.mean()) ** 2))
@@ -128,22 +128,22 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
 
 
 def _tells(record: Record, cart: int) -> bool:
-    """Whether all that moves a cart was measured, and both it and the one before move far."""
+    """Return whether every force on a cart was measured, and it and the one before move far."""
     if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
         return False
     if cart + 1 in record.free and cart + 1 not in record.carts:
         return False
-    # Encoder steps of motion from which on a channel's delay shows.
+    # Encoder steps of motion above which a channel's delay shows.
     return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))
 
 
 def _equations(
     record: Record, cart: int, *, after: float, step: float, period: float, parts: int
 ) -> list[_Normal]:
-    """Return the equations of each part of a record; none where it is too short."""
+    """Return the equations of each part of a record; none if it is too short."""
     t = np.arange(record.t[0], record.t[-1], step)
-    # Of the motion's period: wider ones weigh the fast motions, which tell most, away.
-    # Samples under a bump: fewer, and the encoder's steps are all it sees.
+    # In periods of the motion: wider bumps would suppress the fast motion, which is most
+    # informative. Below a number of samples under a bump only the encoder's steps would be seen.
     width = max(round(0.25 * period / step), 16)
     first, last = _MOST_LATE, t.size - width - _MOST_LATE
     places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
@@ -161,7 +161,7 @@ def _equations(
     before = under(cart - 1)
     shifts = range(-_MOST_LATE, _MOST_LATE + 1)
     left = np.array([before[places - shift] @ weight for shift in shifts])
-    # Zeros of encoders drop out; each record weighs the same.
+    # Encoder zeros cancel; each record has the same weight.
     left = left - left.mean(axis=1, keepdims=True)
     size = float(np.linalg.norm(left[_MOST_LATE]))
     if size == 0:
@@ -179,7 +179,7 @@ def _equations(
 
 
 def _lowest(left: Array) -> tuple[float, float]:
-    """Return for how many steps of delay least is left, between the steps too, and how much."""
+    """Return the delay in grid steps with the least residual, interpolated, and that residual."""
     i = int(np.argmin(left))
     between = 0.0
     if 0 < i < left.size - 1 and (bend := left[i - 1] - 2 * left[i] + left[i + 1]) > 0:

@@ -1,7 +1,8 @@
-"""How well records follow a chain, and how one would have to be read to follow it.
+"""How well records follow a chain, and how a record must be read differently to follow it.
 
-Start and encoder zeros aside, what a chain leaves of a record is linear in its columns. So the
-weights with which they follow best tell at once which column is turned or in another unit.
+Apart from start and encoder zeros, the chain's residual of a record is linear in the record's
+columns. So the best factors on the columns show at once which column is reversed or in another
+unit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -31,10 +32,10 @@ class Followed:
 
     Attributes
     ----------
-    lost : by cart, the share of its motion's power that neither chain nor noise explains.
-    missed : by cart, (n,) where the chain is minus where the cart was read to be.
-    reach : by cart, how far it moves over how far the chain does, root-mean-square.
-    friction : by cart, the most dry friction that this allows, in input units.
+    lost : by cart, the share of its motion's power explained by neither chain nor noise.
+    missed : by cart, (n,) simulated minus read position.
+    reach : by cart, the ratio of its motion to the chain's, root-mean-square.
+    friction : by cart, the most dry friction that is compatible with this, in input units.
     """
 
     lost: dict[int, float]
@@ -57,9 +58,9 @@ class Followed:
 class Misread:
     """What makes a record follow: `words` say it; a `legal` one need not be a mistake.
 
-    `remedy` : what mends it where all records of a bench are so. `scale` : how far it moves over
-    how far its input moves the carts, where only that differs. `clock` : its time over the true
-    one, where only that differs.
+    `remedy` : the fix if all records of a bench are so. `scale` : the ratio of its motion to that
+        of the input, if nothing else differs. `clock` : the ratio of its time to the true one, if
+        nothing else differs.
     """
 
     words: str
@@ -70,7 +71,7 @@ class Misread:
 
 
 def is_driven(record: Record) -> bool:
-    """Whether a logged input, which no controller chose, moves the carts."""
+    """Return whether a logged input, not chosen by a controller, moves the carts."""
     driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
     return driven and record.u is not None and bool(np.ptp(record.u) > 0)
 
@@ -81,25 +82,25 @@ def measured(record: Record) -> list[int]:
 
 
 def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
-    """Hold every driven record in which the measured carts move against the chain, by id."""
+    """Compare every driven record in which measured carts move with the chain, by id."""
     modes = _modes(chain)
     found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
     return {name: fit for name, fit in found.items() if fit}
 
 
 def most_follow(fits: Mapping[str, Followed]) -> bool:
-    """Tell whether at least half of some records follow, if there are any."""
+    """Return whether at least half of some records follow, if there are any."""
     return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
 
 
 def near(record: Record, chain: Chain) -> list[Followed]:
     """Return how a record follows carts like those of the chain, a little slower or faster.
 
-    A spring that stiffens, or an input that comes late, shifts resonances by some percent, and at
-    one of them that is all of the motion.
+    A spring that stiffens, or a late input, shifts resonances by some percent. At a resonance that
+    is the whole motion.
     """
     modes = _modes(chain)
-    # A spring that stiffens, or an input that is late, shifts resonances by some percent.
+    # A spring that stiffens, or a late input, shifts resonances by some percent.
     detuned = [replace(record, t=factor * record.t) for factor in np.linspace(0.85, 1.15, 13)]
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
@@ -107,22 +108,22 @@ def near(record: Record, chain: Chain) -> list[Followed]:
 def find_misread(
     record: Record, chain: Chain, fit: Followed, *, better: float = 10.0
 ) -> Misread | None:
-    """Return how a record must be read to follow the chain, so many times better than as it is.
+    """Return how a record must be read to follow the chain better by the given factor.
 
     Parameters
     ----------
-    fit : how it follows as it is.
+    fit : how it follows unchanged.
     """
     found, least = None, min(fit.share / better, FOLLOWED)
-    # What stays of a good record is friction, and no other reading takes that away.
+    # The residual of a good record is friction, which no other reading removes.
     if better > 1 and fit.share < 0.005:
         return None
-    # As the bench counts its input: a record's own sign was found by what it holds.
+    # In the bench's counting: a record's own sign was found by what it holds.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        # What a record that counts the other way leaves at most; a long delay leaves more.
+        # The largest residual of a record that counts the other way; a long delay leaves more.
         if held and held.share <= (min(least, 0.02) if misread.legal else least):
             found, least = misread, held.share
     return found
@@ -144,7 +145,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         window = open_window(record)
     except DataError:
         return
-    # Encoder steps of motion: rounding changes a smaller one by any factor.
+    # Encoder steps of motion: rounding can change a smaller one by any factor.
     if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
@@ -158,7 +159,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
 
 
 def _weights(window: FitWindow, modes: Modes) -> Array:
-    """Return the factors (p,) with which the columns follow best."""
+    """Return the factors (p,) on the columns with which the record follows best."""
     driven = compare(replace(window, y=0 * window.y), modes).residual.ravel()
     alone = [
         compare(replace(window, drive_u=None, y=window.y * row[:, None]), modes).residual.ravel()
@@ -169,15 +170,15 @@ def _weights(window: FitWindow, modes: Modes) -> Array:
 
 
 def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
-    """Say what is wrong where columns need about these factors, and which; None if nothing known.
+    """Describe the mistake that needs about these factors on the columns; None if none is known.
 
-    A unit is that of the whole file: one cart near its null moves by any factor too little.
+    A unit applies to the whole file: one cart near its null may move too little by any factor.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    # An amplifier at its limit makes less of the input by a factor of 2 or 3.
+    # An amplifier at its limit reduces the input by a factor of 2 or 3.
     scales = [scale for scale in LENGTH_SCALES if scale >= 10.0]
     for scale in (*scales, *(1 / scale for scale in scales)):
-        # Relative, of a unit's factor: the known ones lie 2.5 times apart.
+        # Relative, of a unit's factor: known factors are at least 2.5 apart.
         if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
             words = (
                 "its positions or its input look to be in another unit: they move "
@@ -192,11 +193,11 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     return None
 
 
-# ------------------------------------------------------------------ one record held
+# ------------------------------------------------------- one record and the chain
 
 
 def _modes(chain: Chain) -> _ModesOf:
-    """Return what finds the chain's modes by its free carts, without derivatives."""
+    """Return a function that finds the chain's modes by its free carts, without derivatives."""
     P = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
 
     @cache
@@ -220,11 +221,11 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     except DataError:  # nothing moves, or the motor does not reach the last cart
         return None
     power = np.var(window.y, axis=1)
-    excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder and noise
+    excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder steps and noise
     lost = np.maximum(excess, 0.0) / power
     reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
-    # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)²
-    # where they move at all, which is doubled here; encoder and noise hide shares below the least.
+    # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² if
+    # they move at all, doubled here; encoder and noise hide smaller shares.
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         missed=dict(zip(window.carts, residual, strict=True)),
@@ -238,7 +239,7 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
 
 
 def force_on(record: Record, chain: Chain, *, cart: int) -> Array | None:
-    """Return what pulls at a cart (n,) by input and neighbours; None where one is not known."""
+    """Return the force on a cart (n,) by input and neighbours; None if one is unknown."""
     assert record.u is not None
     force = record.u if cart == 1 else np.zeros_like(record.u)
     for neighbour, k in ((cart - 1, chain.k[cart - 1]), (cart + 1, chain.k[cart])):

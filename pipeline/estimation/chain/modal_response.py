@@ -1,8 +1,8 @@
 """Exact response of a chain to a measured input, and its Jacobian by the fit vector, by modes.
 
-In modal coordinates every state is alone, z' = lambda z + b u, so an input held between samples
-gives an exact scalar recursion at any sample times, and the derivative of the whole response by any
-number of parameters needs only one more recursion a mode (by lambda) and constant matrices.
+In modal coordinates every state is alone, z' = lambda z + b u. So a held input gives an exact
+scalar recursion at any sample times. The derivatives by any number of parameters need only one more
+recursion for each mode (by lambda) and constant matrices.
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,10 @@ from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.linear.chain import Chain
 
 # Below this |lambda dt| the derivative of expm1(z)/z is taken from its series: rounding would leave
-# it 1e-16/|z|, the series errs by z²/8.
+# 1e-16/|z|, the series errs by z²/8.
 _SMALL_EXPONENT = 1e-6
 # Poles closer than this (relative) lose the third power of it in the Jacobian. More damping on one
-# cart, by a share no record can tell, sets them apart by twice its root.
+# cart, too little to show in a record, separates them by twice its root.
 _MEETING = 1e-3
 _PARTING = 1e-5
 
@@ -51,9 +51,9 @@ def find_modes(
 ) -> Modes:
     """Decompose the free part of a chain into modes.
 
-    `dp_dtheta` (n_p,) is that of `Parametrisation`. Where two poles meet (a critically damped
-    cart) there are no separate modes, and near there rounding spoils the derivatives: such poles
-    are first parted.
+    `dp_dtheta` (n_p,) is that of `Parametrisation`. If two poles meet (a critically damped cart)
+    there are no separate modes, and nearby rounding spoils the derivatives: such poles are first
+    separated.
     """
     A, B, _, _ = chain.state_space(free=free)
     if _poles_meet(A):
@@ -67,7 +67,7 @@ def find_modes(
     poles, V = map(np.asarray, np.linalg.eig(A))  # of a real matrix: exact conjugate pairs
     poles, V = poles.astype(np.complex128), V.astype(np.complex128)
     W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
-    # No mode of a passive chain grows: what rounding leaves above zero would do so all the same.
+    # No mode of a passive chain grows; a positive real part is rounding error.
     poles = poles - np.maximum(poles.real, 0.0)
     inner = W @ dA @ V
     gap = poles - poles[:, None]
@@ -89,7 +89,7 @@ def find_modes(
 
 
 def _poles_meet(A: Array) -> bool:
-    """Tell whether two poles lie too close for modes of their own."""
+    """Return whether two poles are too close for separate modes."""
     poles = np.linalg.eigvals(A)
     gap = np.abs(poles - poles[:, None]) + np.diag(np.full(poles.size, np.inf))
     return bool(np.min(gap) < _MEETING * np.max(np.abs(poles)))
@@ -118,7 +118,7 @@ def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, 
     u (n,) is held from sample to sample. Exact for any sample times.
     """
     dt = np.diff(t)
-    uniform = np.ptp(dt) <= 1e-9 * dt[0]  # sample times differ by their rounding only
+    uniform = np.ptp(dt) <= 1e-9 * dt[0]  # sample times differ only by rounding
     step = dt[:1] if uniform else dt
     z = poles[:, None] * step
     growth = np.exp(z)

@@ -1,7 +1,7 @@
 """Dry friction in a free decay: the exact piecewise solution, fitted and tested.
 
-With viscous damping and dry friction F the cart swings about k d to one side while it moves one
-way and about the other while it moves back (d = F/k), so that A_{j+1} = rho A_j - (1 + rho) d.
+With viscous damping and dry friction F the cart swings about d = F/k to one side while it moves one
+way, and about d to the other side while it moves back. So A_{j+1} = rho A_j - (1 + rho) d.
 
 Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
 """
@@ -19,10 +19,10 @@ from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
 from pipeline.results import FrictionTest
 
-_THRESHOLD = 10.8  # F(1, many) above this once in a thousand decays without friction
+_THRESHOLD = 10.8  # F(1, many) exceeds this once in a thousand decays without friction
 _UNKNOWNS = 7
-_MOST_LOSS = 50.0  # of an exponent on the way to the fit: beyond, numbers run over
-_LESS_DAMPING = (1.0, 0.3)  # starts: friction takes a share of the damping fitted without it
+_MOST_LOSS = 50.0  # of an exponent during the fit: larger ones overflow
+_LESS_DAMPING = (1.0, 0.3)  # starts: shares of the fitted damping that are assumed to be friction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -38,26 +38,26 @@ def fit_friction(
 ) -> FrictionFit | None:
     """Fit a decay with viscous damping and dry friction; compare with viscous damping alone.
 
-    Searched are turning point, decay rate and frequency; rest point, drift, first amplitude and
-    friction band are linear. The F-statistic allows for a coloured residual.
+    The search is over turning point, decay rate and frequency; rest point, drift, first amplitude
+    and friction band are linear. The F-statistic allows for a correlated residual.
 
     Parameters
     ----------
     t, y : (n,) one free decay.
     viscous : the fit without friction, to the same samples.
-    turning : s, a turning point of the cart, about; `falling`: it moves to smaller y afterwards.
-    floor : the least residual (root-mean-square) that means anything; a friction band within it
-        is not called present.
+    turning : s, an approximate turning point; `falling`: y decreases after it.
+    floor : the least significant residual (root-mean-square); a friction band within it is not
+        called present.
 
     Returns
     -------
-    None where the samples do not carry the further unknowns or the fit does not converge.
+    None if the samples do not determine the further unknowns or the fit does not converge.
     """
     pole = complex(viscous.poles[0])
     if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
         return None
     cut = partial(_Swings.at, direction=-1.0 if falling else 1.0)
-    # Up to 1.5 times the noise without friction there is little, if any.
+    # Up to 1.5 times the noise without friction, there is little of it, if any.
     fits = [
         fit_separable(
             y,
@@ -92,7 +92,7 @@ def fit_friction(
 
 
 def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
-    """Return (7, 7) the inverse of J'J, J by the nonlinear unknowns, then by the linear ones."""
+    """Return (7, 7) the inverse of J'J, J by the nonlinear, then the linear unknowns."""
     full = np.column_stack([fitted.derivatives(linear), fitted.columns])
     size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
     inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
@@ -101,18 +101,18 @@ def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Swings:
-    """A decay, cut into half cycles at its turning points; those before the first one count, too.
+    """A decay, cut into half cycles at its turning points; those before the first one count too.
 
-    In each, y = rest + drift + (amplitude kept + friction pushed) swing - friction side, where
-    the friction band d is on the side the cart moves to.
+    In each, y = rest + drift + (amplitude kept + friction pushed) swing - friction side, with the
+    friction band d on the side the cart moves to.
 
     Attributes
     ----------
     p : turning point s, decay rate and damped frequency rad/s.
     since : (n,) s since the turning point; tau (n,) s since the half cycle began.
-    swing : (n,) from 1 at the half cycle's beginning towards -1 at its end; sine (n,) beside it.
-    cycle : (n,) which of the half cycles a sample is in.
-    number : (n_cycles,) what they are numbered, 0 after the turning point.
+    swing : (n,) from 1 at the half cycle's start to -1 at its end; sine (n,): its quadrature.
+    cycle : (n,) the half cycle of each sample.
+    number : (n_cycles,) their numbers, 0 after the turning point.
     kept, pushed, side : (n_cycles,) see above.
     """
 
@@ -157,13 +157,13 @@ class _Swings:
 
     @property
     def columns(self) -> Array:
-        """What rest point, drift, amplitude and friction band multiply, (n, 4)."""
+        """Return the factors of rest point, drift, amplitude and friction band, (n, 4)."""
         kept, pushed, side = (part[self.cycle] for part in (self.kept, self.pushed, self.side))
         one = np.ones_like(self.tau)
         return np.array([one, self.since, kept * self.swing, pushed * self.swing - side]).T
 
     def derivatives(self, linear: Array) -> Array:
-        """Return those of y by the turning point, the decay rate and the frequency, (n, 3)."""
+        """Return the derivatives of y by turning point, decay rate and frequency, (n, 3)."""
         _, drift, amplitude, band = linear
         _, decay, omega_d = self.p
         tau, swing, sine, ratio = self.tau, self.swing, self.sine, decay / omega_d

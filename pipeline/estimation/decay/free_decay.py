@@ -12,16 +12,17 @@ from pipeline.estimation.decay.ringing import Ringing, fit_ringing
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
-# Residual over noise up to which a model says all there is to say: with 50 samples chance moves it
-# by a tenth.
+# The ratio of residual to noise below which a model is complete: with 50 samples chance moves it by
+# a tenth.
 _ADEQUATE = 1.5
-# Swings are counted in grains: encoder steps, or as much noise as would round as coarsely.
+# Swings are counted in grains: the encoder step, or the step that would round as coarsely as the
+# noise.
 _PROMINENCE = 6.0
 _SMALLEST_SWING = 8.0
-_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points left to the hand, where enough others remain
+_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points attributed to the hand, if enough others remain
 _MIN_SAMPLES = 12
-# Carried back, a fit may be off by so many of its own residuals; and by a share of the amplitude
-# while it stands on the smaller swings only, or where it leaves more than noise anyway.
+# Extended backwards, a fit may be off by this many of its own residuals. A share of the amplitude
+# is added while it rests on the smaller swings only, or if it leaves more than noise anyway.
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0)
 _REAL_SHARE = 0.15
@@ -30,7 +31,7 @@ _RELEASE_MARGIN = 1 / 40  # of a period, in which the fingers leave the cart
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stretch:
-    """Samples [first, stop) without a change of the input; the input's level, None without."""
+    """Samples [first, stop) with constant input; its level, or None without an input."""
 
     first: int
     stop: int
@@ -54,7 +55,7 @@ class FreeDecay:
         return self.friction.model if self.friction and self.friction.test.present else self.fit
 
     def rms(self, t: Array, y: Array) -> float:
-        """Root-mean-square of what the model leaves of the decay; `t`, `y` are the record's."""
+        """Root-mean-square residual of the model over the decay; `t`, `y` are the record's."""
         window = slice(self.first, self.stop)
         return float(np.sqrt(np.mean((y[window] - self.model(t[window])) ** 2)))
 
@@ -62,11 +63,11 @@ class FreeDecay:
 def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list[int]]:
     """Return the turning points of the record's largest free decay, and the stretch it is in.
 
-    `size` is the smallest change that means anything. The part without input is preferred.
+    `size` is the smallest significant change. The part without input is preferred.
 
     Raises
     ------
-    DataError : nowhere two turning points of one decay.
+    DataError : no stretch has two turning points of one decay.
     """
     y = record.position(cart)
     most = 0
@@ -102,7 +103,7 @@ def _stretches(record: Record) -> list[list[Stretch]]:
 
 
 def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[int]:
-    """Return the turning points of the largest run of ever smaller swings in equal times."""
+    """Return the turning points of the largest run of decreasing swings in equal times."""
     part = y[stretch.first : stretch.stop]
     # The first is where the stretch begins, no turning point. The last is where the cart came to
     # rest, and counts if it did so in time.
@@ -113,8 +114,8 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
     start = 0
     while start < swings.size:
         end = start + 1
-        # A swing may exceed the one before by this much, no more.
-        # Of the intervals so far; a hand keeps no better time.
+        # A swing may exceed the one before by this factor. For times, of the intervals so far; a
+        # hand is not more regular.
         while (
             end < swings.size
             and _SMALLEST_SWING * size <= swings[end] <= 1.02 * swings[end - 1]
@@ -127,7 +128,7 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
 
 
 def _score(y: Array, run: list[int]) -> float:
-    """Rank runs: more swings first by their kind (one, several), then by how far they go."""
+    """Rank runs: first by the kind of their number of swings (one, several), then by size."""
     if len(run) < 2:
         return 0.0
     travelled = float(np.sum(np.abs(np.diff(y[run]))))
@@ -137,14 +138,14 @@ def _score(y: Array, run: list[int]) -> float:
 def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: float) -> FreeDecay:
     """Fit the free decay from its release to its last turning point.
 
-    The later swings are fitted first and carried back over the earlier ones, as far as they
-    agree: so the hand is told from the cart. Where not even the later swings fit to the noise
-    (real friction is no textbook's), all of them count.
+    The later swings are fitted first and extended back over the earlier ones as long as they agree.
+    This separates the hand from the cart. If not even the later swings fit to the noise (real
+    friction is not ideal), all of them count.
 
     Parameters
     ----------
     run : the turning points.
-    floor : the least residual (root-mean-square) that means anything.
+    floor : the least significant residual (root-mean-square).
     """
     interval = float(np.median(np.diff(t[run])))
     stop = run[-1] + 1
@@ -154,7 +155,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
     def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
-        """Fit with dry friction where the viscous fit leaves more than noise, and at last."""
+        """Fit with dry friction if the viscous fit leaves more than noise."""
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
         friction = None
@@ -176,7 +177,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
-        # How a real cart breaks away is no part of the model: from its first passage on.
+        # The start of a real cart's motion is not part of the model: begin at its first passage.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
         held = _carried_back(t, y, decay, latest=decay.first, share=_REAL_SHARE, floor=floor)
@@ -196,7 +197,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
 def _carried_back(
     t: Array, y: Array, decay: FreeDecay, *, latest: int, share: float, floor: float
 ) -> int:
-    """Return the first sample, not after `latest`, from which on the decay's model holds."""
+    """Return the first sample, not after `latest`, from which the decay's model holds."""
     head = slice(decay.stretch.first, latest)
     size = abs(decay.fit.amplitudes[0]) * decay.fit.growth(t[head])[0]
     tolerance = _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * size

@@ -9,7 +9,7 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
 
 _MAX_EVALUATIONS = 100
-_MOST_GROWTH = 50.0  # of an exponent: beyond, numbers run over
+_MOST_GROWTH = 50.0  # of an exponent: larger ones overflow
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -19,9 +19,9 @@ class Ringing:
     Attributes
     ----------
     poles : (n_modes,) upper half plane, rad/s; `amplitudes` (n_modes,) complex, at `t0`.
-    covariance : of (level, slope, decay rates, frequencies), allowing for a coloured residual;
-        the slope's row is zero where it was not fitted.
-    rms : of the residual; `converged` False where the fit ran out of steps.
+    covariance : of (level, slope, decay rates, frequencies), allowing for a correlated residual;
+        the slope's row is zero if it was not fitted.
+    rms : of the residual; `converged` is False if the fit ran out of steps.
     """
 
     t0: float
@@ -40,12 +40,12 @@ class Ringing:
         return self.level + self.slope * tau + (self.amplitudes[:, None] * waves).real.sum(0)
 
     def growth(self, t: Array) -> Array:
-        """Return the size of each mode against that at `t0`, (n_modes, n); at most e^50."""
+        """Return the size of each mode relative to that at `t0`, (n_modes, n); at most e^50."""
         return np.exp(np.minimum(self.poles.real[:, None] * (t - self.t0), _MOST_GROWTH))
 
 
 def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:
-    """Fit damped sinusoids, a level and (with `drift`) a straight drift, from these poles on.
+    """Fit damped sinusoids, a level and (with `drift`) a straight drift, starting from these poles.
 
     The level, slope and amplitudes are linear, so that only decay rates and frequencies are
     searched.
@@ -93,7 +93,7 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Waves:
-    """Damped waves (n_modes, n) at dimensionless times `tau`, beside a level (and drift)."""
+    """Damped waves (n_modes, n) at dimensionless times `tau`, with a level (and drift)."""
 
     tau: Array
     level: Array
@@ -130,5 +130,5 @@ def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes + 1].T
     z = np.linalg.eigvals(np.linalg.lstsq(rows[:-1], rows[1:], rcond=None)[0])
     s = np.log(z.astype(np.complex128)) / (grid[1] - grid[0])
-    # Imaginary part over size: below, a pole is real but for rounding.
+    # Imaginary part over size: below this a pole is real except for rounding.
     return s[s.imag > 1e-3 * np.abs(s)]

@@ -14,7 +14,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.minimise import evaluated_once
 
 _PRECISION = 1e-8  # relative: of the sum of squares, of p, and of its slope
-_FOUND = (1, 2, 3, 4)  # what MINPACK says where it came to one of them
+_FOUND = (1, 2, 3, 4)  # MINPACK's codes for convergence
 
 
 class SeparableModel(Protocol):
@@ -22,7 +22,7 @@ class SeparableModel(Protocol):
 
     @property
     def columns(self) -> Array:
-        """What the linear unknowns multiply, (n, n_linear)."""
+        """The factors of the linear unknowns, (n, n_linear)."""
         ...
 
     def derivatives(self, linear: Array) -> Array:
@@ -32,7 +32,7 @@ class SeparableModel(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SeparableFit:
-    """The nonlinear unknowns p (n_p,) and the linear ones where the residual is least.
+    """The nonlinear unknowns p (n_p,) and the linear ones at the least residual.
 
     `residual` (n,) is model - y; `converged` False where the fit ran out of steps.
     """
@@ -58,8 +58,8 @@ def fit_separable(
         return J - point.basis @ (point.basis.T @ J)
 
     at = evaluated_once(lambda p: _solved(y, model(p)))
-    # `least_squares` runs the same MINPACK routine, and takes as long again to prepare each call.
-    with np.errstate(over="ignore"):  # in its covariance of p, which nobody asks for
+    # `least_squares` runs the same MINPACK routine, but takes as long again to prepare each call.
+    with np.errstate(over="ignore"):  # in its covariance of p, which is not used
         p, *_, status = leastsq(
             lambda p: at(p).residual,
             start,
@@ -77,7 +77,7 @@ def fit_separable(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Point:
-    """The model at some p (n_p,), its linear unknowns solved for; `basis` spans the columns."""
+    """The model at some p (n_p,), with its linear unknowns solved; `basis` spans the columns."""
 
     model: SeparableModel
     basis: Array
@@ -86,10 +86,10 @@ class _Point:
 
 
 def _solved(y: Array, model: SeparableModel) -> _Point:
-    """Return the model with the linear unknowns that leave the least of y."""
+    """Return the model with the linear unknowns of least residual."""
     X = model.columns
     basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
-    # Columns that are alike, far from the fit, share what they explain.
+    # Columns that are nearly equal, far from the fit, share their contribution.
     apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
     linear = (y @ basis / apart) @ turn
     return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)

@@ -57,7 +57,7 @@ class Chain:
     def matrices(self, *, free: Sequence[int] | None = None) -> tuple[Array, Array, Array, Array]:
         """Return M, C, K (f, f) and the force vector (f,) of the free carts, the others held.
 
-        A held cart is a wall: its row and column go. Holding cart 1 leaves no input.
+        A held cart is a wall, so its row and column are removed. Holding cart 1 leaves no input.
         """
         rows = self._rows(free)
         force = np.array([1.0 if row == 0 else 0.0 for row in rows])
@@ -119,8 +119,8 @@ class Chain:
 
         Raises
         ------
-        DataError : no spring holds the carts, so a constant force has no rest position; or springs
-            so far apart in stiffness that the numbers cannot tell.
+        DataError : no spring holds the carts, so a constant force has no rest position; or the
+            springs' stiffnesses differ too much for the numbers.
         """
         if not self.is_tied:
             raise DataError("no spring ties the carts to a wall: there is no static gain")
@@ -134,7 +134,7 @@ class Chain:
 
     @property
     def is_tied(self) -> bool:
-        """Whether every cart is tied to a wall, by its own springs or through its neighbours."""
+        """Whether every cart is connected to a wall, directly or through its neighbours."""
         from_left = np.logical_and.accumulate(self.k[:-1] != 0)
         from_right = np.logical_and.accumulate(self.k[:0:-1] != 0)[::-1]
         return bool(np.all(from_left | from_right))
@@ -167,7 +167,7 @@ class Chain:
 
     @property
     def zeta_carts(self) -> Array:
-        """zeta_i (n,): each cart alone, the others held; infinite where no spring holds it."""
+        """zeta_i (n,): each cart alone, the others held; infinite if no spring holds it."""
         with np.errstate(divide="ignore"):
             return self.c / (2 * self.m * self.omega_carts)
 
@@ -203,12 +203,12 @@ class Chain:
     def parameters(self) -> dict[str, float]:
         """Return the named parameters of this chain, in the order of the paper's Tables 1-3.
 
-        `K, omega_n, zeta` for one cart (`mass, damping` where it has no spring); two and three
-        carts as in Tables 2 and 3; more carts as for two, with further letters and numbers.
+        `K, omega_n, zeta` for one cart (`mass, damping` if it has no spring); two and three carts
+        as in Tables 2 and 3; more carts as for two, with further letters and numbers.
 
         Raises
         ------
-        DataError : several carts that no spring ties to a wall have no static gains.
+        DataError : several carts without a spring to a wall have no static gains.
         """
         if self.n == 1 and self.k.sum() == 0:
             return {"mass": float(self.m[0]), "damping": float(self.c[0])}

@@ -1,4 +1,4 @@
-"""Sine dwells on a chain: at which frequencies, how long the transient lasts, how far they go."""
+"""Sine dwells on a chain: their frequencies, the length of the transient, and the reach."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ SETTLED_DWELL = 9.0  # … to a tenth of one: at a resonance it hides in the amp
 def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> list[float]:
     """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
 
-    Half the number is spread evenly over the range, as a first look would; the rest brackets each
-    feature: on it and half a bandwidth to each side. Those of `among` are always there.
+    Half of them are spread evenly over the range, as in a first look. The others bracket each
+    feature: on it, and half a bandwidth to each side. Those of `among` are always included.
     """
     features = [quadratic_factors(chain.poles)]
     features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
@@ -30,7 +30,7 @@ def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> l
     spread = np.geomspace(0.7 * resonances[0], 1.5 * resonances[-1], max(n - close.size, n // 2))
     hertz = list(among)
     for candidate in [*close, *spread]:
-        f = round(float(candidate) / (2 * np.pi), 2)  # as one types it
+        f = round(float(candidate) / (2 * np.pi), 2)  # as people type it
         if all(abs(f - other) > 0.015 * other for other in hertz):
             hertz.append(f)
     return sorted(hertz)
@@ -39,25 +39,25 @@ def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> l
 def settling_wait(chain: Chain, *, time_constants: float) -> float:
     """Return how long a student waits for the transient, s."""
     slowest = float(np.min(-chain.poles.real))
-    if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero but for rounding
+    if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero except for rounding
         raise DataError("the carts never settle: a session needs damping and a spring to a wall")
-    # No student waits longer, however little damping there is.
+    # No student waits longer, however small the damping.
     return min(time_constants / slowest, 12.0)
 
 
 def steady_time(hertz: float) -> float:
-    """Return how long a dwell goes on once the transient is over, s."""
-    # Room to see that six cycles do not change any more; or seconds, at high frequencies.
+    """Return how long a dwell goes on after the transient, s."""
+    # Enough to see that six cycles no longer change; or seconds, at high frequencies.
     return max(6.5 / hertz, 1.4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """How far an input of size one moves any cart, in position units.
+    """The largest motion of any cart under an input of size one, in position units.
 
     Attributes
     ----------
-    steady : once the transient is over.
+    steady : after the transient.
     furthest : at any time.
     """
 

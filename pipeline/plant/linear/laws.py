@@ -1,7 +1,7 @@
-"""The orders that gains, resonances and nulls of a real chain of carts stand in.
+"""The order of gains, resonances and nulls of a real chain of carts.
 
-Carts held still raise every frequency, so resonances and nulls interlace (Cauchy); without
-damping exactly, with heavy damping they may bend.
+Holding carts raises every frequency, so resonances and nulls interlace (Cauchy): exactly without
+damping; with heavy damping they may not.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ class Bracket(NamedTuple):
 
 
 def brackets(n: int) -> list[Bracket]:
-    """Return what lies between what in a chain of n carts, two or more, all springs there."""
+    """Return the brackets of a chain of n carts, two or more, with all springs present."""
     modes, alone = omega_names(MODES[:n]), omega_names(map(str, range(1, n + 1)))
     found = [Bracket(modes[0], name, modes[-1], _ALONE) for name in alone]
     if n == 3:
@@ -41,7 +41,7 @@ def brackets(n: int) -> list[Bracket]:
 
 
 def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Return (lesser, greater, why) of every order that the named parameters obey.
+    """Return (lesser, greater, why) for every order that the named parameters obey.
 
     The names may come in any order, and some of a chain's may be missing.
     """

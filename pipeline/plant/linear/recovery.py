@@ -16,15 +16,15 @@ from pipeline.plant.linear.chain import Chain
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Recovered:
-    """The chain that a set of transfer functions implies; arrays may go on with more axes.
+    """The chain implied by a set of transfer functions; arrays may have further axes.
 
     Attributes
     ----------
-    m, c : (n,), k : (n + 1,), as in `Chain`, but as found: a measured table may well imply a
-        negative spring, which `Chain` users must see and not have hidden.
+    m, c : (n,), k : (n + 1,), as in `Chain`, but as found: a measured table may imply a negative
+        spring, which must be visible.
     damping_terms, stiffness_terms : (n,) 2 zeta_i omega_i and omega_i² of each cart alone.
     couplings : (n - 1,) k² over both masses, of the springs between the carts.
-    routes : the redundancies R1, R2, …: two routes to one number.
+    routes : the redundancies R1, R2, …: two ways to compute one number.
     """
 
     m: Array
@@ -49,8 +49,9 @@ def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
     """Recover masses, dampings and springs from static gains and the polynomials T_1 … T_n.
 
     `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Further axes
-    hold further chains. Uses the best-conditioned route for every number (the s¹ coefficients only
-    serve as checks: rounding grows some 15 times along them) and returns what is left over.
+    hold further chains. Each number is computed by the best-conditioned route, and the redundancies
+    are returned. The s¹ coefficients serve as checks only, as rounding grows some 15 times along
+    them.
     """
     n, others = len(gains), tails[0].shape[1:]
     T = [*tails, np.ones((1, *others))]
@@ -96,7 +97,7 @@ def _relative_difference(a: float, b: float) -> float:
 
 
 def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequence[Array]]:
-    """Return the static gains (n,) and T_1 … T_n that named parameters of 1 to 3 carts stand for.
+    """Return the static gains (n,) and T_1 … T_n of named parameters of 1 to 3 carts.
 
     `values` uses the names of `Chain.parameters`; the recomputed ones (omega_1, …) are not read,
     except the last cart's, which is the zero of the cart before it.
@@ -129,9 +130,9 @@ def _quadratic(values: Mapping[str, float | Array], suffix: str, zeta: str | Non
 
 
 def recover_from_parameters(values: Mapping[str, float | Array]) -> Recovered:
-    """Recover the chain from named parameters (1 to 3 carts), with the redundancies left over.
+    """Recover the chain from named parameters (1 to 3 carts), with the redundancies.
 
-    Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10
-    (R1 to R5). A table that a real chain made leaves them at zero.
+    Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10 (R1
+    to R5). For a table of a real chain they are zero.
     """
     return recover_chain(*transfer_functions(values))

@@ -77,8 +77,8 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
 def _by_blocks(transition: Array, forced: Array, x: Array) -> Array:
     """Return the states (n, n_states) that follow x, the next being transition @ x + forced[i].
 
-    Their sum over time is split: blocks are run from rest, all at once, then joined. That takes
-    2 √n steps of the interpreter instead of n.
+    Their sum over time is split: blocks are run from rest, all at once, then joined. That takes 2
+    √n steps of the interpreter instead of n.
     """
     n, n_states = forced.shape
     length = isqrt(n)

@@ -1,4 +1,4 @@
-"""The numbers a step response is judged by: overshoot and settling time."""
+"""The two measures of a step response: overshoot and settling time."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from pipeline.plant.limits import SETTLING_BAND
 
 
 def overshoot_percent(y: Array, *, before: Array | float, level: Array | float) -> Array:
-    """Return how far `y` (..., n) goes past the final level, in percent of the change in level."""
+    """Return how far `y` (..., n) exceeds the final level, in percent of the change in level."""
     change = np.asarray(level, dtype=np.float64) - before
     past = (y - np.asarray(level)[..., None]) * np.sign(change)[..., None]
     return 100 * np.maximum(past.max(-1), 0.0) / np.abs(change)

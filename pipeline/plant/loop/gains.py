@@ -14,7 +14,7 @@ def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
 
     Raises
     ------
-    LinAlgError : the plant's numbers lie too many orders of magnitude apart.
+    LinAlgError : the plant's numbers differ by too many orders of magnitude.
 
     Reference: E. K. Chu, H. Fan, W. Lin, Linear Algebra Appl. 396 (2005) 55-80.
     """

@@ -1,7 +1,7 @@
-"""The designed loop as systems of python-control, and how far it is from the edge.
+"""The designed loop as systems of python-control, and its distance from instability.
 
-The loop is that of `sampled_loop`: gains on the state predicted for the moment the effort begins
-to act, the observer's prediction, one sample of delay.
+The loop is that of `sampled_loop`: gains on the state predicted for the moment the input acts, the
+observer's prediction, one sample of delay.
 """
 
 from typing import TYPE_CHECKING
@@ -17,14 +17,14 @@ from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop, discret
 if TYPE_CHECKING:
     import control  # half a second: imported where it is used
 
-_SLOWER = 1e-2  # times the slowest pole: there the band begins
+_SLOWER = 1e-2  # times the slowest pole: the lower end of the band
 _NEAREST, _AROUND = 1e-6, 30  # of a mode's frequency, the least distance looked at, and how many
 _ON_AXIS = 1e-2  # rad, by which a crossing of the interpolated curve may miss the true one
 
 
 @result()
 class Margins:
-    """How much the designed loop, cut at the motor, may change before it is unstable.
+    """How much the designed loop, cut at the motor, may change before it becomes unstable.
 
     Reference: K. J. Astrom, R. M. Murray, Feedback Systems, 2nd ed., section 10.3.
     """
@@ -49,8 +49,8 @@ def closed_loop(
 ) -> "control.StateSpace":
     """Return the loop from the set point `r` to the positions, sampled every `sample_time` s.
 
-    The states are those of the carts and the effort `u` that acts: it was computed a sample ago,
-    so it makes the one pole at z = 0. The observer knows the plant, so nothing of it shows.
+    The states are those of the carts and the acting input `u`: it was computed a sample ago, which
+    gives the pole at z = 0. The observer knows the plant, so its poles do not appear.
     """
     import control
 
@@ -73,11 +73,11 @@ def closed_loop(
 def stability_margins(
     chain: Chain, controller: StateFeedback, *, sample_time: float
 ) -> Margins | None:
-    """Return the margins of the loop cut at the motor, or None where it is not stable.
+    """Return the margins of the loop cut at the motor, or None if it is unstable.
 
     Raises
     ------
-    DataError : a mode of the carts is undamped, as one is whose damping a fit held at zero.
+    DataError : a mode of the carts is undamped, such as one whose damping a fit held at zero.
     """
     import control
 
@@ -98,10 +98,10 @@ def stability_margins(
     _, _, _, at_180, at_one, near_minus_one = control.stability_margins(
         (np.abs(L), np.degrees(np.angle(L)), omega), returnall=True
     )
-    # At both ends of the band the response is real, and where it is negative crosses -180° too;
-    # carts that no spring ties to a wall have none at the lower end.
+    # At both ends of the band the response is real, and if negative it crosses -180° too; carts
+    # without a spring to a wall have no lower end.
     at_180 = np.append(at_180, [0.0, np.pi / sample_time] if chain.is_tied else np.pi / sample_time)
-    # The curve between the frequencies looked at was interpolated: what counts is the true one.
+    # The curve between the frequencies was interpolated; now the true one is used.
     real, size_one = response(at_180), response(at_one)
     crosses = np.abs(np.angle(-real)) < _ON_AXIS
     at_180, gain = at_180[crosses], 1 / np.abs(real[crosses])
@@ -119,12 +119,12 @@ def stability_margins(
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
-    """Return frequencies up to Nyquist's, rad/s, the closer together the nearer to a pole."""
+    """Return frequencies up to Nyquist's, rad/s, denser near a pole."""
     nyquist = np.pi / sample_time
     s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # the others turn nothing quickly
     slowest = np.abs(s[np.abs(s) > _NEAREST * nyquist]).min(initial=nyquist)
     lowest = min(_SLOWER * slowest, _SLOWER * nyquist)
-    # So many a decade, to which each mode adds its own.
+    # This many a decade, plus those of each mode.
     count = int(60 * np.log10(nyquist / lowest))
     band = np.geomspace(lowest, nyquist, count, endpoint=False)
     modes = s[s.imag > 0]

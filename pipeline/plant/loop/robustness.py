@@ -1,4 +1,4 @@
-"""What a feedback loop does when the plant is not quite the model it was designed for."""
+"""The behaviour of a feedback loop on plants that differ from the model."""
 
 import numpy as np
 from scipy.linalg import hadamard
@@ -10,10 +10,10 @@ from pipeline.plant.loop.sampled_loop import StateFeedback, loop_matrix
 
 
 def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float) -> bool:
-    """Tell whether the loop is stable on plants off by what identification leaves open.
+    """Return whether the loop is stable on all plants within the errors of identification.
 
-    A two-level screening design and its mirror image: 32 plants that hold every main effect of
-    the errors and many of their combinations. For up to four carts.
+    A two-level screening design and its mirror image: 32 plants that cover every main effect of the
+    errors and many combinations. For up to four carts.
 
     Reference: R. L. Plackett, J. P. Burman, Biometrika 33 (1946) 305-325.
     """
@@ -34,7 +34,7 @@ def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float)
 def level_error_percent(chain: Chain, gains: Array, *, cart: int) -> Array:
     """Return how far errors in the springs move a cart's level, for gains (…, 2n).
 
-    In percent of the level, to first order, the errors of all springs against us.
+    In percent of the level, to first order, with all springs' errors in the worst direction.
     """
     inverse = _compliance(chain, gains)
     x = inverse[..., :, 0]
@@ -50,6 +50,6 @@ def static_levels(chain: Chain, gains: Array) -> Array:
 
 
 def _compliance(chain: Chain, gains: Array) -> Array:
-    """Return the inverse of the stiffness that the feedback leaves, (…, n, n)."""
+    """Return the inverse of the stiffness under feedback, (…, n, n)."""
     fed_back = np.eye(chain.n)[:, :1] * gains[..., None, 0::2]
     return np.asarray(np.linalg.inv(chain.stiffness + fed_back), dtype=np.float64)

@@ -20,7 +20,8 @@ without delay and one at z = 0. The observer starts at the first reading, at res
 
 PID: effort = scale (kp e + ki ∫e + kd de/dt), e = r - y of one cart, in the units of the readings.
 ∫e is the sum of e sample_time up to this tick, de/dt the difference from the last tick over
-sample_time; before the first tick e is zero, so a reference that stands at the first tick kicks.
+sample_time. Before the first tick e is zero, so a reference that is on at the first tick causes a
+kick.
 """
 
 from collections.abc import Sequence
@@ -34,8 +35,8 @@ from pipeline.arrays import Array, frozen_array
 from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 
-# Share of the prediction error at a tick that is put down to the velocity. A half keeps three
-# quarters of the encoder's rounding noise out of v and forgets a wrong start in a few ticks.
+# Share of the prediction error at a tick that corrects the velocity. A half keeps three quarters of
+# the encoder's rounding noise out of v and forgets a wrong start in a few ticks.
 VELOCITY_CORRECTION = 0.5
 MOST_TICKS = 200_000  # of a run: over three minutes at 1 kHz, and some seconds to simulate
 
@@ -89,28 +90,28 @@ class LoopRun:
 
 
 class MovingPlant(Protocol):
-    """What may stand for the chain in a loop: it moves on by a sample and keeps its state."""
+    """A plant that may replace the chain in a loop: it advances by a sample and keeps its state."""
 
     @property
     def state(self) -> Array:
-        """State (x1, v1, x2, v2, …) of the free carts as the sensors read it, (2f,)."""
+        """State (x1, v1, x2, v2, …) of the free carts as read by the sensors, (2f,)."""
         ...
 
     def step(self, u: float, *, following: float, interval: float) -> None:
-        """Move on by `interval` s under the input `u`; `following` is the one that comes next."""
+        """Advance by `interval` s under the input `u`; `following` is the next input."""
         ...
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopSetup:
-    """How the controller and the carts are joined.
+    """The connection of controller and carts.
 
     Attributes
     ----------
     sample_time : s, of the controller; default the mean interval of the run.
     delay : ticks from reading to acting, 1 or 0.
     input_limit : the effort is clipped to ± this.
-    drive : force on cart 1 per effort; other than 1 where a log has another sign or scale.
+    drive : force on cart 1 per effort; not 1 if a log has another sign or scale.
     encoder_step : what the controller's readings are rounded to, one number or (f,).
     rest : readings of the carts at rest without input, one number or (f,).
     free : the carts that move; default all.
@@ -150,8 +151,8 @@ def simulate_loop(
     ----------
     t : (n,) s, ascending; where the run is wanted. It begins at t[0].
     reference : set point, in the units of the readings; one number or (n,) at `t`.
-    start : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest. Or what moves
-        in the chain's place, from the state it is in.
+    start : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest. Or a plant
+        that replaces the chain, in its present state.
 
     Raises
     ------
@@ -162,7 +163,7 @@ def simulate_loop(
     interval = (t[-1] - t[0]) / (t.size - 1)
     T = interval if setup.sample_time is None else setup.sample_time
     check_ticks(float(t[-1] - t[0]), T)
-    # Time stamps are rounded and jitter: an instant belongs to the nearest sample.
+    # Time stamps are rounded and jitter, so an instant belongs to the nearest sample.
     ticks = np.arange(int(np.floor((t[-1] - t[0]) / T + 0.5)) + 2)
     r = np.broadcast_to(np.asarray(reference, dtype=np.float64), t.shape)
     nearest = np.searchsorted((t[1:] + t[:-1]) / 2, t[0] + T * ticks)
@@ -196,7 +197,7 @@ def simulate_loop(
 
 
 def check_ticks(duration: float, sample_time: float) -> None:
-    """Raise DataError where a run has more ticks than a simulation can go through."""
+    """Raise DataError if a run has more ticks than a simulation can handle."""
     if not duration <= MOST_TICKS * sample_time:
         raise DataError(
             f"a loop needs at most {MOST_TICKS:,} ticks to be simulated, found "
@@ -209,8 +210,8 @@ def replay(
 ) -> Array:
     """Return the effort (n,) the controller asks for at each reading of a recorded run.
 
-    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted: what the
-    stated law makes of what the carts did, to hold against the logged input.
+    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted: this is the
+    response of the stated law to the actual motion, for comparison with the logged input.
     """
     T = float(t[-1] - t[0]) / (t.size - 1)
     law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])
@@ -268,7 +269,7 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
 
 
 class _Law(Protocol):
-    """A controller's memory: told of each reading, asked for the effort, told what acts."""
+    """A controller's memory: it gets each reading, returns the effort, and learns what acts."""
 
     def measure(self, y: Array) -> None: ...
     def predict(self, applied: float) -> None: ...
@@ -305,7 +306,7 @@ class _PidLaw:
         self.y = float(y[self.row])
 
     def predict(self, applied: float) -> None:
-        """Do nothing: a PID controller knows no plant."""
+        """Do nothing: a PID controller has no plant model."""
 
     def effort(self, r: float) -> float:
         pid, error = self.controller, r - self.y

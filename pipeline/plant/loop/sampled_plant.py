@@ -1,4 +1,4 @@
-"""A chain as its controller sees it: sampled, free of units, and the energies in its state."""
+"""A chain as its controller sees it: sampled, without units, with its energies."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ class SampledPlant:
     def of(
         cls, chain: Chain, *, cart: int, settling: float, sample_time: float | None
     ) -> "SampledPlant":
-        """Sample a chain, fast enough for its modes and for the settling (s) asked for."""
+        """Sample a chain fast enough for its modes and for the desired settling time (s)."""
         speeds = np.maximum(np.abs(chain.poles), 4 / settling)
         rate = float(np.exp(np.log(speeds).mean()))
         if sample_time is None:
@@ -60,22 +60,22 @@ class SampledPlant:
         return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
 
     def cost_to_units(self, weights: Array) -> Array:
-        """Return Q of the cost in which the input's square is weighed by 1/stiffness."""
+        """Return Q of the cost in which the input's square has the weight 1/stiffness."""
         unit = np.tile([1.0, self.rate], self.chain.n)
         return self.stiffness * weights / np.outer(unit, unit)
 
     def stays_stable(self, gains: Array) -> bool:
-        """Whether the loop is stable whatever the usual errors of the chain; gains in units."""
+        """Whether the loop tolerates the usual errors of the chain; gains in units."""
         controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
         return stays_stable(self.chain, controller, sample_time=self.sample_time)
 
 
 def energy_weights(plant: SampledPlant, weights: Array) -> Array:
-    """Return Q (n_candidates, 2n, 2n) for a grid of weights of either energy, R being one."""
+    """Return Q (n_candidates, 2n, 2n) for a grid of weights of both energies, with R = 1."""
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
     if chain.k[0] == chain.k[-1] == 0:
-        # Nothing holds the carts as a whole: weigh their mean displacement as a spring would.
+        # Nothing holds the carts as a whole: weight their mean displacement as a spring would.
         stiffness = stiffness + np.ones((n, n)) / n**2
     potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
     potential[0::2, 0::2] = stiffness

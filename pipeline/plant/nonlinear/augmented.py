@@ -1,7 +1,7 @@
 """Simulate the chain with effects: whole runs at once, or sample by sample under a controller.
 
-What the sensors read is what comes out, a sensor's own scale included. Importing this module
-compiles; the linear chain never needs it.
+The results are sensor readings, which include a sensor's own scale. Importing this module compiles
+code that the linear chain never needs.
 """
 
 from collections import deque
@@ -39,7 +39,7 @@ def simulate_augmented(
     ----------
     t, u : (n,) s and input, held from sample to sample.
     free : the carts free to move; default all. The others are held at zero.
-    x0 : (n_carts,) positions at the start; default where the carts rest.
+    x0 : (n_carts,) positions at the start; default the rest positions.
 
     Returns
     -------
@@ -47,20 +47,20 @@ def simulate_augmented(
 
     Raises
     ------
-    DataError : the carts run away.
+    DataError : the carts diverge.
     """
     n = model.chain.n
     free = _all(n) if free is None else free
     x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
-    # In smaller steps than usual: this is what others are judged by.
+    # In smaller steps than usual, since others are judged by this.
     return _simulate(model.tables(), t, u, free=free, x0=x0, refine=4.0)
 
 
 def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) -> Array:
     """Return where the carts rest without input and without dry friction, (n_carts,).
 
-    They are let go at zero with their dampings so large that they creep to their rest. Carts that
-    no spring ties to a wall rest anywhere: zero.
+    They are released at zero with dampings so large that they creep to their rest. Carts without a
+    spring to a wall rest anywhere, so at zero.
     """
     tables, n = model.tables(), model.chain.n
     cart = tables.cart
@@ -72,7 +72,7 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     stiffness, m = model.chain.stiffness, model.chain.m
     cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
     slowest = np.sqrt(np.linalg.eigvals(stiffness / m[:, None]).real.min())
-    # After 40 periods of the slowest motion, heavily damped, nothing is left of the start.
+    # After 40 periods of the slowest motion, heavily damped, the start is forgotten.
     t = np.array([0.0, 40.0 * 2 * np.pi / slowest])
     free = _all(n) if free is None else free
     return _simulate(tables, t, np.zeros(2), free=free, x0=np.zeros(n), refine=1.0)[:, -1]
@@ -94,22 +94,22 @@ def _all(n: int) -> tuple[int, ...]:
 
 
 def compile_simulator() -> None:
-    """Run the simulator once, so that it is compiled: ten seconds, where nobody has yet."""
+    """Run the simulator once, so that it is compiled: ten seconds, unless it is stored."""
     chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
     simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))
 
 
 class SteppedBench:
-    """A bench that moves on by one interval at a time and keeps all of its state.
+    """A bench that advances by one interval at a time and keeps all of its state.
 
-    Friction, contacts, hidden masses, the delay line and the drive's lag carry over from call to
-    call. A hand may carry a cart, let it go, and push.
+    Friction, contacts, hidden masses, the delay line and the drive's lag carry over between calls.
+    A hand may carry a cart, release it, or push it.
     """
 
     def __init__(
         self, model: AugmentedChain, *, free: Sequence[int] | None = None, x0: Array | None = None
     ) -> None:
-        """Put the bench at rest at `x0` (n_carts,), default where the carts rest."""
+        """Put the bench at rest at `x0` (n_carts,), by default its rest positions."""
         n = model.chain.n
         free = _all(n) if free is None else sorted(set(free))
         x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
@@ -140,11 +140,11 @@ class SteppedBench:
         self._inputs: deque[tuple[float, float]] = deque([(-np.inf, 0.0)])
         self._lagged = 0.0
 
-    # ------------------------------------------------------------------ what it shows
+    # ------------------------------------------------------------------ its readings
 
     @property
     def readings(self) -> Array:
-        """What the sensors of all carts read, (n_carts,)."""
+        """The readings of all carts' sensors, (n_carts,)."""
         return self._tables.cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[kernel.X, : self._n]
 
     @property
@@ -155,19 +155,19 @@ class SteppedBench:
 
     @property
     def shortest_step(self) -> float:
-        """The longest substep that it may take where it is stiffest, s."""
+        """The longest substep allowed where it is stiffest, s."""
         return min(self._step, self._push.contact_step)
 
-    # ------------------------------------------------------------------ what moves it
+    # ------------------------------------------------------------------ its motion
 
     def step(self, u: float, *, following: float, interval: float) -> None:
-        """Move on by `interval` s under the input `u`; `following` is the one that comes next.
+        """Advance by `interval` s under the input `u`; `following` is the next input.
 
-        The next input is needed where a drive leads its log (a negative delay).
+        The next input is needed if a drive leads its log (a negative delay).
 
         Raises
         ------
-        DataError : the carts run away, or the drive leads by more than the interval.
+        DataError : the carts diverge, or the drive leads by more than the interval.
         """
         if -self._tables.drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
             raise DataError("in a closed loop the input cannot lead its log by over one sample")
@@ -196,14 +196,17 @@ class SteppedBench:
         self.step(0.0, following=0.0, interval=interval)
 
     def let_go(self, cart: int, *, velocity: float) -> float:
-        """Free all carts again, this one at a velocity; returns the force that held its springs."""
+        """Free all carts again, this one with a velocity;
+
+        return the force that held its springs.
+        """
         self._state[kernel.INV] = self._inverse_mass
         self._state[kernel.V, self._rows] = 0.0
         self._state[kernel.V, cart - 1] = velocity
         return -float(self._static_forces()[cart - 1])
 
     def push(self, cart: int, force: float) -> None:
-        """Add a steady force on one cart, until it is taken off again."""
+        """Add a constant force on one cart, until it is removed."""
         self._state[kernel.FIX, cart - 1] += force
 
     # ------------------------------------------------------------------ inside
@@ -227,14 +230,14 @@ class SteppedBench:
         return mean
 
     def _static_forces(self) -> Array:
-        """Return the forces on all bodies but friction and the drive, as if they stood still."""
+        """Return the forces on all bodies except friction and the drive, at zero velocity."""
         s = self._state
         s[kernel.MID_X], s[kernel.MID_V], s[kernel.FORCE] = s[kernel.X], 0.0, s[kernel.FIX]
         smooth_forces(self._tables, self._bodies, 0.0, 0.0, self._push.smooth)
         return s[kernel.FORCE] - self._bodies.K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
-        """Put the contacts that are closed from the start into the matrices."""
+        """Put contacts that are closed from the start into the matrices."""
         bodies = self._bodies
         for e, which in enumerate(bodies.switches):
             if guard(which, False, self._tables, bodies.s, 0.0) > 0.0:
@@ -242,7 +245,7 @@ class SteppedBench:
                 switch(which, 1.0, self._tables, bodies.s, bodies.K, bodies.C)
 
     def _bend_presliding(self) -> None:
-        """Bend the presliding friction as far as it holds what acts on the carts at rest."""
+        """Bend the presliding friction until it balances the forces on the carts at rest."""
         net = self._static_forces()
         most = np.array([settling(self._tables.cart, i, 0.0)[0] for i in range(self._n)])
         for i in np.flatnonzero(most):

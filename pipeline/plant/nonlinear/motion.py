@@ -1,10 +1,10 @@
 """The chain with its effects as an ordinary differential equation, for python-control.
 
-Written from the effects' own laws. The simulator treats what switches at its very instant; here
-it is a right-hand side that any solver may integrate, and two things are near, not exact:
+It is written from the effects' own laws. The simulator switches at exact instants; here it is a
+right-hand side that any solver may integrate, and two things are approximate:
 
 - Dry friction, which is set-valued at rest, brakes a slow cart like a damper that would stop it in
-  `stop` s, up to the friction's size. A cart that is held creeps by force / mass * stop.
+  `stop` s, up to the friction's size. A held cart creeps by force / mass * stop.
 - A delay is a Padé approximation of the fourth order, good up to a frequency of about 4 / delay
   (rad/s); C. Moler, C. Van Loan, SIAM Review 45 (2003), 3-49, section 3, for the exponential.
 
@@ -54,7 +54,7 @@ _FUNCTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class _Expression:
-    """An expression of a law at one place, its parameters filled in."""
+    """An expression of a law at one place, with its parameters filled in."""
 
     code: Any
     values: Mapping[str, float]
@@ -83,7 +83,7 @@ class EquationsOfMotion:
 
         Raises
         ------
-        DataError : the drive leads its log, which no system of states can.
+        DataError : the drive leads its log, which no state-space system can.
         """
         chain, terms = model.chain, model.terms
         self.n = n = chain.n
@@ -110,7 +110,7 @@ class EquationsOfMotion:
             for term in terms
             if isinstance(term.effect.law, FrictionLaw)
         ]
-        # What goes into the drive passes the dead zone first.
+        # The dead zone shapes the input of the drive first.
         inputs = [term for term in terms if isinstance(term.effect.law, InputLaw)]
         inputs.sort(key=lambda term: term.effect.key)
         self._inputs = [
@@ -143,7 +143,7 @@ class EquationsOfMotion:
                 own = [f"x{i}_hidden", f"v{i}_hidden"]
             case "play":
                 own = ["x_motor", "v_motor"]
-                # Without the motor's mass a play leaves cart 1 a fiftieth, at the least.
+                # Without the motor's mass a play leaves cart 1 at least a fiftieth.
                 self._m[0] = max(self._m[0] - term.values[1], 0.02 * self._m[0])
             case "lag":
                 own = ["u_lag"]
@@ -159,9 +159,9 @@ class EquationsOfMotion:
         self.states += own
 
     def start(self, x0: Sequence[float]) -> Array:
-        """Return the state of carts let go at rest at `x0` (n_carts,), what hides on them too.
+        """Return the state of carts released at rest at `x0` (n_carts,), with their hidden masses.
 
-        Bristles are bent as far as they hold the carts.
+        Bristles are bent until they hold the carts.
         """
         state = np.zeros(len(self.states))
         state[: 2 * self.n : 2] = x0
@@ -248,7 +248,7 @@ class EquationsOfMotion:
         x: float,
         v: float,
     ) -> float:
-        """Return what reaches cart 1 across the play; fill the motor's rates."""
+        """Return the force that reaches cart 1 across the play; fill the motor's rates."""
         (gap, mass, stiffness, damping), at = play[0].values, play[1]
         apart, rate = state[at] - x, state[at + 1] - v
         side = 1.0 if apart > 0.0 else -1.0

@@ -1,4 +1,4 @@
-"""The catalogue of effects: what a bench may do beyond the linear chain.
+"""The catalogue of effects: behaviour of a bench beyond the linear chain.
 
 To add one: write an `Effect` in a file here, list it below, and run `python -m docs.codegen`.
 """
@@ -89,9 +89,9 @@ def find_effect(key: str) -> Effect:
 
 
 def _with_words(typed: str) -> list[str]:
-    """Return the effects that have all the words typed in their name, else in their title.
+    """Return the effects with all the typed words in their name, else in their title.
 
-    In the order of the catalogue, which begins with the commonest.
+    In the order of the catalogue, which begins with the most common.
     """
     words = set(_WORD.findall(typed[:60].lower()))  # no name is longer
     for names in (attrgetter("key"), attrgetter("title")):

@@ -1,4 +1,4 @@
-"""What an effect is: a hypothesis about the bench, with an equation, a fingerprint and a test."""
+"""An effect is a hypothesis about the bench, with an equation, a fingerprint and a test."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -51,19 +51,19 @@ class PlaceScales:
 
 @dataclass(frozen=True)
 class EffectParameter:
-    """One number of an effect.
+    """One parameter of an effect.
 
     Attributes
     ----------
     unit : in terms of "position", "input" and "s"; "" for a pure number.
-    scale : its typical size at a place, an expression in what `PlaceScales` has; starts and steps
-        are multiples of it.
-    typical : the multiple of `scale` that makes the effect plain to see.
-    signed : may be of either sign. A sign that picks a side (`side`) stays as it started.
-    neutral : the value that gives the base model (where one exists).
+    scale : its typical size at a place, an expression in the fields of `PlaceScales`; starts and
+        steps are multiples of it.
+    typical : the multiple of `scale` that makes the effect clearly visible.
+    signed : may be of either sign. A sign that picks a side (`side`) never changes.
+    neutral : the value that gives the base model (if one exists).
     lower, upper : bounds of the magnitude, in multiples of `scale`.
-    reach : how far its logarithm goes in one step of a fit.
-    reported : False for a detail of the contact that the data need but nobody asks for.
+    reach : the largest step of its logarithm in a fit.
+    reported : False for a detail of the contact that the data need but no user asks for.
     """
 
     name: str
@@ -95,20 +95,20 @@ class Effect:
 
     Attributes
     ----------
-    key : its name in files; `sentence` tells a student what it is.
-    law : in the symbols of the parameters; growth : its coordinates in a fit from nothing, where
-        they are others.
-    fingerprint : what it does to the data; deciding_run: the experiment that settles it.
-    axis : what to plot the force (or reading) against, to see it.
-    between_carts : on a spring to a wall it would be part of the linear chain.
+    key : its name in files; `sentence` explains it to a student.
+    law : in the symbols of the parameters; growth : its coordinates in a fit from zero, if they
+        differ.
+    fingerprint : its signs in the data; deciding_run: the experiment that settles it.
+    axis : the quantity against which the force (or reading) shows it.
+    between_carts : True if on a spring to a wall it would be part of the linear chain.
     fewest_carts : with fewer it is part of the linear chain.
     family : effects of one family exclude each other at one place; on several carts they are one.
     grows_from : the simpler effect whose fit is the start of this one's.
-    only_rest : shows in nothing but where the carts rest, like an encoder's zero; found from those.
-    equivalent : what the data cannot tell from it, and why.
-    same_as, same_below : the key of an effect that provably cannot be told from it while its first
-        parameter is below this many sample times.
-    genuine : False where the values have degenerated into another law.
+    only_rest : shows only in the rest positions, like an encoder's zero, and is found from them.
+    equivalent : effects that the data cannot distinguish from it, and why.
+    same_as, same_below : the key of an effect that provably cannot be distinguished from it while
+        its first parameter is below this many sample times.
+    genuine : False if the values have degenerated into another law.
     """
 
     written_as: ClassVar[str] = "key"
@@ -141,7 +141,7 @@ class Effect:
 
     @property
     def contact(self) -> bool:
-        """Whether bodies meet: it then has details of the contact that nobody asks for."""
+        """Whether it has a contact, with details that no user asks for."""
         return not all(p.reported for p in self.parameters)
 
     @property
@@ -152,12 +152,12 @@ class Effect:
 
     @property
     def dry(self) -> bool:
-        """Whether it is friction whose size differs from run to run."""
+        """Whether it is friction whose size differs between runs."""
         return isinstance(self.law, FrictionLaw | HysteresisLaw)
 
     @property
     def many_rests(self) -> bool:
-        """Whether carts may lie still elsewhere than where their springs alone would let them."""
+        """Whether carts may rest away from the equilibrium of their springs."""
         repeats = isinstance(self.law, ForceLaw) and {"x", "sin"} <= names_in(self.law.force)
         return self.dry or repeats
 
@@ -168,7 +168,7 @@ class Effect:
 
     @property
     def hides_mass(self) -> bool:
-        """Whether something moves that no sensor reads."""
+        """Whether a body moves that no sensor reads."""
         return self.is_built("hidden mass")
 
     @property
@@ -179,7 +179,7 @@ class Effect:
 
     @property
     def needs_drive(self) -> bool:
-        """Whether its law asks for the input."""
+        """Whether its law uses the input."""
         law = self.law
         text = (
             law.force
@@ -191,12 +191,12 @@ class Effect:
         return bool({"u", "on"} & names_in(text)) or self.place == "input"
 
     def is_built(self, *kinds: str) -> bool:
-        """Whether its law is one of those that the simulators have built in."""
+        """Whether its law is built into the simulators."""
         return isinstance(self.law, BuiltLaw) and self.law.kind in kinds
 
     @property
     def own(self) -> tuple[EffectParameter, ...]:
-        """The parameters but those that it shares with the friction within it."""
+        """The parameters without those shared with the friction inside it."""
         if not (isinstance(self.law, FrictionLaw) and self.law.beyond):
             return self.parameters
         mine = {*self.grown.coordinates, *self.grown.parameters}
@@ -204,7 +204,10 @@ class Effect:
 
     @property
     def grown(self) -> Growth:
-        """The coordinates in which the law grows from nothing: its parameters, if no others."""
+        """The coordinates in which the law grows from zero:
+
+        its parameters, unless others are given.
+        """
         symbols = tuple(p.symbol for p in self.parameters)
         return self.growth or Growth(symbols, signed=self.parameters[0].signed)
 
@@ -215,13 +218,13 @@ class Effect:
         return f"{owner}_{parameter.name}".upper()
 
     def columns(self, values: Mapping[str, float]) -> dict[IntEnum, float]:
-        """Return what parameter values fill of the simulator's tables."""
+        """Return the entries of given parameter values in the simulator's tables."""
         table = TABLES[self.place]
         by_name = {p.name: table[self.column_name(p)] for p in self.parameters}
         return {by_name[name]: value for name, value in values.items()}
 
     def grown_values(self, coordinates: Mapping[str, float]) -> dict[str, float]:
-        """Return the parameters that go with coordinates (and shared parameters), by symbol."""
+        """Return the parameters for given coordinates (and shared parameters), by symbol."""
         values = {p.name: coordinates[p.symbol] for p in self.own if p.symbol in coordinates}
         for p in self.own:
             if p.symbol in self.grown.parameters:
@@ -233,9 +236,9 @@ class Effect:
         return dict(zip(self.names, values, strict=True))
 
     def places(self, springs: Sequence[bool]) -> tuple[int, ...]:
-        """Return where it can sit on a bench: cart or spring numbers, or 0 for the input.
+        """Return its possible places on a bench: cart or spring numbers, or 0 for the input.
 
-        The two wall springs of a single cart only act through their sum, so one stands for both.
+        The two wall springs of a single cart only act through their sum, so one represents both.
         """
         n = len(springs) - 1
         if n < self.fewest_carts:
@@ -290,7 +293,7 @@ class EffectTerm:
     def from_written(
         cls, *, effect: Effect, where: Mapping[str, int], parameters: Mapping[str, float]
     ) -> "EffectTerm":
-        """Return what a file holds; a `KeyError` where it lacks a parameter."""
+        """Return the effect that a file holds; a `KeyError` if it lacks a parameter."""
         values = tuple(parameters[name] for name in effect.names)
         return cls(effect=effect, place=next(iter(where.values()), 0), values=values)
 
@@ -333,7 +336,7 @@ def chain_scales(
     near = min(i, chain.n - 1)
     stiffness = chain.k[i] if place == "spring" else float(np.diag(chain.stiffness)[near])
     if stiffness <= 0.0:
-        # A cart without springs: what its inertia needs stands in for the spring force.
+        # For a cart without springs, its inertial force replaces the spring force.
         stiffness = chain.m[near] * (velocity[i] / position[i]) ** 2
     return PlaceScales(
         position=float(position[i]),

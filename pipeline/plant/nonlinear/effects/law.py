@@ -1,11 +1,11 @@
 """The law of an effect, written once: expressions in Python's syntax, over symbols.
 
-Quantities on a cart (of cart 1, for the input): `x`, `v`. On a spring: its stretch `d`, `rate` and
+Quantities on a cart (cart 1, for the input): `x`, `v`. On a spring: its stretch `d`, `rate` and
 stiffness `k`. Everywhere: `u`, the force that arrives from the drive; `on`, 1 while the drive is
-powered and 0 else; `z`, a state of the law's own. All other names are symbols of parameters. The
-functions are abs, sign, exp, sin, cos, min, max, clip.
+powered and 0 otherwise; `z`, a state of the law's own. All other names are symbols of parameters.
+The functions are abs, sign, exp, sin, cos, min, max, clip.
 
-`python -m docs.codegen` makes compiled code, with all derivatives.
+`python -m docs.codegen` generates compiled code, with all derivatives.
 """
 
 import ast
@@ -30,12 +30,12 @@ from pipeline.words.math import (
 
 @dataclass(frozen=True)
 class ForceLaw:
-    """A force on a cart, or the tension that a spring has more; smooth but for corners.
+    """A force on a cart, or an additional tension of a spring; smooth except at corners.
 
     Attributes
     ----------
     step : the longest step in s over which the force may be held.
-    on_motor : of an input: it acts on the motor, not on cart 1, where there is play between them.
+    on_motor : for an input: it acts on the motor, not on cart 1, if there is play between them.
     """
 
     force: str
@@ -46,12 +46,12 @@ class ForceLaw:
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Dry friction: its size while the cart slides; at rest it holds up to as much.
+    """Dry friction: its size while the cart slides; at rest it holds up to the same force.
 
     Attributes
     ----------
-    at_rest : what it holds, where that is not the same.
-    beyond : key of the friction that it has within, whose parameters it shares.
+    at_rest : the largest force that it holds, if that differs.
+    beyond : key of the friction that it contains, whose parameters it shares.
     """
 
     size: str
@@ -63,7 +63,7 @@ class FrictionLaw:
 
 @dataclass(frozen=True)
 class HysteresisLaw:
-    """Dry friction with a state `z`, from -1 to 1, of its own: force and rate are linear in it."""
+    """Dry friction with its own state `z`, from -1 to 1: force and rate are linear in it."""
 
     force: str
     _: KW_ONLY
@@ -73,9 +73,9 @@ class HysteresisLaw:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """A force past a position (or stretch), whose sign is the side; it may only push, or pull too.
+    """A force past a position (or stretch), whose sign is the side; it may only push, or also pull.
 
-    The simulators switch it at its very instant.
+    The simulators switch it at the exact instant.
     """
 
     force: str
@@ -87,7 +87,7 @@ class ContactLaw:
 
 @dataclass(frozen=True)
 class InputLaw:
-    """What arrives of the input `u`."""
+    """The part of the input `u` that arrives."""
 
     arrives: str
     step: float = inf
@@ -95,7 +95,7 @@ class InputLaw:
 
 @dataclass(frozen=True)
 class BuiltLaw:
-    """A law with a state of its own, which the simulators have built in."""
+    """A law with its own state, built into the simulators."""
 
     kind: Literal["hidden mass", "play", "delay", "lag", "reading"]
     formula: Math
@@ -107,11 +107,11 @@ Law = ForceLaw | FrictionLaw | HysteresisLaw | ContactLaw | InputLaw | BuiltLaw
 
 @dataclass(frozen=True)
 class Growth:
-    """Coordinates in which a law grows from nothing in proportion, for a fit from nothing.
+    """Coordinates in which a law grows in proportion from zero, for a fit that starts there.
 
     Attributes
     ----------
-    coordinates : symbols; those of parameters mean these.
+    coordinates : symbols; those of parameters are these parameters.
     parameters : the other parameters, by symbol: expressions in the coordinates, with `hypot` and
         `atan2`, the spring's stiffness `k` and the parameters that are shared.
     signed : the first one may be of either sign.
@@ -158,7 +158,7 @@ def formula_of(law: Law, *, place: str, unseen: set[str]) -> Math:
             return row("f", "=", *slides, ",", WIDE_SPACE, *held)
 
 
-_SUM, _PRODUCT, _POWER, _ATOM = range(4)  # how firmly an operation binds
+_SUM, _PRODUCT, _POWER, _ATOM = range(4)  # the precedence of an operation
 
 
 class _Formula:
@@ -177,7 +177,7 @@ class _Formula:
         return terms if binds >= least else [parens(*terms)]
 
     def _bound(self, node: ast.expr) -> tuple[list[Term], int]:
-        """Return an expression and how firmly it binds."""
+        """Return an expression and its precedence."""
         match node:
             case ast.Constant(value=value):
                 return [str(value)], _ATOM

@@ -1,4 +1,4 @@
-"""A sensor with a scale of its own."""
+"""A sensor with its own scale."""
 
 from pipeline.plant.nonlinear.effects.base import Effect, EffectParameter
 from pipeline.plant.nonlinear.effects.law import BuiltLaw, Growth

@@ -1,1 +1,1 @@
-"""The compiled simulator, and derivatives carried beside the state."""
+"""The compiled simulator, with derivatives integrated beside the state."""

@@ -1,4 +1,4 @@
-"""What switches inside a step: end stops, springs past a stretch, both sides of a backlash."""
+"""Switching inside a step: end stops, springs past a stretch, both sides of a backlash."""
 
 from pipeline.plant.nonlinear.columns import Drive
 from pipeline.plant.nonlinear.simulator.laws import slack_of, stop_of
@@ -52,10 +52,10 @@ def contact(which, tables):
 
 @jit
 def guard(which, active, tables, s, h):
-    """Return how far past its switch a contact or slack is, h from now; positive: it switches.
+    """Return how far past its switch a contact or slack is, h from now; positive means it switches.
 
-    Switches n to 2n are springs, the others contacts, which begin where the bodies meet and push,
-    and end where the push does.
+    Switches n to 2n are springs, the others contacts, which begin when the bodies meet and push,
+    and end when the push ends.
     """
     n = tables.cart.shape[0]
     if n <= which <= 2 * n:

@@ -1,14 +1,14 @@
 """Simulate carts with dry friction, contact, slack and an imperfect drive: compiled, by events.
 
-Every substep takes the linear part (springs, dampers, hidden masses) by a Taylor series to sixth
-order, so the linear chain is exact to rounding, and holds the nonlinear forces at their value in
-the middle of the step. Dry friction is set-valued: a cart that stops inside a step stops at the
-root of its velocity polynomial, and from rest it either sticks (and then truly does not move) or
-slides on. No tanh, no threshold velocity.
+Every substep integrates the linear part (springs, dampers, hidden masses) by a Taylor series of
+sixth order, so the linear chain is exact to rounding. Nonlinear forces are held at their value in
+the middle of the step. Dry friction is set-valued. A cart that stops inside a step stops at the
+root of its velocity polynomial. From rest it either sticks (and then truly does not move) or slides
+on. There is no tanh and no threshold velocity.
 
-What is simulated is told by three tables, one row a cart, a spring, and one for the drive; an
-effect fills columns of them (`plant.nonlinear.effects`), and the neutral values of all columns
-give the linear chain back.
+Three tables define the simulation, with one row for each cart, each spring, and the drive. An
+effect fills columns of them (`plant.nonlinear.effects`); the neutral values of all columns give the
+linear chain.
 
 Reference: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., sec.
 VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit,
@@ -37,14 +37,14 @@ from pipeline.plant.nonlinear.simulator.state import (
     ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, inlined, jit, pair, tie,
 )  # fmt: skip
 
-_SERIES_REACH = 0.2  # omega h: the series' sixth order then leaves 1e-8 after seconds
+_SERIES_REACH = 0.2  # omega h: the series of sixth order then leaves 1e-8 after seconds
 _CONTACT_REACH = 0.4  # omega h inside a contact
-_INSTANT = 1e-9  # s; times as near as this are one
+_INSTANT = 1e-9  # s; closer times count as one
 _BLOWN_UP = 1e9  # positions beyond this are a diverged model
 
 
 class Excitation(NamedTuple):
-    """What happens to a bench in one run.
+    """The excitation of a bench in one run.
 
     `t` (samples,) are its times; `knots` and `command` (k,) the input, held from knot to knot, and
     `held` (3, k) room for what arrives of it and its integrals. `free` (n,) tells which carts move,
@@ -63,7 +63,7 @@ class Excitation(NamedTuple):
 
 
 class StartState(NamedTuple):
-    """How the bodies of one run start.
+    """The start state of the bodies of one run.
 
     `x` and `v` (shots, n) are those of the carts at the start of each shot; or (shots, 2 n), where
     those of their hidden masses relative to them follow, which the first shot takes and the later
@@ -84,7 +84,7 @@ def describe_run(
     shots: Any = None,
     guided: Array | None = None,
 ) -> Excitation:
-    """Return a run as the simulator takes it, arrays of any kind copied to its own.
+    """Return a run in the simulator's form, with arrays of any kind copied.
 
     `t` (samples,), `command` (k,), held from knot to knot, by default from sample to sample; `free`
     (n,) which carts move; without `guided` (n, samples) the others stand still at zero. One shot.
@@ -106,7 +106,7 @@ def describe_run(
 def _plain(array: Any, dtype: Any) -> Any:
     """Return an array of the one kind the compiled function takes: whole, and writable.
 
-    For arrays that may not be written to, or for strides, numba compiles anew, for ten seconds.
+    Numba would compile again, for ten seconds, for read-only or strided arrays.
     """
     array = np.asarray(array)
     fits = array.dtype == dtype and array.flags.carray
@@ -115,7 +115,7 @@ def _plain(array: Any, dtype: Any) -> Any:
 
 @jit
 def _assemble(tables, free, s, K, C, parent, switches):
-    """Fill the linear matrices and the numbers of what switches.
+    """Fill the linear matrices and the parameters of switches.
 
     Returns how many bodies there are, the motor's row or -1, and how many switches.
     """
@@ -187,7 +187,7 @@ def _integral(run, time, at):
 
 @jit
 def _edge(run, delay, now, end, at):
-    """Return when, between `now` and `end`, the delayed input first jumps: or `end`."""
+    """Return when, between `now` and `end`, the delayed input first jumps; else `end`."""
     knots, held = run.knots, run.held
     while at < knots.size - 1 and knots[at + 1] + delay < end - _INSTANT:
         at += 1
