@@ -1,6 +1,6 @@
 """cartlab: identification, control and grading for the mass-spring-damper laboratory.
 
-In a notebook: `from pipeline import analyse, explain`, then `analyse("team-07")`.
+In a notebook: `from pipeline import analyse, check, explain`, then `analyse("team-07")`.
 """
 
 TYPE_CHECKING = False  # as that of typing, which takes its time to load
@@ -12,7 +12,7 @@ __version__ = "0.2.0"
 
 def __getattr__(name: str) -> "Any":
     """Load what a notebook asks for when it does, as the command line must answer at once."""
-    if name in ("analyse", "explain"):
+    if name in ("analyse", "check", "explain"):
         from importlib import import_module
 
         return getattr(import_module("pipeline.notebook"), name)

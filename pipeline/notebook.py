@@ -1,13 +1,18 @@
 """Analyses for a notebook: one call each, and everything in the types of pandas and control."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import ConfigError, DataError
 from pipeline.exchange import frames, gap_frames
 from pipeline.gap.types import Gap
+from pipeline.grading.rubric_file import load_rubric
+from pipeline.grading.self_check.check import check_numbers
+from pipeline.grading.self_check.log import CheckAnswer
+from pipeline.grading.self_check.words import answer_lines
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.margins import closed_loop
 from pipeline.plant.nonlinear.motion import EquationsOfMotion
@@ -20,6 +25,7 @@ from pipeline.report.sections.questions import ask
 from pipeline.report.sections.summary import terminal_summary
 from pipeline.results import Analysis, FeedbackDesign
 from pipeline.submission import load_submission
+from pipeline.submission.load import with_reported
 from pipeline.words.progress import silent
 from pipeline.words.spans import spans
 from pipeline.words.text import with_symbols
@@ -282,3 +288,63 @@ def analyse(folder: Path | str) -> Lab:
     submission = load_submission(Path(folder))
     results, gap = with_gap(run(submission), submission.folder)
     return Lab(results=results, document=build_document(results, gap=gap))
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class CheckedNumbers:
+    """Which reported numbers disagree with the recordings; shown as `cartlab check` prints it.
+
+    Attributes
+    ----------
+    answer : what `checks.jsonl` keeps, without any value.
+    """
+
+    answer: CheckAnswer
+
+    @property
+    def disagree(self) -> tuple[str, ...]:
+        """The numbers that disagree, by key: "final.K"."""
+        return self.answer.disagree
+
+    @property
+    def agree(self) -> tuple[str, ...]:
+        """The numbers that agree, by key."""
+        return self.answer.agree
+
+    def share(self, *numbers: str) -> float:
+        """Return how many of these numbers agree, as a share; a missing one does not."""
+        if not numbers:
+            raise TypeError('name the numbers that count: share("final.K", "final.zeta")')
+        return sum(number in self.agree for number in numbers) / len(numbers)
+
+    def __repr__(self) -> str:
+        return "\n".join(answer_lines(self.answer))
+
+
+def check(
+    folder: Path | str,
+    *,
+    reported: Mapping[str, Any] | None = None,
+    rubric: Path | str | None = None,
+) -> CheckedNumbers:
+    """Say which numbers disagree with a submission's recordings, as `cartlab check` does.
+
+    Asked again without changes, it says where to look. It never tells a value, and writes each
+    answer into the submission's `checks.jsonl`.
+
+    Parameters
+    ----------
+    reported : numbers in tables, `{"final": {"K": 24.3}}`; a text such as "0.10" keeps its digits.
+        None: the numbers of `submission.toml`.
+    rubric : whose tolerances hold, a file or a shipped name; None: the shipped one for so many
+        carts.
+
+    Raises
+    ------
+    SubmissionError : nothing is reported, a name is unknown, or no recording can be read.
+    """
+    submission = load_submission(Path(folder))
+    if reported is not None:
+        submission = with_reported(submission, reported)
+    asked = load_rubric(Path(rubric)) if rubric else None
+    return CheckedNumbers(answer=check_numbers(submission, rubric=asked))

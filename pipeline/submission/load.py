@@ -6,11 +6,12 @@ import stat
 import unicodedata
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
+import numpy as np
 from pydantic import ValidationError
 
 from pipeline.errors import SubmissionError, lies_in_the_file
@@ -116,6 +117,42 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
     return submission.model_copy(
         update={"experiments": experiments, "folder": folder, "discussion": _notes(folder)}
     )
+
+
+def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submission:
+    """Return the submission with other numbers under `[reported]`, checked as those of a file.
+
+    Parameters
+    ----------
+    reported : its tables; a text keeps the digits of its number, "0.10".
+
+    Raises
+    ------
+    InvalidSubmission : with every problem.
+    """
+    system = {"carts": submission.system.carts}
+    document = {"version": 1, "system": system, "reported": _as_typed(reported)}
+    changed = submission.model_copy(
+        update={"reported": _validate(document, where="numbers").reported}
+    )
+    if found := list(_reported_problems(changed)):
+        worded = [(at, f"{dotted(at, document)}: {what}") for at, what in found]
+        raise InvalidSubmission("numbers", worded)
+    return changed
+
+
+def _as_typed(value: object) -> object:
+    """Return numbers and their texts as decimals, arrays as lists."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): _as_typed(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_typed(item) for item in value]
+    if isinstance(value, float | str):
+        with suppress(InvalidOperation):
+            return Decimal(str(value))
+    return value
 
 
 # ------------------------------------------------------------- from a document to a model

@@ -1,0 +1,115 @@
+"""The check in a notebook: `from pipeline import check`."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import pipeline
+from pipeline.errors import SubmissionError
+from pipeline.grading.self_check.log import read_answers
+from pipeline.notebook import check
+from pipeline.resources import RUBRICS
+from pipeline.simulated.submission import write_submission
+from tests.helpers.commandline import cartlab_here
+
+RIGHT = {"K": 28.9, "omega_n": 13.2, "zeta": "0.101"}
+IN_HERTZ = {**RIGHT, "omega_n": 2.1}
+
+
+@pytest.fixture
+def lab(tmp_path) -> Path:
+    """Recordings, and no number reported in `submission.toml`."""
+    folder = tmp_path / "lab"
+    write_submission(folder, "throne-1dof", seed=7, compact=True)
+    return folder
+
+
+def test_it_is_the_packages_own():
+    """`from pipeline import check` is this function."""
+    assert pipeline.check is check
+
+
+def test_numbers_of_the_notebook_are_checked_first_which_then_where(lab):
+    """Neither answer has a value, and both are in the file of `cartlab check`."""
+    first = check(lab, reported={"final": IN_HERTZ})
+    assert first.disagree == ("final.omega_n",)
+    assert first.agree == ("final.K", "final.zeta")
+    assert "Hz" not in repr(first)
+    second = check(lab, reported={"final": IN_HERTZ})
+    assert "Hz where rad/s is asked" in repr(second)
+    assert not re.search(r"\b1[23]\.\d", repr(second))  # 13.2 rad/s is what they should find
+    assert read_answers(lab) == (first.answer, second.answer)
+
+
+def test_without_numbers_those_of_the_file_are_checked(lab):
+    """With the answer that the command line gives for the same folder, but for its count."""
+    with (lab / "submission.toml").open("a", encoding="utf-8") as file:
+        file.write("\n[reported.final]\nK = 28.9\nomega_n = 2.1\nzeta = 0.101\n")
+    typed = check(lab, reported={"final": IN_HERTZ})
+    here = check(lab)
+    done = cartlab_here("check", lab, "--json")
+    assert here.answer.basis == typed.answer.basis == json.loads(done.stdout)["basis"]
+    assert here.disagree == typed.disagree == tuple(json.loads(done.stdout)["disagree"])
+
+
+def test_numbers_that_numpy_computed_are_numbers(lab):
+    """Also in arrays: gains, and the matrices of a state model."""
+    computed = {name: np.float64(value) for name, value in RIGHT.items()}
+    A = np.array([[0.0, 1.0], [-(13.2**2), -2 * 0.101 * 13.2]])
+    B = np.array([[0.0], [28.9 * 13.2**2]])
+    found = check(lab, reported={"final": computed, "state_space": {"A": A, "B": B}})
+    assert found.disagree == ()
+    assert {"final.K", "state_space.A(2, 1)", "state_space.B(2)"} <= set(found.agree)
+
+
+def test_a_text_keeps_the_digits_that_were_typed(lab):
+    """Python drops the 0 of 0.10, which makes its last digit coarser."""
+    as_typed = check(lab, reported={"final": {"zeta": "0.10"}})
+    as_number = check(lab, reported={"final": {"zeta": 0.10}})
+    assert as_typed.agree == as_number.agree == ("final.zeta",)
+    assert as_typed.answer.basis != as_number.answer.basis
+
+
+def test_a_share_counts_missing_numbers_as_wrong(lab):
+    """So that nobody earns more by reporting less."""
+    found = check(lab, reported={"final": {"K": 28.9, "omega_n": 2.1}})
+    assert found.share("final.K") == 1.0
+    assert found.share("final.K", "final.omega_n") == 0.5
+    assert found.share("final.K", "final.omega_n", "final.zeta", "initial.K") == 0.25
+    with pytest.raises(TypeError, match="name the numbers that count"):
+        found.share()
+
+
+def test_a_rubric_gives_its_tolerances(lab, tmp_path):
+    """A number 10 % off passes a rubric that allows 20 %."""
+    text = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
+    text = re.sub(r"(?m)^(full|none)_percent = .*\n", "", text)
+    limits = 'check = "final"\nfull_percent = 20.0\nnone_percent = 40.0'
+    wide = re.sub(r'(?m)^check = "final"$', limits, text)
+    (tmp_path / "wide.toml").write_text(wide, encoding="utf-8")
+    off = {"final": {"K": 28.9 * 1.1}}
+    assert check(lab, reported=off).disagree == ("final.K",)
+    assert check(lab, reported=off, rubric=tmp_path / "wide.toml").disagree == ()
+
+
+@pytest.mark.parametrize(
+    ("reported", "said"),
+    [
+        ({}, "no number is reported yet"),
+        ({"final": {"omega": 1.0}}, r"final\.omega: unknown parameter; did you mean 'omega_n'"),
+        ({"finl": RIGHT}, r"finl: unknown key; did you mean 'final'"),
+        ({"final": {"K": "ten"}}, r"final\.K: expected a number, found 'ten'"),
+        ({"final": {"K": ...}}, r"final\.K: expected a number, found Ellipsis"),
+        ({"final": {"K": float("nan")}}, r"final\.K: expected a finite number, found NaN"),
+        ({"final": {"K": True}}, r"final\.K: expected a number, found True"),
+        ({"feedback": {"gains": [1.0]}}, r"feedback\.gains: expected 2 gains, found 1"),
+    ],
+)
+def test_what_is_no_number_is_one_clear_error(lab, reported, said):
+    """And no answer is counted for it."""
+    with pytest.raises(SubmissionError, match=said):
+        check(lab, reported=reported)
+    assert read_answers(lab) == ()
