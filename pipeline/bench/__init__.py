@@ -1,1 +1,1 @@
-"""The bench: what to record, the serial line, the virtual bench, live views."""
+"""The bench: the serial line, sessions, live views."""

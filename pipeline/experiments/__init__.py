@@ -1,1 +1,1 @@
-"""What to record, with which controller, and what it asks of the bench."""
+"""Choosing experiments: what to record, with which controller, in which size."""

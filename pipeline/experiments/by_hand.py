@@ -1,4 +1,4 @@
-"""A recording that a person wants, from the few numbers in which one says it."""
+"""A recording that a person wants, described by a few numbers."""
 
 from dataclasses import dataclass
 from math import ceil, floor
@@ -21,10 +21,10 @@ _WAVES: dict[RecordingKind, Literal["square", "chirp", "sine"]] = {
     "sine": "sine",
 }
 _SHORTEST = 1.0  # s
-# s; of three carts at 1 kHz that is weighed in 1 s and 0.5 GB, 600 s in 20 s and 2 GB
+# s; three carts at 1 kHz take 1 s and 0.5 GB to evaluate, 600 s take 20 s and 2 GB
 _LONGEST = 120.0
-_ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, whatever their product rounds to
-# The numbers that say what one of a kind is, as keys of plan.toml, and what else they are called.
+_ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, however the product is rounded
+# The numbers that define a recording of each kind, as keys of plan.toml, and their other names.
 NEEDED: dict[RecordingKind, tuple[str, ...]] = {
     "step": ("amplitude",),
     "sweep": ("amplitude", "frequency", "frequency_end"),
@@ -36,14 +36,14 @@ TYPED = {"frequency_end": "to"}
 
 @dataclass(frozen=True, kw_only=True)
 class WantedRecording:
-    """The few numbers in which a person says what to record.
+    """The few numbers in which a person describes a recording.
 
     Attributes
     ----------
-    seconds : that it lasts, 1 to 120; made whole periods of a dwell or sweep.
+    seconds : duration, 1 to 120; rounded to whole periods of a dwell or sweep.
     amplitude : input units.
-    frequency, frequency_end : Hz, of a dwell, or from where to where a sweep goes.
-    cart : that is let go, of a decay.
+    frequency, frequency_end : Hz, of a dwell, or start and end of a sweep.
+    cart : the released cart of a decay.
     """
 
     kind: RecordingKind
@@ -55,11 +55,11 @@ class WantedRecording:
 
 
 def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
-    """Return the recording, all carts free unless one is let go; it rests as the plan's others do.
+    """Return the recording, with all carts free unless one is released, and the plan's rest time.
 
     Raises
     ------
-    ConfigError : it is no recording that the limits of the plan allow; says which number, and why.
+    ConfigError : the plan's limits do not allow it; the message names the number and the reason.
     """
     kind, seconds = wanted.kind, wanted.seconds
     everyone = tuple(range(1, submission.system.carts + 1))
@@ -88,7 +88,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
             frequency=wanted.frequency if kind != "step" else cycles / seconds,
             frequency_end=wanted.frequency_end if kind == "sweep" else None,
             cycles=cycles,
-            settle=driven[-1] if driven else 5.0,  # s, where the plan has nothing to go by
+            settle=driven[-1] if driven else 5.0,  # s, if the plan has no rest time
         )
     for key, what in recording_problems(made, plan.limits, submission.system):
         raise ConfigError(f"{TYPED.get(key, key)}: {what}")
@@ -96,7 +96,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
 
 
 def _count_periods(seconds: float, frequency: float) -> int:
-    """Return how many whole periods last so long or a little longer, or as long as may be."""
+    """Return the number of whole periods of this length or a little more, within the limit."""
     most = floor(_LONGEST * frequency * (1 + _ROUNDING))
     if not most:
         raise ConfigError(
@@ -111,7 +111,7 @@ def add_recording(folder: Path, recording: Recording) -> Recording:
 
     Raises
     ------
-    ConfigError : the plan is broken; nothing is written then.
+    ConfigError : the plan is broken; nothing is written.
     """
     plan = current_plan(load_submission(folder))
     return add_recordings(folder, [recording], otherwise=plan).recordings[-1]

@@ -1,4 +1,4 @@
-"""The experiments that are weighed against one another, each as large as the travel allows."""
+"""The candidate experiments, each as large as the travel allows."""
 
 from collections.abc import Collection, Iterator
 from math import ceil
@@ -23,12 +23,12 @@ def propose_candidates(
 ) -> list[Recording]:
     """Return what could be recorded next, with all carts free.
 
-    Dwells where the carts are identified from dwells; else chirps, square waves and multisines, as
-    far as the bench knows their `commands`.
+    Dwells if the carts are identified from dwells; else chirps, square waves and multisines, if the
+    bench knows their `commands`.
 
     Raises
     ------
-    DataError : none has an input that the limits allow, or settles.
+    DataError : no candidate has an input within the limits, or settles.
     """
     made = list(_dwells(known) if known.dwells else _broadband(known, limits, commands, goal))
     settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
@@ -49,9 +49,9 @@ def propose_candidates(
 
 
 def _dwells(known: Knowledge) -> Iterator[Recording]:
-    """Dwells that are measured for as long as one waits for their steady state.
+    """Dwells that last as long again as the wait for their steady state.
 
-    None where nobody waits so long: a transient would pass for a steady state.
+    None if that takes too long: a transient would be taken for a steady state.
     """
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
     if wait * np.min(-known.chain.poles.real) < SETTLED:

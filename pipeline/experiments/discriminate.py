@@ -1,9 +1,9 @@
-"""Which experiment tells two explanations apart: where they differ most, whatever either is fitted.
+"""The experiment that distinguishes two explanations: where they differ most after any refit.
 
-T-optimal: what counts of the difference of two predictions is what is left of it when the other
-model's parameters, as far as all earlier records let them go, its start and the encoders' zeros
-have done what they can. Of several models each pair counts by the product of their probabilities,
-which bounds the expected fall of entropy.
+T-optimal design: the difference of two predictions counts only as far as the other model cannot
+absorb it. That model may adjust its parameters, as far as all earlier records allow, its start and
+the encoder zeros. With several models each pair counts by the product of their probabilities, which
+bounds the expected fall of entropy.
 
 References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box,
 W. J. Hill, Technometrics 9 (1967), 57-71.
@@ -42,20 +42,20 @@ from pipeline.submission import Submission
 Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
-_PERIOD = 5e-3  # s from sample to sample, of which a cycle has some
-_PER_CYCLE, _BEYOND = 10, 2.0  # … and at least so many times the highest resonance is looked to
+_PERIOD = 5e-3  # s between samples, with several in a cycle
+_PER_CYCLE, _BEYOND = 10, 2.0  # … and up to at least this multiple of the highest resonance
 _TIME = 12.0  # s of a record, about …
-_LONGEST = 4  # … and times that, where it would not settle the two that it tells apart best
+_LONGEST = 4  # … and this many times longer, if it would not settle the pair that it separates best
 _STEP = 1e-3  # relative, of an effect's parameter for a difference
-_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest one's weight: no contender any more
-_DECIDED = CLOSE_BIC * THINNING  # square sum that settles two
-_LEAST_WEIGHT = 0.1  # of the others: what swings overstates how sure the criterion is
-_SAME = 1e-9  # of the largest: such a change of the parameters shows in nothing
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest's weight: below it a model is no contender
+_DECIDED = CLOSE_BIC * THINNING  # square sum that settles a pair
+_LEAST_WEIGHT = 0.1  # of the others: a swinging residual exaggerates the certainty of the criterion
+_SAME = 1e-9  # of the largest: a smaller change of the parameters is not visible
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """What a recording is worth, and the two models that it tells apart best, by how much."""
+    """The value of a recording, the pair of models that it separates best, and by how much."""
 
     worth: tuple[float, float]
     recording: Recording
@@ -69,8 +69,8 @@ class _Weighed:
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
     """Return the gap with a proposal within the limits of the submission's plan.
 
-    It resembles none of those it is to be `without`. Where none can be made, for a spoilt plan.toml
-    say, a note says why: the gap stays what it is.
+    The proposal resembles none of those in `without`. If none can be made, for example because
+    plan.toml is broken, a note says why and the gap stays as it is.
     """
     try:
         return with_proposal(gap, limits=current_plan(submission).limits, without=without)
@@ -79,7 +79,7 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
 
 
 def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] = ()) -> Gap:
-    """Return the gap with the recording that tells its contenders apart best, if it has two.
+    """Return the gap with the recording that best distinguishes its contenders, if there are two.
 
     Raises
     ------
@@ -91,7 +91,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
         return gap
     weight = np.array([one.weight for one in gap.contenders])
     weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
-    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the one chosen, whatever the criterion prefers
+    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the chosen one, whatever the criterion prefers
     if np.count_nonzero(weight) < 2:
         return gap
     sigma, pinned = _noise(gap), _pinned(gap)
@@ -105,7 +105,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
         score = counted * told
         i, j = divmod(int(np.argmax(score)), len(models))
         return _Weighed(
-            # First as many pairs as can be are settled; then the further apart the better.
+            # First, settle as many pairs as possible; then, separate them as far as possible.
             worth=(float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())),
             recording=recording,
             pair=(i, j),
@@ -131,7 +131,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
 
 
 def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
-    """Return a recording as a gap proposes it, with the cart on which the two differ most."""
+    """Return a recording as a gap proposes it, with the cart on which the pair differs most."""
     one, other = best.pair
     cart = int(np.argmax(np.abs(best.predicted[one] - best.predicted[other]).max(axis=1)))
     return Proposal(
@@ -145,7 +145,7 @@ def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
 
 
 def _noise(gap: Gap) -> Array:
-    """Return the noise (n,) of each cart, from its runs: what the floor is a share of."""
+    """Return the noise (n,) of each cart, from its runs: the floor is a share of it."""
     floor = {(row.experiment, row.cart): row.noise_floor for row in gap.by_record}
     found: dict[int, list[float]] = {}
     for trace in gap.traces:
@@ -158,11 +158,11 @@ def _noise(gap: Gap) -> Array:
 
 
 def _pinned(gap: Gap) -> Array:
-    """Return how far the records still let each parameter of the chain go, as `_predict` has it."""
+    """Return how far the records let each parameter of the chain vary, as `_predict` uses it."""
     chain = gap.model.chain
     return np.array(
         [
-            # Each standard error is of one explanation: a parameter may be off by three.
+            # Each standard error belongs to one explanation: a parameter may be off by three.
             3.0 * gap.chain_std.get(f"{letter}_{i + 1}", np.inf)
             for letter, values in (("m", chain.m), ("c", chain.c), ("k", chain.k))
             for i in np.flatnonzero(values).tolist()
@@ -170,13 +170,13 @@ def _pinned(gap: Gap) -> Array:
     )
 
 
-# ------------------------------------------------------------------------- what is weighed
+# ----------------------------------------------------------------------- the candidates
 
 
 def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
-    """Steps to either side, triangles and chirps in several sizes, each cart let go at heights.
+    """Steps to either side, triangles and chirps in several sizes, each cart released at heights.
 
-    With each the height (position units) at which its cart is let go, 0 where none is.
+    Each comes with the height (position units) at which its cart is released, or 0.
     """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
@@ -196,7 +196,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         ("triangle", "sweep", slow, None),
         ("triangle", "sweep", rounded(float(resonances[0])), None),
         ("chirp", "sweep", low, high),
-        # Carts move little up there, under all that the motor gives: what is late or soft shows.
+        # Carts move little there, under the motor's full input: delays and soft laws show.
         ("chirp", "sweep", high, fastest),
         ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
     )
@@ -216,7 +216,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         t, u = sampled_input(whole, period=_PERIOD)
         reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
         largest = min(FURTHEST * limits.travel / reach, limits.input)
-        # Laws differ in how they grow with the motion.
+        # Laws differ in their growth with the motion.
         for size in (1.0, 0.5, 0.2):
             for sign in (1, -1) if wave == "square" else (1,):
                 amplitude = sign * rounded_down(size * largest)
@@ -224,7 +224,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
     for cart in everyone:
         if chain.k[cart - 1] + chain.k[cart] <= 0:
             continue
-        for share in (0.6, 0.2):  # of the travel limit, from where a hand lets go
+        for share in (0.6, 0.2):  # of the travel limit, for a release by hand
             height = rounded(share * limits.travel)
             release = let_go(cart, name=f"apart-decay-{cart}", seconds=_TIME)
             note = f"let go at {share:.0%} of the travel limit, {height:g} from the zero"
@@ -232,12 +232,12 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
 
 
 def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
-    """Return the sweep through the resonances that swings the carts as far as they may go."""
+    """Return the sweep through the resonances that swings the carts as far as allowed."""
     every = (recording for recording, _ in _candidates(chain, limits))
     return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
 
 
-# ------------------------------------------------------------------------- how far apart
+# ------------------------------------------------------------------ the separation
 
 
 def _tell_apart(
@@ -248,10 +248,10 @@ def _tell_apart(
     sigma: Array,
     pinned: Array,
 ) -> tuple[Array, Array, Array, Array] | None:
-    """Return (models, models) what separates each two, times, input and predictions.
+    """Return (models, models) the separation of each pair, times, input and predictions.
 
-    A separation is the square sum over the noise that neither model can take up; None where the
-    motion of a model cannot be had.
+    A separation is the square sum over the noise that neither model can absorb; None if a model's
+    motion cannot be computed.
     """
     t, u = sampled_input(recording, period=_PERIOD)
     u = recording.amplitude * u
@@ -275,9 +275,9 @@ def _tell_apart(
 
 
 def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
-    """Do two models differ in nothing but what acts on an input, a lag for a delay, say?
+    """Return whether two models differ only in effects on an input, such as a lag and a delay.
 
-    What still parts their free motions is chance: a contact bounces otherwise in either.
+    Any remaining difference of their free motions is chance, such as a contact's bounces.
     """
     mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
     lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
@@ -285,10 +285,10 @@ def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
 
 
 def _left(difference: Array, by: Array, pinned: Array) -> float:
-    """Return the square sum of a difference (n,) that changes of the parameters leave.
+    """Return the square sum of a difference (n,) that no change of the parameters absorbs.
 
-    Those of the chain, the first ones, are `pinned` (n_p,) by all earlier records: a change by so
-    much costs one.
+    The chain's parameters, which come first, are `pinned` (n_p,) by all earlier records: a change
+    by this much costs one.
     """
     columns = by.reshape(len(by), -1).T
     held = np.zeros((pinned.size, len(by)))
@@ -305,13 +305,13 @@ def _left(difference: Array, by: Array, pinned: Array) -> float:
 def _predict(
     model: AugmentedChain, t: Array, u: Array, recording: Recording, x0: Array | None
 ) -> tuple[Array, Array]:
-    """Return the readings (n, samples), and their derivatives (., n, samples) by what is free.
+    """Return the readings (n, samples) and their derivatives (., n, samples) by free parameters.
 
-    By every parameter of the chain and its effects, the start of a cart let go, the zeros.
+    These are all parameters of the chain and its effects, the start of a released cart, the zeros.
     """
     n, k = model.chain.n, model.chain.k
     variants = [model, *_changed(model)]
-    # A constant force or cogging holds the carts elsewhere where it, or a spring, is another.
+    # A constant force or cogging holds the carts elsewhere if it, or a spring, changes.
     stiffer = [
         replace(model, chain=replace(model.chain, k=k * (1 + _STEP * (np.arange(n + 1) == j))))
         for j in np.flatnonzero(k)
@@ -349,7 +349,7 @@ def _predict(
 
 
 def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
-    """Yield the model with each parameter of an effect a little larger."""
+    """Yield the model with each parameter of an effect slightly increased."""
     for at, term in enumerate(model.terms):
         for i, value in enumerate(term.values):
             moved = (*term.values[:i], value * (1 + _STEP), *term.values[i + 1 :])

@@ -1,8 +1,8 @@
-"""The controller of a recording in the bench's own numbers, once it is known to do no harm there.
+"""The controller of a recording in the bench's own numbers, checked for safety.
 
 The bench computes in duty counts and encoder counts, once a period, by the laws of
 `plant.loop.sampled_loop`: state feedback with velocities at constant velocity and one period of
-delay, PID without delay. A design has a sample time of its own and predicts with a model, so the
+delay, PID without delay. A design has a sample time of its own and predicts with a model. So the
 loop is simulated as the bench will run it before any gain is sent.
 """
 
@@ -38,11 +38,11 @@ _PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the carts' own stiffness that a propos
 
 @dataclass(frozen=True, kw_only=True)
 class CountScales:
-    """What a count is in the submission's units.
+    """The size of a count in the submission's units.
 
     Attributes
     ----------
-    input : input units per duty count; negative where a positive duty drives cart 1 to negative x.
+    input : input units per duty count; negative if a positive duty drives cart 1 to negative x.
     position : position units per encoder count.
     """
 
@@ -51,11 +51,11 @@ class CountScales:
 
 
 def bench_scales(submission: Submission, *, bench: Description, analysis: Analysis) -> CountScales:
-    """Return the scales the submission states, or else the bench; the sign as the data have it.
+    """Return the scales stated by the submission or else the bench; the sign is that of the data.
 
     Raises
     ------
-    DataError : a scale that neither states in the submission's unit.
+    DataError : neither states a scale in the submission's unit.
     """
     stated = submission.system
     for key, scale, unit in (
@@ -85,14 +85,14 @@ def bench_gains(
     bench: Description,
     limits: PlanLimits,
 ) -> StateGains | PidGains:
-    """Return what the bench is to be sent before a closed-loop recording starts.
+    """Return the gains to send to the bench before a closed-loop recording.
 
-    What is wrong is said without the recording's name, which who tells of the recording gives.
+    Errors do not name the recording, which the caller adds.
 
     Raises
     ------
-    DataError : the carts are not identified; or on the bench the loop would be unstable, would
-        pass a limit, or would miss the goal of its design.
+    DataError : the carts are not identified; or on the bench the loop would be unstable, pass a
+        limit, or miss its design goal.
     """
     trial = _Trial.of(
         recording, submission=submission, analysis=analysis, bench=bench, limits=limits
@@ -106,7 +106,7 @@ def bench_gains(
     law = _law(loop, analysis.feedback)
     goal = None if loop.gains else submission.design or Design(cart=loop.cart)
     trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
-    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders that no cart is tied to
+    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders without a cart
     return StateGains(
         gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
     )
@@ -120,9 +120,9 @@ def propose_pid(
     bench: Description,
     limits: PlanLimits,
 ) -> PidLoop:
-    """Return gains on cart 1 for a bench that knows no other law: stiffer, damped, to the level.
+    """Return gains on cart 1 for a bench without state feedback: stiffer, damped, to the level.
 
-    A PID on a further cart soon swings up, on the one that the motor drives hardly ever.
+    A PID on a further cart soon becomes unstable, on the driven cart hardly ever.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def propose_pid(
         damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
         loop = PidLoop(
             kp=_typed(counts * kp),
-            ki=_typed(counts * kp * slowest * 0.25),  # the level comes slower than any pole
+            ki=_typed(counts * kp * slowest * 0.25),  # slower than any pole
             kd=_typed(counts * damping) if damped else 0.0,
         )
         try:
@@ -155,7 +155,7 @@ def propose_pid(
 def controller_table(
     gains: StateGains | PidGains, *, cart: int, scales: CountScales, carts: int
 ) -> Table:
-    """Return what `controller` of the experiment in submission.toml is after these gains ran.
+    """Return the `controller` entry for submission.toml after these gains ran.
 
     A PID's `scale` is for a data file in encoder counts.
     """
@@ -179,7 +179,7 @@ def _typed(value: float) -> float:
 
 
 def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
-    """Return the gains the plan states, or those of the design, as the bench runs them."""
+    """Return the gains stated in the plan, or those of the design, as the bench runs them."""
     if loop.gains and loop.prefilter is not None:
         return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:
@@ -226,7 +226,7 @@ class _Trial:
     def refuse_state(
         self, law: StateFeedback, *, cart: int, goal: Design | None, design: FeedbackDesign | None
     ) -> None:
-        """Raise DataError where the loop is unstable, passes a limit or misses its goal."""
+        """Raise DataError if the loop is unstable, passes a limit or misses its goal."""
         reference = self.recording.amplitude
         if not stays_stable(self.chain, law, sample_time=self.period):
             raise DataError(
@@ -239,9 +239,9 @@ class _Trial:
         y, judged = x[cart - 1], {"before": 0.0, "level": np.float64(reference)}
         overshoot = float(step_response.overshoot_percent(y, **judged))
         settling = float(step_response.settling_time(t, y, **judged))
-        # No encoder tells two counts of overshoot from its own flicker.
+        # An encoder cannot distinguish two counts of overshoot from its own flicker.
         unseen = 100 * 2 * self.scales.position / abs(reference)
-        # A goal that the design itself cannot meet was said to be so in its report.
+        # The report already says so if the design itself cannot meet its goal.
         most = max(goal.overshoot_percent, design.overshoot_percent) + unseen
         longest = max(goal.settling_time, design.settling_time or np.inf)
         if overshoot > most or not settling <= longest + design.sample_time:
@@ -252,7 +252,7 @@ class _Trial:
             )
 
     def refuse_pid(self, loop: PidLoop) -> None:
-        """Raise DataError where the loop is unstable or passes a limit."""
+        """Raise DataError if the loop is unstable or passes a limit."""
         if loop.cart > self.chain.n:
             raise DataError(f"there is no cart {loop.cart} to control")
         law = Pid(
@@ -278,7 +278,7 @@ class _Trial:
     def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
         """Return t (n,) and positions (n_carts, n) of the step; refuse one that passes a limit."""
         run = self.recording
-        seconds = min(run.duration, 10.0)  # s that a simulated step is followed
+        seconds = min(run.duration, 10.0)  # s of a simulated step
         motion = simulate_loop(
             self.chain,
             law,
@@ -308,7 +308,7 @@ class _Trial:
 def _pid_matrix(chain: Chain, pid: Pid, *, period: float) -> Array:
     """Return the map of (x, ∫e, last e) from tick to tick without a reference or delay.
 
-    Without ki the integral does nothing and is left out: it would be an eigenvalue of one.
+    Without ki the integral does nothing and is left out, as it would be an eigenvalue of one.
     """
     phi, gamma = discretise(chain, period)
     row = np.zeros(gamma.size)

@@ -1,4 +1,4 @@
-"""What a next experiment is to make better: one number of the parameters' covariance."""
+"""The goal of a next experiment: one number of the parameters' covariance to reduce."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,22 +14,22 @@ from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest
 
-GAP = "gap"  # what tells the explanations of a gap apart
+GAP = "gap"  # distinguishing the explanations of a gap
 DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
-_STEP = 1e-4  # relative change of a parameter, of which the loop's overshoot is a difference
+_STEP = 1e-4  # relative change of a parameter, for differences of the loop's overshoot
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Goal:
-    """A standard error to make small: one, the largest of several, or their mean.
+    """A standard error to reduce: one, the largest of several, or their mean.
 
     Attributes
     ----------
     name : as `--for` takes it.
-    words : what the number is, "the error of zeta_2".
-    rows : (k, n_p) derivatives of what is of interest by the relative parameters, as shares, of
-        the overshoot as shares of the step. One row: c-optimal.
-    mean : of several errors the "largest" (E-optimal in named parameters), the "root mean square"
+    words : the number in words, "the error of zeta_2".
+    rows : (k, n_p) derivatives of the goal by the relative parameters; of overshoot, as shares of
+        the step. One row: c-optimal.
+    mean : for several errors the "largest" (E-optimal in named parameters), the "root mean square"
         (A-optimal) or the "volume" of the confidence region, as its mean radius (D-optimal).
     """
 
@@ -39,7 +39,10 @@ class Goal:
     mean: Literal["largest", "root mean square", "volume"] = "largest"
 
     def of(self, told: Array) -> Array:
-        """Return the error (…,) that H and S (…, 2, n_p, n_p) leave; inf where they leave all."""
+        """Return the error (…,) for information H and S (…, 2, n_p, n_p);
+
+        inf if it is unbounded.
+        """
         H, S = told[..., 0, :, :], told[..., 1, :, :]
         if self.mean == "volume":
             (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
@@ -57,12 +60,12 @@ class Goal:
         return np.einsum("...kp,...pq,...kq->...k", half, S, half)
 
     def worst(self, told: Array) -> int:
-        """Return which of the rows is known worst."""
+        """Return the index of the worst-known row."""
         return int(np.argmax(self._variances(*told)))
 
 
 def check_goal(name: str, *, names: Sequence[str]) -> None:
-    """Refuse what is no goal for carts with parameters of these names.
+    """Refuse an unknown goal for carts with parameters of these names.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
 def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
     """Return the derivative (1, n_p) of the loop's peak by the parameters, as share of the step.
 
-    The controller stays what it is and the carts turn out to be others.
+    The controller is fixed while the carts vary.
     """
     P, chain = known.parametrisation, known.chain
     controller = feedback.controller(chain)
@@ -132,14 +135,14 @@ def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
 
 
 def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
-    """Return which `n` of the candidates (m, 2, n_p, n_p) leave the smallest error, the best first.
+    """Return which `n` of the candidates (m, 2, n_p, n_p) give the smallest error, the best first.
 
-    One may be taken several times. They are added one by one; then each in turn gives way to
-    whichever serves better in its place, until none does: the exchange algorithm.
+    One may be chosen several times. They are added one by one. Then each in turn is replaced by a
+    better one, until no replacement helps: the exchange algorithm.
 
     Parameters
     ----------
-    told : (2, n_p, n_p) what is known already.
+    told : (2, n_p, n_p) the present information.
 
     References
     ----------

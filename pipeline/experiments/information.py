@@ -1,9 +1,9 @@
-"""How much a record tells of the carts: the Fisher information of one that is not there yet.
+"""The Fisher information on the carts in a record that does not exist yet.
 
-The fit that will be made of it tells: the squares of its derivatives by the parameters over the
-noise, start and encoder zeros eliminated, are the information H; what the noise does to them is S,
-which is H for white noise and more where rounding leaves errors that last. Both add up over
-records, and the covariance is H⁻¹ S H⁻¹.
+It follows from the later fit. The squares of its derivatives by the parameters over the noise, with
+start and encoder zeros eliminated, are the information H. S is the effect of the noise on them,
+which is H for white noise and more if rounding leaves lasting errors. Both add up over records, and
+the covariance is H⁻¹ S H⁻¹.
 
 References: E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data,
 1997, chapter 6; G. C. Goodwin, R. L. Payne, Dynamic System Identification: Experiment Design and
@@ -42,18 +42,18 @@ from pipeline.results import Analysis, ChainFit, FrequencyResponse, Record, Sine
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Knowledge:
-    """What the records so far tell of the carts, and how well the next ones will be measured.
+    """The information in the records so far, and the precision of the next ones.
 
     Attributes
     ----------
     chain : as identified.
     told : (2, n_p, n_p) H and S of the relative changes of the parameters of `parametrisation`.
-    size : (n_p,) what those are relative to, physical units.
-    step, noise : (n,) of each cart, the encoder's step and what shakes it, position units.
+    size : (n_p,) the reference of these changes, in physical units.
+    step, noise : (n,) the encoder step and the other noise of each cart, position units.
     sample_time : s, of the bench.
-    beyond : how many times S is what encoders leave: friction, say, leaves more.
-    dwells : so far; where there are any, the carts are identified from dwells alone.
-    misfit : by how much of its magnitude a dwell lies off the carts, beyond its error.
+    beyond : the ratio of S to the encoders' part: friction, for example, adds to it.
+    dwells : so far; if there are any, the carts are identified from dwells alone.
+    misfit : the distance of a dwell from the carts beyond its error, as a share of its magnitude.
     """
 
     chain: Chain
@@ -69,7 +69,7 @@ class Knowledge:
 
     @classmethod
     def of(cls, analysis: Analysis) -> Self:
-        """Take stock of what the records of a submission tell.
+        """Return the information in the records of a submission.
 
         Raises
         ------
@@ -81,11 +81,11 @@ class Knowledge:
         everything = Parametrisation(bench=analysis.bench)
         gone = tuple(name for name in everything.names if name not in fit.names)
         P = everything.holding_at_zero(*gone)
-        # A fit held these at zero; here the logarithm must have a slope.
+        # A fit held these at zero; here the logarithm needs a slope.
         undamped = 1e-6 * critical_damping(chain)
         chain = Chain(m=chain.m, c=np.where(chain.c > 0, chain.c, undamped), k=chain.k)
         value = P.physical(chain)
-        size = np.where(value > 0, value, np.max(chain.k))  # a wall spring may be just there
+        size = np.where(value > 0, value, np.max(chain.k))  # a wall spring may be almost zero
         records = _fitted_records(analysis, fit)
         covariance = np.asarray(fit.covariance / np.outer(size, size), dtype=np.float64)
         known = cls(
@@ -116,9 +116,9 @@ class Knowledge:
         return replace(known, noise=np.array(shaken))._compared(windows, covariance)
 
     def _compared(self, windows: Sequence[FitWindow], covariance: Array) -> Self:
-        """Return the same with H of the windows, the S behind this covariance, and what is beyond.
+        """Return the same with H of the windows, the S behind this covariance, and their ratio.
 
-        S is never below what the encoders' noise makes of such records.
+        S is never below the effect of the encoders' noise on such records.
         """
         H, S = np.sum([self._of_window(window) for window in windows], axis=0)
         J, inverse = self.by_parameters(), np.linalg.inv(H)
@@ -131,7 +131,7 @@ class Knowledge:
         J = parameter_jacobian(self.chain, self.parametrisation.names) * self.size
         return J / np.array(list(self.chain.parameters().values()))[:, None]
 
-    # ------------------------------------------------------------------ what a record tells
+    # -------------------------------------------------------- the information in a record
 
     def of_recording(self, recording: Recording) -> Array:
         """Return H and S (2, n_p, n_p) of a recording with all carts free, from rest."""
@@ -159,14 +159,14 @@ class Knowledge:
         return self._of_window(window) * np.array([1.0, self.beyond])[:, None, None]
 
     def _of_window(self, window: FitWindow) -> Array:
-        """Return H and S of a window, its positions rounded as the encoders will round them."""
+        """Return H and S of a window, with its positions rounded as the encoders will do."""
         rows = [cart - 1 for cart in window.carts]
         theta = self.parametrisation.pack(self.chain)
         (misfit,) = look([window], self.parametrisation, theta).misfits
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
         exact = window.y + misfit.residual * window.sigma[:, None]
         resting = window.n_resting
-        exact[:, :resting] = exact[:, [resting]]  # whose residual is not weighed down
+        exact[:, :resting] = exact[:, [resting]]  # whose residual is not weighted down
         flat = J.reshape(theta.size, -1)
         S = np.mean(
             [score_covariance(weighed(off, window), J) for off in self._errors(exact, rows)], axis=0
@@ -174,17 +174,17 @@ class Knowledge:
         return np.stack([flat @ flat.T, S])
 
     def _errors(self, exact: Array, rows: list[int]) -> Iterator[Array]:
-        """Yield what encoders of these carts err by on exact positions (p, n), several times."""
+        """Yield random encoder errors on exact positions (p, n), several times."""
         rng, step = np.random.default_rng(0), self.step[rows, None]
-        for _ in range(3):  # what one noise does to the parameters is chance
-            # Where between two counts an encoder begins is chance.
+        for _ in range(3):  # the effect of a single noise on the parameters is chance
+            # An encoder's start between two counts is random.
             from_count = exact + step * rng.uniform(-0.5, 0.5, size=step.shape)
             read = from_count + self.noise[rows, None] * rng.standard_normal(exact.shape)
             whole = step * np.round(read / np.where(step > 0, step, 1.0))
             yield np.where(step > 0, whole, read) - from_count
 
     def _of_dwell(self, recording: Recording) -> Array:
-        """Return what the steady state tells, as precisely as that of the dwells so far."""
+        """Return the information of the steady state, as precise as that of the dwells so far."""
         steady = recording.duration - settling_wait(self.chain, time_constants=SETTLED_DWELL)
         samples = max(steady / self.sample_time, 1.0)
         omega, responses = np.array([2 * np.pi * recording.frequency]), []
@@ -204,7 +204,7 @@ class Knowledge:
     def of_lines(self, omega: Array, *, amplitude: Array, seconds: float) -> Array:
         """Return H and S (n, 2, n_p, n_p) of steady sines of omega (n,), rad/s, each alone.
 
-        Sines that move the carts by many counts: what is rounded is white.
+        The sines move the carts by many counts, so rounding errors are white.
         """
         P, carts = self.parametrisation, range(1, self.chain.n + 1)
         data = Points.collect(self._response(omega, carts), n=self.chain.n)
@@ -236,7 +236,7 @@ class Knowledge:
         return sampled_input(recording, period=self.sample_time)
 
     def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:
-        """Return the input at which the cart that goes furthest takes `share` of the travel."""
+        """Return the input at which the largest cart motion is this `share` of the travel."""
         t, u = self.input(recording)
         x = simulate_linear(self.chain, t, u, free=recording.carts)
         return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
@@ -253,7 +253,7 @@ def sampled_input(recording: Recording, *, period: float) -> tuple[Array, Array]
     return _sampled(start, recording.duration, period, recording.frequency_end, recording.sines)
 
 
-# All that are weighed at once are kept, for each is asked for twice or more.
+# All candidates are kept, as each is used twice or more.
 @lru_cache(maxsize=64)
 def _sampled(
     start: Start, duration: float, period: float, end: float | None, tones: tuple[Tone, ...]
@@ -266,11 +266,11 @@ def _sampled(
 
 
 def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
-    """Return the records that the fit is made of.
+    """Return the records used in the fit.
 
     Raises
     ------
-    DataError : there are none: the fit is to a table.
+    DataError : there are none, as the fit is to a table.
     """
     kinds = ("sine",) if fit.method == "bode_fit" else ("step", "sweep")
     out = {one.experiment for one in analysis.left_out}
@@ -290,7 +290,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 def _median_by_cart(
     runs: Sequence[Record] | Sequence[FitWindow], values: Sequence[Array], *, n: int
 ) -> Array:
-    """Return the median (n,) over the runs of what each has a value of for each of its carts."""
+    """Return the median (n,) over the runs of a value that each run has for its carts."""
     found = [
         [
             float(of_run[run.carts.index(cart)])

@@ -1,6 +1,6 @@
-"""Many sines in one record, at the frequencies that tell most and with as low a peak as may be.
+"""Many sines in one record, at the most informative frequencies and with a low peak.
 
-How far the carts go is what bounds an input here, so it is their motion whose peak is made low.
+The input is bounded by the carts' travel, so the peak of their motion is reduced.
 
 References: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970), 85-89, for the phases to
 begin with; E. Van der Ouderaa, J. Schoukens, J. Renneboog, IEEE Trans. Instrumentation and
@@ -17,10 +17,10 @@ from pipeline.experiments.information import Knowledge
 Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # harmonics
 
-_QUANTA = 16  # equal parts of the motion's power, put where they tell most
-_LOW, _HIGH = 0.3, 1.6  # times the first and the last resonance, between which the lines lie
+_QUANTA = 16  # equal parts of the motion's power, placed where they are most informative
+_LOW, _HIGH = 0.3, 1.6  # times the first and the last resonance, as limits of the lines
 _CLIP_AT = 0.8  # of the peak
-_DIGITS = 4  # of shares and phases, as they stand in a file
+_DIGITS = 4  # of shares and phases, as written in a file
 
 
 def optimal_tones(
@@ -31,7 +31,7 @@ def optimal_tones(
     Parameters
     ----------
     base : Hz, of which the lines are harmonics.
-    seconds, travel : how long it will run, and how far a cart may go, position units.
+    seconds, travel : duration, and limit of the motion, position units.
     """
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     low, high = _LOW * resonances[0], _HIGH * resonances[-1]
@@ -39,7 +39,7 @@ def optimal_tones(
     omega = np.asarray(2 * np.pi * base * lines, dtype=np.float64)
     G = known.chain.frequency_response(omega)
     reach = np.max(np.abs(G), axis=0)
-    # How far each part of the power moves a cart; the motion's peak is about 1.8 of its rms.
+    # The motion for each part of the power; the motion's peak is about 1.8 of its rms.
     each = travel / 1.8 * np.sqrt(2 / _QUANTA)
     told = known.of_lines(omega, amplitude=each / reach, seconds=seconds)
     chosen = choose(told, known.told, n=_QUANTA, goal=goal)
@@ -52,13 +52,13 @@ def optimal_tones(
 
 
 def schroeder_phases(size: Array) -> Array:
-    """Return phases (n,) of lines of this size (n,) that keep their sum's peak low, rad."""
+    """Return phases (n,) of lines of these sizes (n,) that keep their sum's peak low, rad."""
     power = size**2 / np.sum(size**2)
     return -2 * np.pi * np.cumsum(np.cumsum(power) - power)
 
 
 def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
-    """Return phases (n,) at which the carts' furthest swing is low: clip, keep the phases, again.
+    """Return phases (n,) with a low largest swing of the carts: clip, keep the phases, repeat.
 
     `G` (carts, n) is the response at the lines.
     """
@@ -71,7 +71,7 @@ def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
         if top < lowest:
             best, lowest = phase, top
         spectrum = np.fft.rfft(np.clip(x, -_CLIP_AT * top, _CLIP_AT * top))[:, lines]
-        # What is sin here is -j times half the line there; each cart votes by how far it goes.
+        # A sine here is -j times half the line there; each cart is weighted by its motion.
         phase = np.angle(np.sum(1j * spectrum * np.conj(motion), axis=0))
     return best
 

@@ -1,4 +1,4 @@
-"""`cartlab plan --next`: the experiments that bring most, and what each will bring."""
+"""`cartlab plan --next`: the most useful experiments, and the benefit of each."""
 
 import json
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from pipeline.words.numbers import count, first_few
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-_ALONE = 4  # recordings of the plan of which a sentence says what each would leave
+_ALONE = 4  # recordings of the plan whose single benefit is listed
 STATISTICAL = (
     f"that counts the noise alone: no bench is calibrated better than to {100 * CALIBRATION:g} %"
 )
@@ -37,17 +37,16 @@ STATISTICAL = (
 
 @dataclass(frozen=True, kw_only=True)
 class NextPlan:
-    """The experiments chosen, and the error expected after each.
+    """The chosen experiments, and the expected error after each.
 
     Attributes
     ----------
-    now : the error that `words` names, relative, by what is recorded.
-    errors : (n + 1,) the same once the open recordings of the plan are there too, and after each
-        more.
-    planned : what each open recording of the plan would leave by itself, by id.
-    separation : for "gap", of the two explanations that it tells apart best, in noises.
-    wrote : what became of plan.toml, in words.
-    doubt : why the errors do not hold, whatever is recorded; "": they do.
+    now : the present error described by `words`, relative.
+    errors : (n + 1,) the same with the open recordings of the plan, and after each more.
+    planned : the error after each single open recording of the plan, by id.
+    separation : for "gap", of the pair of explanations that is separated best, in noises.
+    wrote : the change of plan.toml, in words.
+    doubt : why the errors are not reliable, whatever is recorded; "": they are.
     """
 
     words: str
@@ -63,12 +62,12 @@ class NextPlan:
 
     @property
     def said(self) -> str:
-        """What they bring, in one sentence."""
+        """Their benefit, in one sentence."""
         return "; ".join(self.sentences)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What they bring, and what to make of it."""
+        """Their benefit, with notes."""
         if self.separation is not None:
             return (
                 f"{self.recordings[0].id} tells two explanations of the gap apart by "
@@ -110,8 +109,8 @@ def plan_next(
 
     Raises
     ------
-    DataError : the data recorded do not identify the carts, so nothing can be weighed.
-    ConfigError : there is no such goal; gap.json is broken, or of other data or limits.
+    DataError : the recorded data do not identify the carts, so nothing can be predicted.
+    ConfigError : there is no such goal; gap.json is broken, or belongs to other data or limits.
     """
     path = plan_path(submission)
     old, new = current_plan(submission), not path.exists()
@@ -143,7 +142,7 @@ def plan_next(
 
 
 def _doubt(analysis: Analysis, folder: Path) -> str:
-    """Return that the errors count noise, where more than noise is left."""
+    """Return a note that the errors count noise, if more than noise is left."""
     fit = analysis.fit
     if fit is None or fit.explains_data:
         return ""
@@ -163,11 +162,11 @@ def choose_next(
     commands: frozenset[str],
     without: Sequence[Recording] = (),
 ) -> NextPlan:
-    """Choose the `n` next experiments, each with the error expected once it is there.
+    """Choose the `n` next experiments, each with the error expected after it.
 
     Parameters
     ----------
-    without : nothing that resembles one of these.
+    without : nothing similar to these.
 
     Raises
     ------
@@ -214,7 +213,7 @@ def choose_next(
 
 
 def tells_nothing(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
-    """Return why a recording would not make the carts known better; "": it would."""
+    """Return why a recording would not improve the carts' parameters; "": it would."""
     kinds = ("sine",) if known.dwells else ("step", "sweep")
     if recording.kind not in kinds:
         used = "dwells" if known.dwells else "steps and sweeps"
@@ -229,12 +228,12 @@ def tells_nothing(recording: Recording, known: Knowledge, *, limits: PlanLimits)
 
 
 def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, float]:
-    """Return the recording that `cartlab gap` proposes, and how far it sets explanations apart.
+    """Return the recording that `cartlab gap` proposes, and the separation it promises.
 
     Raises
     ------
-    DataError : there is no gap.json, or it proposes none.
-    ConfigError : it is broken, or of other data or limits than these.
+    DataError : there is no gap.json, or it has no proposal.
+    ConfigError : it is broken, or belongs to other data or limits than these.
     """
     path = submission.folder / "gap" / "gap.json"
     command = f"`cartlab gap {submission.folder}`"
@@ -277,7 +276,7 @@ def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
 
 
 def _promise(words: str, before: float, after: float) -> str:
-    """Return what one recording is to bring, as its note says it."""
+    """Return the promise of one recording, as its note says it."""
     doubt = f"; {STATISTICAL}" if after < CALIBRATION else ""
     return f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected{doubt}"
 

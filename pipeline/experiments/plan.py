@@ -1,7 +1,7 @@
 """The plan of a session at the bench: what to record, and within which limits.
 
-It stands in `plan.toml` in the submission folder. `cartlab plan` proposes it, a person may change
-it, `cartlab acquire` carries it out.
+It is `plan.toml` in the submission folder. `cartlab plan` proposes it, a person may change it,
+`cartlab acquire` carries it out.
 """
 
 from math import isclose
@@ -17,12 +17,12 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 class PlanLimits(TomlTable):
-    """What no run may pass.
+    """The limits of every run.
 
     Attributes
     ----------
     input : largest input, input units.
-    travel : furthest a cart may be from where it was zeroed, position units.
+    travel : largest distance of a cart from its zero, position units.
     """
 
     input: Positive
@@ -30,7 +30,7 @@ class PlanLimits(TomlTable):
 
 
 class PidLoop(TomlTable):
-    """The bench's own PID on one cart: duty counts of e in encoder counts."""
+    """The bench's own PID on one cart: duty counts, with e in encoder counts."""
 
     type: Literal["pid"] = "pid"
     kp: Finite
@@ -40,7 +40,7 @@ class PidLoop(TomlTable):
 
 
 class StateLoop(TomlTable):
-    """State feedback, in the submission's units; () and None: what the design finds."""
+    """State feedback, in the submission's units; () and None: those of the design."""
 
     type: Literal["state_feedback"] = "state_feedback"
     gains: tuple[Finite, ...] = ()
@@ -53,19 +53,19 @@ class Recording(TomlTable):
 
     Attributes
     ----------
-    id : the experiment's in submission.toml; its files are named after it.
+    id : of the experiment in submission.toml; its files have this name.
     carts : free to move; the others are held.
     wave : of the input, or in closed loop of the reference.
-    amplitude : input units, in closed loop position units; 0: a decay that a hand starts.
+    amplitude : input units, in closed loop position units; 0: a decay started by hand.
     frequency : Hz, of the wave; a chirp starts there.
-    frequency_end : Hz, where a chirp ends.
-    tones : of a multisine, of each sine the harmonic of `frequency`, its share of the amplitude
+    frequency_end : Hz, end of a chirp.
+    tones : of a multisine, for each sine the harmonic of `frequency`, its share of the amplitude
         and its phase in rad.
     cycles : periods; the run takes cycles/frequency seconds.
-    release : the cart that is pulled out and let go by hand; None: no hand.
+    release : the cart that is pulled out and released by hand; None: no hand.
     controller : closes the loop.
     settle : s of rest beforehand.
-    aim : what it was chosen for by its information, "zeta_2"; "": by habit, or by a person.
+    aim : the parameter for which it was chosen, "zeta_2"; "": by default, or by a person.
     """
 
     id: str
@@ -90,17 +90,17 @@ class Recording(TomlTable):
 
     @property
     def sines(self) -> tuple[Tone, ...]:
-        """The tones of a multisine, as a bench is told them."""
+        """The tones of a multisine in the bench's form."""
         return tuple(Tone(harmonic=h, share=share, phase=p) for h, share, p in self.tones)
 
     def resembles(self, other: Self) -> bool:
-        """Whether who wants one of the two no more does not want the other either."""
+        """Return whether a person who refuses one of the two would refuse the other too."""
         words = (self.kind, self.wave, self.carts, self.release, self.controller)
         if words != (other.kind, other.wave, other.carts, other.release, other.controller):
             return False
         mine = (self.amplitude, self.frequency, self.frequency_end or 0.0)
         yours = (other.amplitude, other.frequency, other.frequency_end or 0.0)
-        # What is proposed again after other records differs by as much.
+        # A proposal repeated after other records differs by this much.
         return all(isclose(a, b, rel_tol=0.1) for a, b in zip(mine, yours, strict=True))
 
 

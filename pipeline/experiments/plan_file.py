@@ -1,4 +1,4 @@
-"""`plan.toml`: read it, write it, add to it; whatever is wrong is one line a person can act on."""
+"""`plan.toml`: read it, write it, add to it; every fault is one line a person can act on."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -19,9 +19,9 @@ from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.submission.toml_section import toml_section
 
 NAME = "plan.toml"
-LONGEST_RUN = 600.0  # s; what a simulation of it and its file can well take
+LONGEST_RUN = 600.0  # s; a limit for the time of a simulation and the size of a file
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # data files are named after it
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # data files have its name
 _HEAD = """\
 # What to record, in this order; `cartlab acquire` carries it out. Change what you like: `cartlab
 # plan` leaves what stands here alone and adds tables at the end as the data allow it, dwells after
@@ -45,7 +45,7 @@ _CHECK = """\
 
 
 def plan_path(submission: Submission) -> Path:
-    """Return where a submission's plan stands, there or not yet."""
+    """Return the path of a submission's plan, which may not exist yet."""
     return submission.folder / NAME
 
 
@@ -65,12 +65,12 @@ def load_plan(submission: Submission) -> Plan:
 
 
 def save_plan(plan: Plan, submission: Submission) -> Path:
-    """Write the plan, or add what is new in it to the file; same plan, same bytes.
+    """Write the plan, or add its new recordings to the file; same plan, same bytes.
 
     Raises
     ------
-    ConfigError : the file that is there is broken, or would be; nothing is written then.
-    ValueError : it does not begin with what stands in the file, which nobody overwrites.
+    ConfigError : the existing file is broken, or would be; nothing is written.
+    ValueError : it does not begin with the recordings of the file, which are never overwritten.
     """
     path = plan_path(submission)
     if path.exists() or path.is_symlink():
@@ -91,18 +91,17 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
 
 
 def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Plan) -> Plan:
-    """Put recordings at the end of a submission's plan as it is by now; return that plan.
+    """Add recordings to the end of a submission's plan as it is now; return that plan.
 
-    Whoever proposes them may have thought for minutes, while others added theirs. An id that is
-    taken becomes another.
+    The proposal may have taken minutes, while others added theirs. An id that is taken is changed.
 
     Parameters
     ----------
-    otherwise : the plan that they are added to where there is no file.
+    otherwise : the plan to extend if there is no file.
 
     Raises
     ------
-    ConfigError : the plan is broken, or would be; nothing is written then.
+    ConfigError : the plan is broken, or would be; nothing is written.
     """
     with turn_in(folder):
         submission = load_submission(folder)
@@ -115,7 +114,7 @@ def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Pl
 
 
 def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
-    """Return the recordings, each with an id of its own: "step-3" where there is a "step-2"."""
+    """Return the recordings, each with a unique id: "step-3" if there is a "step-2"."""
     used, renamed = set(taken), []
     for recording in proposed:
         name = recording.id
@@ -172,14 +171,14 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
-# ------------------------------------------------- what the keys say about one another
+# ------------------------------------------------- consistency of several keys
 
 
 def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
-    """Yield (location, what is wrong) for what no single value shows."""
+    """Yield (location, problem) for problems that no single value shows."""
     first: dict[str, int] = {}
     for i, recording in enumerate(plan.recordings):
-        name = recording.id.lower()  # some file systems do not tell capitals
+        name = recording.id.lower()  # some file systems ignore case
         if name in first:
             yield ("recordings", i, "id"), f"used before, by recordings[{first[name] + 1}]"
         first.setdefault(name, i)
@@ -190,7 +189,7 @@ def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
 def recording_problems(
     recording: Recording, limits: PlanLimits, system: System
 ) -> Iterator[tuple[str, str]]:
-    """Yield (key, what is wrong) for what no single value of a recording shows."""
+    """Yield (key, problem) for problems that no single value of a recording shows."""
     n, carts, wave = system.carts, recording.carts, recording.wave
     if not _ID.fullmatch(recording.id):
         wanted = "letters, digits, dots, dashes; its data files are named after it"
@@ -212,13 +211,13 @@ def recording_problems(
     if (wave == "multisine") != bool(recording.tones) or len(recording.tones) > MOST_TONES:
         found = len(recording.tones)
         yield "tones", f"expected 1 to {MOST_TONES} for a multisine, else none, found {found}"
-    elif recording.tones and _peak(recording) > 1.01:  # it may lie between the points looked at
+    elif recording.tones and _peak(recording) > 1.01:  # the peak may be between the points
         yield "tones", f"their sum reaches {_peak(recording):.3g} times `amplitude`, at most 1 does"
     yield from _loop_problems(recording, n)
 
 
 def _peak(recording: Recording) -> float:
-    """Return how high a multisine of amplitude one goes."""
+    """Return the peak of a multisine of amplitude one."""
     h, share, phase = (column[:, None] for column in np.array(recording.tones).T)
     # 16 points of a period of the highest.
     turns = np.linspace(0.0, 1.0, 16 * int(h.max()), endpoint=False)
@@ -226,7 +225,7 @@ def _peak(recording: Recording) -> float:
 
 
 def _time_problems(recording: Recording) -> Iterator[tuple[str, str]]:
-    """Yield what no bench takes: it drops the command, and streams nothing."""
+    """Yield times that no bench accepts: it drops the command, and streams nothing."""
     low, high = FREQUENCIES
     for key in ("frequency", "frequency_end"):
         hertz = getattr(recording, key)

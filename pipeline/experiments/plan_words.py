@@ -1,4 +1,4 @@
-"""A plan as a person reads it: what is recorded, what must be held, how long it takes."""
+"""A plan for people: what is recorded, what must be held, how long it takes."""
 
 from collections.abc import Collection, Sequence
 from itertools import groupby
@@ -9,11 +9,11 @@ from pipeline.words.numbers import count
 
 
 def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ()) -> str:
-    """Return the recordings in order, under a line each time carts are to be held or freed.
+    """Return the recordings in order, under a line whenever carts must be held or freed.
 
     Parameters
     ----------
-    new : ids that were not in the plan before; each has a +.
+    new : ids that were not in the plan before; each is marked with +.
     """
     n, done = submission.system.carts, recorded_ids(plan, submission)
     wide = max((len(recording.id) for recording in plan.recordings), default=0)
@@ -40,7 +40,7 @@ def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ())
 def plan_data(
     plan: Plan, submission: Submission, *, new: Collection[str] = ()
 ) -> dict[str, object]:
-    """Return the plan for JSON, with what is derived from it; `new` as for the table."""
+    """Return the plan for JSON, with derived values; `new` as for the table."""
     done, everyone = recorded_ids(plan, submission), range(1, submission.system.carts + 1)
     recordings = [
         {
@@ -68,12 +68,12 @@ def recorded_ids(plan: Plan, submission: Submission) -> frozenset[str]:
 
 
 def session_time(recordings: Collection[Recording]) -> float:
-    """Return how long recordings take, rests included, s; hands take their own time."""
+    """Return the duration of recordings, rests included, s, without the time for hands."""
     return sum(recording.settle + recording.duration for recording in recordings)
 
 
 def hold_words(carts: Sequence[int], *, n: int) -> str:
-    """Return what is to be held and what freed."""
+    """Return which carts to hold and which to free."""
     held = [cart for cart in range(1, n + 1) if cart not in carts]
     if not held:
         return "all carts free" if n > 1 else "cart 1 free"
@@ -85,7 +85,7 @@ def _carts(carts: Sequence[int]) -> str:
 
 
 def what_words(recording: Recording, submission: Submission) -> str:
-    """Return what one recording is and how long it takes."""
+    """Return the content of one recording and its duration."""
     if recording.amplitude == 0:
         what = f"{recording.kind}: pull cart {recording.release} out, let it go"
     else:

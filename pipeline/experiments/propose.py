@@ -1,8 +1,8 @@
-"""Propose what to record: cautious runs first, then what a quick model of the carts asks for.
+"""Propose recordings: cautious runs first, then those chosen with a quick model of the carts.
 
-Nothing is known at first, so inputs are a few percent of what the motor can do; a hand releases
-the carts. Once a sweep is recorded, the carts it identifies say at which frequencies to dwell and
-with how much input. Once the dwells are recorded, the designed controller is run.
+Nothing is known at first, so inputs are a few percent of the motor's range, and a hand releases the
+carts. Once a sweep is recorded, the identified carts determine the dwell frequencies and inputs.
+Once the dwells are recorded, the designed controller is run.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,14 +33,14 @@ from pipeline.words.numbers import count
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-AIM = 0.4  # of the travel limit: how far the carts are meant to move
-FURTHEST = 0.8  # of the travel limit: a transient may take so much; the quick model may err
+AIM = 0.4  # of the travel limit: the intended motion of the carts
+FURTHEST = 0.8  # of the travel limit: allowed for a transient, as the quick model may err
 
-# About 1 cm in units people use; an ECP 210 counts 440 to the centimetre.
+# About 1 cm in common units; an ECP 210 has 440 counts per centimetre.
 _ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0, "counts": 440.0}
 
-# Shares of the input limit before anything is known. A bench's motor moves its carts some 5 to 15
-# cm at full scale, and a resonance several times that.
+# Shares of the input limit while nothing is known. A bench's motor moves its carts some 5 to 15 cm
+# at full scale, and at a resonance several times that.
 _FIRST_STEP = 0.04
 _REPEATS = "ab"  # of a decay
 EDGES = 4  # half periods of a step: off, on, off, on
@@ -49,17 +49,17 @@ _FIRST_SETTLE = 5.0  # s
 FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
 
 _DWELLS = 24
-_STEP = 0.9  # of the aim: where a step rests; it overshoots up to twice as far
+_STEP = 0.9  # of the aim: the level of a step; it overshoots up to twice as far
 
 
 @dataclass(frozen=True, kw_only=True)
 class MadePlan:
-    """A plan as it is written now.
+    """A plan with a message about what was written.
 
     Attributes
     ----------
-    said : in one sentence, what was written.
-    trouble : why the data could not help to choose; "": they could, or there are none.
+    said : what was written, in one sentence.
+    trouble : why the data could not be used; "": they were, or there are none.
     """
 
     plan: Plan
@@ -69,13 +69,13 @@ class MadePlan:
 
 
 def current_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Return the plan of a submission, or the one that is proposed where it has none."""
+    """Return the plan of a submission, or a proposal if it has none."""
     there = plan_path(submission).exists()
     return load_plan(submission) if there else propose_plan(submission, bench=bench)
 
 
 def make_plan(submission: Submission, *, stock: bool = False, progress: Progress) -> MadePlan:
-    """Write plan.toml, or add to it what the data allow.
+    """Write plan.toml, or add the recordings that the data allow.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
     progress("asking the data what else to record")
     try:
         new, trouble = extend_plan(old, submission, bench=bench), ""
-    except DataError as error:  # a plan that data cannot help stands as it is
+    except DataError as error:  # if the data cannot help, a plan stays as it is
         new, trouble = old, str(error)
     added = new.recordings[len(old.recordings) :]
     new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
@@ -97,13 +97,13 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Propose the first runs from what the submission says of the bench; no data are read.
+    """Propose the first runs from the submission's statements about the bench, without data.
 
-    What is recorded already is not proposed. `extend_plan` goes on from there.
+    Existing recordings are not proposed again. `extend_plan` continues from there.
 
     Parameters
     ----------
-    bench : as it describes itself; None: one that knows every command.
+    bench : its own description; None: a bench that knows every command.
     """
     system, recorded = submission.system, submission.experiments
     limits = _limits(system, submission.design, bench)
@@ -122,14 +122,14 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
 
 
 def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Add what the data recorded so far allow: dwells after a sweep, the closed loop after dwells.
+    """Add what the recorded data allow: dwells after a sweep, the closed loop after dwells.
 
-    What stands in the plan stays as it is and where it is. What was added once is not again. A
-    bench that knows no state feedback gets a PID on cart 1.
+    Existing entries stay unchanged and in place. Recordings that were added once are not added
+    again. A bench without state feedback gets a PID on cart 1.
 
     Raises
     ------
-    DataError : the data recorded do not identify the carts, or no loop can be closed on them.
+    DataError : the data do not identify the carts, or no loop can be closed on them.
     """
     stages: list[Callable[[Analysis], list[Recording]]] = []
     if _wants_dwells(plan, submission):
@@ -147,10 +147,10 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
 
 
 def _wants_dwells(plan: Plan, submission: Submission) -> bool:
-    """Whether there are none yet, and a sweep (or all that was planned) is recorded."""
+    """Whether there are no dwells yet, and a sweep (or everything planned) is recorded."""
     n, recorded = submission.system.carts, submission.experiments
     kinds = {e.kind for e in recorded if len(e.carts) == n}
-    if any(r.aim for r in plan.recordings):  # somebody knows what to record; dwells replace it
+    if any(r.aim for r in plan.recordings):  # the person planned dwells; these replace the proposal
         return False
     if kinds & {"sine", "bode"} or any(r.kind == "sine" for r in plan.recordings):
         return False
@@ -160,7 +160,7 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
 
 
 def _wants_loop(plan: Plan, submission: Submission) -> bool:
-    """Whether there is none yet, and the dwells are recorded."""
+    """Whether there is no loop yet, and the dwells are recorded."""
     ids = {e.id for e in submission.experiments}
     kinds = {e.kind for e in submission.experiments}
     kinds_planned = {r.kind for r in plan.recordings}
@@ -176,13 +176,12 @@ def _wants_loop(plan: Plan, submission: Submission) -> bool:
 
 
 def _limits(system: System, design: Design | None, bench: Description | None) -> PlanLimits:
-    """Return the stated limits, and where none are stated usual ones for a person to check."""
+    """Return the stated limits, or usual ones for a person to check."""
     per_count = system.input.per_count or (bench.input_per_count if bench else None)
     if per_count is None and system.input.unit == "V":
         per_count = DUTY_COUNT
     stated = design.input_limit if design else None
-    # Of a unit that nothing is known of, nobody can say what the motor takes.
-    # A usual input, where nothing says what the motor takes.
+    # In an unknown unit, nobody can say what input the motor takes: a usual one is proposed.
     most = FULL_SCALE * per_count if per_count else stated or 5.0
     asked = abs(design.reference) if design else 1.0
     travel = _ABOUT_1_CM.get(system.position.unit, asked or 1.0) / AIM
@@ -192,14 +191,14 @@ def _limits(system: System, design: Design | None, bench: Description | None) ->
 
 
 def _decays(cart: int, system: System) -> list[Recording]:
-    """Let one cart go by hand, the others held; a cart without a spring cannot swing."""
+    """Release one cart by hand, with the others held; a cart without a spring cannot swing."""
     if not (system.springs[cart - 1] or system.springs[cart]):
         return []
     return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS]
 
 
 def let_go(cart: int, *, name: str, seconds: float) -> Recording:
-    """Return the recording of one cart that a hand lets go, the others held."""
+    """Return the recording of one cart released by hand, with the others held."""
     return Recording(
         id=name,
         kind="decay",
@@ -216,7 +215,7 @@ def _first_steps(system: System, limits: PlanLimits) -> list[Recording]:
     return _steps(
         [sign * _FIRST_STEP * limits.input for sign in (1, -1)],
         carts=system.carts,
-        edge=5.0,  # s from edge to edge of the first steps
+        edge=5.0,  # s between edges of the first steps
         settle=_FIRST_SETTLE,
     )
 
@@ -240,7 +239,7 @@ def _steps(
 
 
 def _sweep(system: System, limits: PlanLimits, *, chirps: bool) -> Recording:
-    """Sweep once over the frequencies of such benches, or switch on and off many times."""
+    """Sweep once over the usual frequencies, or switch on and off many times."""
     # A chirp ends 20 times higher; of a square wave, edges are 2.5 s apart.
     frequency = 0.5 if chirps else 0.5 / 2.5
     return Recording(
@@ -264,7 +263,7 @@ def identified_chain(analysis: Analysis) -> Chain:
 
     Raises
     ------
-    DataError : they are not, with the reason.
+    DataError : they are not identified, with the reason.
     """
     fit = analysis.fit
     if fit is None or not fit.converged:
@@ -285,7 +284,7 @@ def _reason(analysis: Analysis, *stages: Stage) -> str:
 
 
 def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
-    """Return a step to each side that ends as far out as the carts are meant to go."""
+    """Return a step to each side that ends as far out as intended."""
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     hold = AIM * limits.travel / float(np.max(np.abs(chain.static_gains())))
     size = min(_STEP * hold, limits.input)
@@ -293,7 +292,7 @@ def large_steps(chain: Chain, limits: PlanLimits) -> list[Recording]:
 
 
 def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
-    """Return steps and dwells that move the carts as far as they are meant to go."""
+    """Return steps and dwells that move the carts as far as intended."""
     aim, furthest = AIM * limits.travel, FURTHEST * limits.travel
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
     recordings = large_steps(chain, limits)
@@ -333,10 +332,10 @@ def _loop(
             f"no closed loop can be proposed: {_reason(analysis, Stage.STATE_FEEDBACK)}"
         )
     task = submission.design or Design(cart=feedback.cart)
-    # Carts on the way to the controlled one may well go further than it does.
+    # Carts before the controlled one may go further than it does.
     furthest = float(np.max(np.abs(feedback.y)) / abs(feedback.reference))
     size = min(abs(task.reference), FURTHEST * limits.travel / furthest)
-    edge = max(3.0 * task.settling_time, 2.0)  # s from edge to edge of the set point
+    edge = max(3.0 * task.settling_time, 2.0)  # s between edges of the set point
     recording = Recording(
         id="control",
         kind="closed_loop",
@@ -357,11 +356,11 @@ def _loop(
 
 
 def rounded(value: float) -> float:
-    """Return the number as one types it: two digits."""
+    """Return the number with two digits, as people type it."""
     return float(f"{value:.2g}")
 
 
 def rounded_down(value: float) -> float:
-    """Return the number in two digits, no further from zero than it is."""
+    """Return the number with two digits, rounded towards zero."""
     size = 10.0 ** (floor(log10(abs(value))) - 1)
     return float(f"{floor(abs(value) / size * (1 + 1e-12)) * size:.2g}") * (1 if value > 0 else -1)

@@ -1,4 +1,4 @@
-"""What an experiment that somebody proposes would bring, beside the one that would be chosen."""
+"""The benefit of a proposed experiment, beside the program's own choice."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ from pipeline.experiments.next_recordings import choose_next, tells_nothing
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.results import Analysis
 
-# The fit takes each sample to err by itself; what an encoder rounds away while a cart hardly moves
-# is the same error in many samples.
+# The fit treats the error of each sample as independent; the rounding error of a cart that hardly
+# moves is the same in many samples.
 _WHY_WORSE = (
     "the fit would know it worse, for where carts rest, or move by few counts, what their encoders "
     "round off does not average out; try a larger motion, or a shorter run"
@@ -18,12 +18,12 @@ _WHY_WORSE = (
 
 @dataclass(frozen=True, kw_only=True)
 class Weighed:
-    """Errors, relative: now, after the one proposed alone, after the one chosen alone.
+    """Relative errors: now, after the proposed one alone, after the chosen one alone.
 
     Attributes
     ----------
-    words : what they are of, "zeta_2".
-    why : the one proposed brings nothing, or harm; "": it does bring something.
+    words : the parameter, "zeta_2".
+    why : why the proposed one does not help, or harms; "": it helps.
     """
 
     words: str
@@ -37,7 +37,7 @@ class Weighed:
 def weigh(
     analysis: Analysis, proposed: Recording, plan: Plan, *, goal: str, commands: frozenset[str]
 ) -> Weighed:
-    """Weigh a recording against the one that serves a goal best within the limits of the plan.
+    """Compare a recording with the best one for a goal within the limits of the plan.
 
     Raises
     ------
@@ -49,7 +49,7 @@ def weigh(
     error = find_goal(goal, known, feedback=analysis.feedback).of
     why = tells_nothing(proposed, known, limits=plan.limits)
     after = found.now if why else float(error(known.told + known.of_recording(proposed)))
-    if after > 1.01 * found.now:  # times the error of now: a difference that shows in two digits
+    if after > 1.01 * found.now:  # times the present error: a visible difference in two digits
         why = _WHY_WORSE
     return Weighed(
         words=found.words,

@@ -1,1 +1,1 @@
-"""Acquisition: the line, the session, and what is kept of it."""
+"""Acquisition: the line, the session, and the files it writes."""

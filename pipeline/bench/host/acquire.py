@@ -1,4 +1,4 @@
-"""Carry out the plan of a submission on a bench, from where it was left."""
+"""Carry out the plan of a submission on a bench, continuing where it was left."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ from pipeline.submission.load import NAME
 from pipeline.submission.toml_file import Value
 
 _USUAL_BAUD = 115_200
-_TRIES = 3  # of one recording; a fault that strikes three times is not chance
+_TRIES = 3  # of one recording; a fault that occurs three times is not chance
 
 
 def acquire(
@@ -41,25 +41,24 @@ def acquire(
     only: Collection[str] = (),
     buttons: Buttons | None = None,
 ) -> tuple[RunOutcome, ...]:
-    """Record what the plan asks for and is not there yet; return how each run ended.
+    """Record what the plan still lacks; return how each run ended.
 
-    Every run that is complete stands in submission.toml at once, so a session that is broken off
-    goes on where it was. What is partial is kept beside the data and recorded again.
+    Every complete run is entered in submission.toml at once, so an interrupted session continues
+    where it was. Partial data are kept beside the others, and the run is recorded again.
 
     Parameters
     ----------
     port : of the bench, as pyserial names it.
-    observers : who watches; the first has a person confirm what hands must do.
-    only : the ids to record, the others left; () for the whole plan, which then grows by what
-        the data recorded allow.
-    buttons : what somebody wants done with the run at hand.
+    observers : they watch; the first one asks a person to confirm what hands must do.
+    only : the ids to record; () for the whole plan, which then grows by what the new data allow.
+    buttons : what a person wants done with the present run.
 
     Raises
     ------
-    Stopped : a signal or a button ended the session; the same call goes on where it was.
-    HardwareError : there is no bench; Runaway : its motor was on while no run was.
-    ConfigError : another session writes there; or the plan as a whole or the submission does not
-        fit the bench; of one recording that does not, its outcome says why, and the others go on.
+    Stopped : a signal or a button ended the session; the same call continues it.
+    HardwareError : there is no bench; Runaway : its motor was on between runs.
+    ConfigError : another session writes there; or plan or submission as a whole do not fit the
+        bench. If a single recording does not fit, its outcome says why, and the others go on.
     """
     with stopping_on_signals(), alone_in(folder):
         work = _Acquisition(
@@ -73,7 +72,7 @@ def acquire(
 
 
 def ensure_plan(folder: Path, *, port: str) -> None:
-    """Write the plan of a submission that has none, within what the bench at the port gives.
+    """Write a plan for a submission without one, within the limits of the bench at the port.
 
     Raises
     ------
@@ -100,7 +99,7 @@ class _Acquisition:
         self._observer = observer
         self._only = frozenset(only)
         self._buttons = buttons
-        self._failed: dict[str, int] = {}  # tries of each recording that has not come off yet
+        self._failed: dict[str, int] = {}  # tries of each recording that has not succeeded yet
 
     def outcomes(self) -> Iterator[RunOutcome]:
         """Record until nothing is left; a line that was lost is opened again."""
@@ -181,7 +180,7 @@ class _Acquisition:
             raise Stopped("by hand")
 
     def _wish(self, run: "_Run") -> Wish:
-        """Return what becomes of a run that ended early: a limit decides, a button, an answer."""
+        """Return what to do with a run that ended early: a limit decides, a button, an answer."""
         name, partial = run.outcome.recording.id, run.outcome.partial
         unsafe = run.outcome.is_unsafe
         if run.file and (unsafe or self._buttons.pressed != "keep"):
@@ -206,7 +205,7 @@ class _Acquisition:
         return wish
 
     def _answer(self, run: "_Run") -> Wish:
-        """Ask whether to record it again; a fault that struck too often is not asked about."""
+        """Ask whether to record it again, unless the fault occurred too often."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] >= _TRIES:
@@ -217,22 +216,22 @@ class _Acquisition:
             self._observer.confirm(
                 f"{name} ended early: {run.outcome.partial}. Record {name} again"
             )
-        except ConfigError:  # nobody there to decide: the rest of the plan goes on
+        except ConfigError:  # nobody is there to decide: the rest of the plan goes on
             return "skip"
         return self._buttons.pressed or "repeat"
 
     def _keep(self, run: "_Run") -> RunOutcome:
-        """Note a run that ended early as an experiment, which says how it ended."""
+        """Enter a run that ended early as an experiment, with a note on its end."""
         remark = f"partial, kept by hand: {run.outcome.partial}"
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
         with signals_held():
             self._note(replace(run, outcome=outcome))
-            (self._folder / run.file).unlink()  # the same lines as those that were noted
+            (self._folder / run.file).unlink()  # the same lines as those that were kept
         self._observer.finished(outcome)
         return outcome
 
     def _note(self, run: "_Run") -> None:
-        """Make the data file of a run, and its table."""
+        """Write the data file of a run, and its table."""
         submission = load_submission(self._folder)
         file = save_record(run.path, folder=self._folder, carts=submission.system.carts)
         outcome = run.outcome
@@ -285,7 +284,7 @@ class _Acquisition:
         session: Session,
         line: SerialLine,
     ) -> "_Run":
-        """Record one experiment and note it."""
+        """Record one experiment and enter it."""
         path = free_raw_path(self._folder, recording)
         try:
             order, table = order_on(recording, plan, submission, line.bench)
@@ -294,10 +293,10 @@ class _Acquisition:
             return self._refused(RunOutcome(recording=recording, lines=0, partial=str(error)), path)
         try:
             restless = session.prepare(order)
-            with signals_held() as let_in:  # what is complete is noted before the program ends
+            with signals_held() as let_in:  # a complete run is entered before the program ends
                 outcome = self._run(session, order, path, submission, let_in)
                 remarks = [restless] if restless else []
-                # Late lines have their stamps: no reader of the data need know.
+                # Late lines have their stamps, so a reader of the data need not know.
                 if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
                     remarks.append(spoilt)
                 run = _Run(
@@ -335,14 +334,14 @@ class _Acquisition:
             raise
 
     def _refused(self, outcome: RunOutcome, path: Path) -> "_Run":
-        """Tell of a recording that did not begin."""
+        """Report a recording that did not begin."""
         self._observer.finished(outcome)
         return _Run(outcome=outcome, path=path)
 
     def _saved_partial(self, path: Path, submission: Submission) -> str:
-        """Save what came of a run that ended early, where no report takes it for a whole one.
+        """Save the data of a run that ended early, where no report takes them for a whole run.
 
-        Return the name of the file, "" where nothing came.
+        Return the name of the file, or "" without any data.
         """
         if not path.exists():
             return ""
@@ -360,9 +359,9 @@ class _Run:
 
     Attributes
     ----------
-    path : of its raw file, which is there if it began.
-    file : of what came of it, where it ended early; "": nothing came.
-    controller : of a closed loop, as submission.toml tells of it.
+    path : of its raw file, which exists if the run began.
+    file : the data of a run that ended early; "": none.
+    controller : of a closed loop, as written in submission.toml.
     """
 
     outcome: RunOutcome
@@ -380,7 +379,7 @@ def _is_lost(line: SerialLine) -> bool:
         line.stop()
         line.clear()
     except Runaway:
-        raise  # a line opened anew would start it again
+        raise  # a line opened again would restart it
     except HardwareError:
         return True
     return False

@@ -1,4 +1,4 @@
-"""Additions to submission.toml: an experiment, a scale, a new file; what stands there is kept."""
+"""Additions to submission.toml: an experiment, a scale, a new file; existing text is kept."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,11 +30,11 @@ _TO_ADD = """\
 
 
 def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
-    """Add an `[[experiments]]` table; text and comments that stand there are kept.
+    """Add an `[[experiments]]` table; existing text and comments are kept.
 
     Raises
     ------
-    SubmissionError : the file cannot take it, or what comes of it would not be valid.
+    SubmissionError : the file cannot take it, or the result would be invalid.
     """
     return edit_submission(submission.folder, lambda document: append_experiment(document, entry))
 
@@ -61,7 +61,7 @@ def recorded_entry(
 
 
 def check_files(plan: Plan, submission: Submission) -> None:
-    """Raise ConfigError where a recording would be written over the data of another experiment."""
+    """Raise ConfigError if a recording would overwrite the data of another experiment."""
     taken = {(submission.folder / e.file).resolve(): e.id for e in submission.experiments}
     for recording in plan.recordings:
         name = data_file(recording)
@@ -74,13 +74,13 @@ def check_files(plan: Plan, submission: Submission) -> None:
 
 
 def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:
-    """Return the submission with its scales, as stated there or by the bench.
+    """Return the submission with its scales, as stated in it or by the bench.
 
-    A folder without one gets a new one from what the bench says of itself.
+    A folder without a submission gets one from the bench's description.
 
     Raises
     ------
-    ConfigError : a scale that nobody states, units that differ, or fewer carts on the bench.
+    ConfigError : a missing scale, units that differ, or too few carts on the bench.
     """
     if not (folder / NAME).exists():
         if stock:
@@ -114,13 +114,13 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
 
 
 def scale_remarks(submission: Submission, bench: Description) -> list[str]:
-    """Return where the submission's scales are not those that the bench states."""
+    """Return notes on scales of the submission that differ from those of the bench."""
     system = submission.system
     pairs = {
         "input": (system.input, bench.input_unit, bench.input_per_count),
         "position": (system.position, bench.position_unit, bench.position_per_count),
     }
-    # Scales that differ by less are the same number typed with fewer digits.
+    # A smaller difference means the same number typed with fewer digits.
     return [
         f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
         f"that of {NAME} is used"
@@ -130,7 +130,7 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
 
 
 def cart_remarks(submission: Submission, bench: Description) -> list[str]:
-    """Return what is to be said where the bench states more carts than the submission has."""
+    """Return notes if the bench states more carts than the submission has."""
     carts = submission.system.carts
     if not bench.commands or bench.carts <= carts:
         return []
@@ -142,11 +142,11 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
 
 
 def limit_words(limits: PlanLimits, submission: Submission, bench: Description) -> str:
-    """Return the limits of a plan beside what the bench counts and can give.
+    """Return the limits of a plan beside counts and full scale of the bench.
 
     Raises
     ------
-    ConfigError : more input is allowed than the bench can give: shares of it would be too large.
+    ConfigError : the input limit exceeds full scale, so shares of it would be too large.
     """
     system = submission.system
     unit, position = system.input.unit, system.position.unit

@@ -1,4 +1,4 @@
-"""Take files recorded by other programs into a submission as they appear in a folder."""
+"""Import files recorded by other programs as they appear in a folder."""
 
 import filecmp
 import shutil
@@ -27,13 +27,13 @@ LOOK_EVERY = 0.5  # s
 
 @dataclass(frozen=True, kw_only=True)
 class Imported:
-    """A file that was taken in.
+    """A file that was imported.
 
     Attributes
     ----------
-    file : its name as it was found; `experiment` the id it has now.
-    planned : it is what the plan asked for next.
-    remarks : what to look at before a report is made of it.
+    file : its original name; `experiment`: the id it has now.
+    planned : it is the next recording of the plan.
+    remarks : what to check before a report is made.
     """
 
     file: str
@@ -44,10 +44,10 @@ class Imported:
 
 
 class Importer:
-    """Watches a folder on behalf of a submission.
+    """Watches a folder for a submission.
 
-    Files that lie there when it is made are taken too, oldest first; one file is taken once, also
-    over several sessions, for a copy of it lies in the submission.
+    Files that are there at the start are imported too, the oldest first. A file is imported once,
+    also over several sessions, as the submission keeps a copy.
     """
 
     def __init__(self, folder: Path, source: Path, *, observer: Observer) -> None:
@@ -60,17 +60,17 @@ class Importer:
         self._plan: Plan | None = (
             load_plan(self._submission) if plan_path(self._submission).exists() else None
         )
-        self._seen: dict[Path, tuple[int, int]] = {}  # size and time when last looked at
+        self._seen: dict[Path, tuple[int, int]] = {}  # size and time at the last look
         self._looks: dict[Path, int] = {}
-        self._over: set[Path] = set()  # taken, refused or there before
-        self._locked: set[Path] = set()  # of which that was said
+        self._over: set[Path] = set()  # imported, refused or there before
+        self._locked: set[Path] = set()  # already reported
         if self._plan:
             self._observer.planned(self._plan, self._done)
 
     def watch(
         self, *, once: bool, wait: Callable[[float], None] = time.sleep
     ) -> Iterator[Imported]:
-        """Yield each file as it is taken in; end when the plan is done, or nothing is left."""
+        """Yield each imported file; end when the plan is done, or nothing is left."""
         self._ask()
         while True:
             for path in self._complete(at_once=once):
@@ -97,10 +97,10 @@ class Importer:
             self._observer.remark(f"next: {recording.id}, a {recording.kind}{hertz}; {held}")
 
     def _complete(self, *, at_once: bool) -> list[Path]:
-        """Return the files that do not change any more, oldest first."""
+        """Return the files that no longer change, the oldest first."""
         ready = []
         for path in self._source.iterdir():
-            hidden = path.name.startswith((".", "~"))  # or of a program at work
+            hidden = path.name.startswith((".", "~"))  # or of a running program
             if path in self._over or hidden or self._is_other(path) or not self._opens(path):
                 continue
             try:
@@ -115,7 +115,7 @@ class Importer:
         return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
 
     def _is_other(self, path: Path) -> bool:
-        """Tell whether this can be no data file, and say so."""
+        """Return whether this cannot be a data file, and report that."""
         if path.is_dir():
             why = "a folder"
         elif path.suffix.casefold() not in ENDINGS:
@@ -127,7 +127,7 @@ class Importer:
         return True
 
     def _opens(self, path: Path) -> bool:
-        """Tell whether a file can be read; one that its program keeps to itself can be later."""
+        """Return whether a file can be read; one locked by its program can be read later."""
         try:
             path.open("rb").close()
         except OSError as error:
@@ -138,20 +138,20 @@ class Importer:
         return True
 
     def _try(self, path: Path, *, final: bool) -> Imported | None:
-        """Take a file; one that vanishes or is locked meanwhile is looked at again."""
+        """Import a file; one that vanishes or is locked meanwhile is tried again."""
         try:
             return self._take(path, final=final)
         except OSError:
             if path.exists() and self._opens(path):
-                raise  # what failed is the folder of the submission
+                raise  # the failure is in the submission's folder
             self._over.discard(path)
             self._looks[path] = 0
             return None
 
     def _take(self, path: Path, *, final: bool) -> Imported | None:
-        """Copy a file into the submission and note it; None where it is refused or known.
+        """Copy a file into the submission and enter it; None if it is refused or known.
 
-        A file that ends in mid-line may still grow, unless this is the `final` look.
+        A file that ends within a line may still grow, unless this is the `final` look.
         """
         self._over.add(path)
         if path.stat().st_size > MAX_DATA_BYTES:
@@ -201,12 +201,12 @@ class Importer:
         )
 
     def _is_known(self, path: Path) -> bool:
-        """Tell whether a copy of the file lies in the submission."""
+        """Return whether the submission has a copy of the file."""
         copies = [self._folder / experiment.file for experiment in self._submission.experiments]
         return any(copy.is_file() and filecmp.cmp(copy, path, shallow=False) for copy in copies)
 
     def _match(self, inspection: Inspection) -> Recording | None:
-        """Return the next recording of the plan if the file looks like it."""
+        """Return the next recording of the plan if the file resembles it."""
         recording = self._next
         if recording is None:
             return None
@@ -214,7 +214,7 @@ class Importer:
             found = inspection.frequency
             near = found and abs(found / recording.frequency - 1) < 0.05
             return recording if inspection.kind == "sine" and near else None
-        # A swept or switched input may look like either.
+        # A swept or switched input may resemble either.
         alike = {"sweep": ("sweep", "step"), "step": ("step", "sweep")}
         return (
             recording if inspection.kind in alike.get(recording.kind, (recording.kind,)) else None

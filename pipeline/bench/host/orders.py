@@ -1,4 +1,4 @@
-"""What a recording asks of the bench: commands and limits in the bench's own counts."""
+"""A recording as orders to the bench: commands and limits in the bench's own counts."""
 
 from dataclasses import dataclass, replace
 
@@ -35,8 +35,8 @@ class Order:
     Attributes
     ----------
     commands : to send, the start last.
-    scales : of the counts; `input_unit`, `position_unit` are theirs.
-    most_duty, most_counts : what no line may pass, duty and encoder counts.
+    scales : of the counts; `input_unit`, `position_unit` are their units.
+    most_duty, most_counts : limits for every line, in duty and encoder counts.
     """
 
     recording: Recording
@@ -48,7 +48,7 @@ class Order:
     most_counts: float
 
     def rest(self) -> "Order":
-        """Return the order to do nothing while the carts settle, with the limits of this one."""
+        """Return the order to rest while the carts settle, with the same limits."""
         settle = self.recording.settle
         return replace(
             self,
@@ -57,7 +57,7 @@ class Order:
         )
 
     def strays(self, reading: Reading, *, period: float) -> bool:
-        """Tell whether the bench follows another target than it was told, as after a changed digit.
+        """Return whether the bench follows another target than ordered, as after a changed digit.
 
         An edge may come a `period` (ms) early or late; a target may be rounded either way.
         """
@@ -75,7 +75,7 @@ class Order:
         return not min(near) - 1 <= reading.target <= max(near) + 1
 
     def drives_off(self, reading: Reading, *, before: Reading) -> bool:
-        """Tell whether the motor gets another duty than the target, which in open loop is its duty.
+        """Return whether the motor's duty differs from the target, which it equals in open loop.
 
         An edge may act a line later.
         """
@@ -85,14 +85,14 @@ class Order:
         return not min(near) - 1 <= reading.duty <= max(near) + 1
 
     def passed(self, reading: Reading, *, carts: int) -> str:
-        """Return what a line passes the limits by, or ""."""
+        """Return the limit that a line passes, or ""."""
         if abs(reading.duty) > self.most_duty:
             found, most = (abs(self.scales.input) * n for n in (reading.duty, self.most_duty))
             return f"the input was {found:.4g} {self.input_unit}, the limit is {most:.4g}"
         return self.too_far(reading, carts=carts)
 
     def too_far(self, reading: Reading, *, carts: int) -> str:
-        """Return which cart is further from its zero than the limit, or ""."""
+        """Return the cart that is further from its zero than the limit, or ""."""
         for cart, count in enumerate(reading.counts[:carts], start=1):
             if abs(count) > self.most_counts:
                 found, most = (self.scales.position * n for n in (count, self.most_counts))
@@ -106,7 +106,7 @@ class Order:
 def order_on(
     recording: Recording, plan: Plan, submission: Submission, bench: Description
 ) -> tuple[Order, Table | None]:
-    """Return the order and, of a closed loop, the controller as submission.toml tells of it."""
+    """Return the order and, for a closed loop, the controller as written in submission.toml."""
     system = submission.system
     scales = CountScales(
         input=system.input.per_count or bench.input_per_count,
@@ -141,7 +141,7 @@ def make_order(
 
     Raises
     ------
-    ConfigError : the amplitude passes the limits or full scale, or is less than half a count.
+    ConfigError : the amplitude exceeds the limits or full scale, or is less than half a count.
     HardwareError : the bench does not know the wave or the controller.
     """
     amplitude = _count_amplitude(recording, limits=limits, scales=scales, system=system)
@@ -160,7 +160,7 @@ def make_order(
 def _count_amplitude(
     recording: Recording, *, limits: PlanLimits, scales: CountScales, system: System
 ) -> int:
-    """Return the amplitude in counts: of the duty, in closed loop of the encoder."""
+    """Return the amplitude in counts: of the duty, or in closed loop of the encoder."""
     closed = recording.controller is not None
     limit, unit, per_count = (
         (limits.travel, system.position.unit, scales.position)
@@ -188,12 +188,13 @@ def _list_commands(
     gains: PidGains | StateGains | None,
     amplitude: int,
 ) -> list[Command]:
-    """Return what a bench is told of a recording, in order."""
+    """Return the commands of a recording, in order."""
     commands: list[Command] = []
     if gains is not None:
         if isinstance(gains, StateGains):
             _check_known("f", "state feedback", bench)
-        # A byte that is lost takes the gains with it: then none act, not those of an earlier run.
+        # A lost byte takes the gains with it; then no gains act, rather than those of an earlier
+        # run.
         commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
         _check_known("c", "chirp", bench)

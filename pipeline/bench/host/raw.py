@@ -1,8 +1,8 @@
-"""The raw file of a run: a line that says what it is, then the bytes exactly as they came.
+"""The raw file of a run: a descriptive line, then the bytes exactly as they came.
 
-`<name>.raw` holds one line of JSON and the bytes of the port; `<name>.times` beside it tells when
-they came: sixteen bytes for each lump, the end of the lump in the stream and the time. Both are
-written as the bytes arrive and only ever grow, so whatever kills the program leaves them readable.
+`<name>.raw` holds one line of JSON and the bytes of the port. `<name>.times` beside it has sixteen
+bytes for each chunk: the end of the chunk in the stream, and its time. Both are written as the
+bytes arrive and only grow, so they stay readable whatever kills the program.
 """
 
 import json
@@ -20,20 +20,20 @@ from pipeline.output import own_folder
 
 FOLDER = "raw"
 _VERSION = "cartlab-raw/1"
-_TIME = struct.Struct("<Qd")  # end of the lump in the stream, s since the run began
-_LINE = ("target", "duty", "milliseconds")  # what follows the encoders
+_TIME = struct.Struct("<Qd")  # end of the chunk in the stream, s since the run began
+_LINE = ("target", "duty", "milliseconds")  # the fields behind the encoders
 
 
 @dataclass(frozen=True, kw_only=True)
 class RawHeader:
-    """What a raw file says of itself.
+    """The description of a run in its raw file.
 
     Attributes
     ----------
     recording, limits : as in the plan.
     commands : what was sent to the bench to begin the run, in order.
-    bench : as it describes itself; of a stock bench only what is known.
-    begun : when, local time with the offset of its zone.
+    bench : its own description; for a stock bench only the known facts.
+    begun : local time with its offset.
     """
 
     recording: Recording
@@ -58,11 +58,11 @@ class RawHeader:
 
 
 class RawWriter:
-    """Writes what arrives, at once; what is written survives the program.
+    """Writes arriving bytes at once, so that they survive the program.
 
     Raises
     ------
-    FileExistsError : a raw file is never written over.
+    FileExistsError : a raw file is never overwritten.
     """
 
     def __init__(self, path: Path, header: RawHeader) -> None:
@@ -92,12 +92,12 @@ class RawWriter:
 
 @dataclass(frozen=True, kw_only=True)
 class RawRun:
-    """A raw file as it was read.
+    """A raw file that was read.
 
     Attributes
     ----------
     content : the bytes as they came; the last line may be cut.
-    arrivals : (end of the lump in `content`, s since the run began), ascending.
+    arrivals : (end of the chunk in `content`, s since the run began), ascending.
     """
 
     header: RawHeader
@@ -105,7 +105,7 @@ class RawRun:
     arrivals: tuple[tuple[int, float], ...]
 
     def lumps(self) -> Iterator[tuple[bytes, float]]:
-        """Yield the bytes of each lump and when they came; those without a time come last."""
+        """Yield the bytes of each chunk and their time; those without a time come last."""
         start, at = 0, 0.0
         for end, at in self.arrivals:
             yield self.content[start:end], at
@@ -115,11 +115,11 @@ class RawRun:
 
 
 def read_raw(path: Path) -> RawRun:
-    """Read a raw file, also one whose writing was cut off anywhere.
+    """Read a raw file, also one that was cut off anywhere.
 
     Raises
     ------
-    DataError : it is none; not even its header is whole.
+    DataError : it is not a raw file, or its header is incomplete.
     """
     raw = path.read_bytes()
     head, newline, content = raw.partition(b"\n")
@@ -151,7 +151,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
 
 
 def free_raw_path(folder: Path, recording: Recording) -> Path:
-    """Return a name not yet taken: each try of a recording has a raw file of its own."""
+    """Return a free name, as each try of a recording has its own raw file."""
     parent = own_folder(folder, FOLDER)
     number = 1
     while (path := parent / f"{recording.id}-{number}.raw").exists():
@@ -160,7 +160,7 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 
 
 def known_commands(folder: Path) -> frozenset[str]:
-    """Return the extensions of the bench of the latest recording; the chirp where there is none."""
+    """Return the bench's extensions at the latest recording; the chirp if there is none."""
     for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
         try:
             return read_raw(path).header.bench.commands

@@ -1,4 +1,4 @@
-"""From a raw file to the data file of an experiment: the bench log that every reader knows."""
+"""From a raw file to the data file of an experiment: an ordinary bench log."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +14,12 @@ DATA = "data"
 
 
 def data_file(recording: Recording, *, partial: bool = False) -> str:
-    """Return the name of a recording's data file inside the submission, forward slashes."""
+    """Return the name of a recording's data file inside the submission, with forward slashes."""
     return f"{DATA}/{recording.id}{'.partial' if partial else ''}.txt"
 
 
 def readings_of(run: RawRun) -> tuple[Reading, ...]:
-    """Return the valid lines of a run, in order, judged as while they came."""
+    """Return the valid lines of a run, in order, judged as during the run."""
     stream = Stream(
         encoders=run.header.bench.encoders,
         period=1e3 * run.header.bench.period,
@@ -35,11 +35,11 @@ def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = Fal
 
     Raises
     ------
-    DataError : the raw file holds next to no lines.
+    DataError : the raw file holds too few lines.
     """
     run = read_raw(raw_path)
     readings = readings_of(run)
-    if len(readings) < 8:  # what a record needs at least
+    if len(readings) < 8:  # the least that a record needs
         raise DataError(f"{raw_path.name}: holds {len(readings)} lines, too few for a record")
     name = data_file(run.header.recording, partial=partial)
     own_folder(folder, DATA).mkdir(exist_ok=True)
@@ -49,9 +49,9 @@ def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = Fal
 
 
 def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str:
-    """Return the bench log: counts as they came, stamps in s as they came (rounded to ms).
+    """Return the bench log: counts and stamps in s as they came (rounded to ms).
 
-    With `reference` the target is a column too, in encoder counts.
+    With `reference` the target is also a column, in encoder counts.
     """
     encoders = min(carts, len(readings[0].counts))
     heading = ["Sample", "Time", *(f"Encoder {i + 1} Pos" for i in range(encoders))]
@@ -65,12 +65,12 @@ def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str
 
 
 def save_left_over(folder: Path, *, carts: int) -> list[str]:
-    """Save partial records of raw files that no data file was made of; return their names."""
+    """Save partial records of raw files without a data file; return their names."""
     saved = []
     for path in sorted((folder / FOLDER).glob("*.raw")):
         try:
             recording = read_raw(path).header.recording
-            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or meant to lead elsewhere
+            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or a path to another place
                 continue
             made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
             if not any(file.exists() for file in made):

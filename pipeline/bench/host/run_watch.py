@@ -1,4 +1,4 @@
-"""What is looked at while lines come: the limits and the wave, in a run and in the rest before."""
+"""Checks on arriving lines: limits and wave, during a run and in the rest before it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -14,14 +14,14 @@ class LineWatch:
 
     Parameters
     ----------
-    carts : whose travel is watched; 0 where they have no true zero yet.
-    period : ms from line to line; None of a stock bench, whose waves nobody knows to the ms.
+    carts : the carts whose travel is watched; 0 without a true zero.
+    period : ms between lines; None for a stock bench, whose waves are not known to the ms.
 
     Attributes
     ----------
-    is_astray : the motor's duty was not what the order asks for.
+    is_astray : the motor's duty was not as ordered.
     is_too_far : a cart was further from its zero than its limit.
-    is_unsafe : it was stopped because to go on was not safe.
+    is_unsafe : it was stopped because going on was not safe.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None) -> None:
@@ -40,7 +40,7 @@ class LineWatch:
         return ""
 
     def stop(self, why: str) -> str:
-        """Return why the run must stop, which is not safe to go on with."""
+        """Return why the run must stop for safety."""
         self.is_unsafe = True
         return f"stopped: {why}"
 
@@ -69,13 +69,13 @@ class LineWatch:
 
 
 class _InARow:
-    """Tells what line after line shows, two or more, from a garbled line, which is alone."""
+    """Distinguishes a condition that lasts two or more lines from a single garbled line."""
 
     def __init__(self) -> None:
         self._since: int | None = None  # ms of the first of these lines
 
     def lasts(self, shows: bool, *, ms: int) -> bool:
-        """Return whether it has lasted; `ms`: the stamp of this line."""
+        """Return whether the condition has lasted; `ms`: the stamp of this line."""
         if not shows:
             self._since = None
         elif self._since is None:
@@ -86,7 +86,7 @@ class _InARow:
 
 
 class RunWatch(LineWatch):
-    """Checks the lines of a run, and hands them on in batches."""
+    """Checks the lines of a run, and passes them on in batches."""
 
     def __init__(
         self,
@@ -110,7 +110,7 @@ class RunWatch(LineWatch):
         self._let_in()
         self._batch += batch
         if trouble := super().check(batch):
-            return trouble  # before anybody is told: the stop goes out first
+            return trouble  # before any observer hears of it: the stop goes out first
         now = time.monotonic()
         if now - self._forwarded > 0.05:
             self._forwarded = now
@@ -118,7 +118,7 @@ class RunWatch(LineWatch):
         return ""
 
     def forward(self, batch: Sequence[Reading]) -> None:
-        """Hand on what waits, and this."""
+        """Pass on the waiting lines, and this one."""
         waiting, self._batch = [*self._batch, *batch], []
         if waiting:
             self._observer.readings(waiting, self._stream.anomalies())
@@ -129,7 +129,7 @@ class RestWatch(LineWatch):
 
     Parameters
     ----------
-    since : ms from which the lines are kept.
+    since : ms from which lines are kept.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None, since: float) -> None:
@@ -144,11 +144,11 @@ class RestWatch(LineWatch):
 
     @property
     def last(self) -> Reading | None:
-        """The last line that was kept."""
+        """The last line kept."""
         return self._readings[-1] if self._readings else None
 
     @property
     def swings(self) -> list[int]:
-        """How far each encoder went, counts."""
+        """The range of each encoder, counts."""
         columns = zip(*(reading.counts for reading in self._readings), strict=True)
         return [max(column) - min(column) for column in columns]

@@ -1,7 +1,7 @@
-"""The serial line to a bench: open it, shake hands, send, receive. Nobody else touches a port.
+"""The serial line to a bench: open, shake hands, send, receive. No other module uses a port.
 
-Every line that comes is looked at. In a run the session does it; at any other time the line does it
-itself, in `overhear`: the motor must be off then.
+Every arriving line is checked. During a run the session does it. At any other time the line does it
+in `overhear`, since the motor must then be off.
 """
 
 import re
@@ -27,17 +27,17 @@ from pipeline.bench.protocol.messages import (
 )
 from pipeline.errors import DataError, HardwareError
 
-_TRIES, _BETWEEN = 5, 0.4  # s; a bench just plugged in is not there at once
-LUMP = 8192  # bytes read at most at a time: what is read within one heartbeat, many times over
+_TRIES, _BETWEEN = 5, 0.4  # s; a bench just plugged in does not appear at once
+LUMP = 8192  # largest number of bytes read at once: many times those of one heartbeat
 _QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
 _LOOK = 0.005  # s between looks at the port
 FIRST_LINE = 2.0  # s a bench may take to begin
 _NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
-_QUIET = 0.05  # s without a byte: what was under way has arrived
+_QUIET = 0.05  # s without a byte, after which everything has arrived
 
 
 class Runaway(HardwareError):
-    """The bench did what nothing told it to; nothing more may be asked of it."""
+    """The bench acted without an order; no more orders may be sent to it."""
 
 
 class SerialLine:
@@ -45,20 +45,20 @@ class SerialLine:
 
     Attributes
     ----------
-    bench : as it describes itself, or a stock bench.
-    resets : how many were sent; each made the counts of that moment zero.
+    bench : its own description, or a stock bench.
+    resets : number sent; each sets the present counts to zero.
     """
 
     def __init__(self, port: "serial.SerialBase", *, name: str) -> None:
         self._port = port
         self._name = name
         self.bench = Description(name="stock", encoders=2, carts=2)
-        self._described = b""  # the line in which it describes itself; b"": a stock bench does not
+        self._described = b""  # its description; b"": a stock bench gives none
         self._asked = 0  # queries whose answers may still be under way
         self.resets = 0
         self._lock = threading.RLock()  # of the port; `watched` looks at it in a thread
         self._in_run = False
-        self._is_cleared = False  # what comes now was sent while no run was on
+        self._is_cleared = False  # lines arriving now were sent while no run was on
         self._ear = _Ear()
         self._runaway: Runaway | None = None
 
@@ -69,14 +69,14 @@ class SerialLine:
         self.close()
 
     def close(self) -> None:
-        """Give the port back."""
+        """Close the port."""
         socket = getattr(self._port, "_socket", None)
         self._port.close()
-        if socket is not None:  # which pyserial forgets where the other end has hung up
+        if socket is not None:  # which pyserial forgets if the other end has hung up
             socket.close()
 
     def knows(self, letter: str) -> bool:
-        """Tell whether the bench knows one of the commands beyond the stock ones."""
+        """Return whether the bench knows a command beyond the stock ones."""
         return letter in self.bench.commands
 
     def send(self, *commands: Command) -> None:
@@ -85,7 +85,7 @@ class SerialLine:
         Raises
         ------
         HardwareError : the line is gone.
-        Runaway : a run is to start, and the bench has run away before.
+        Runaway : a run is to start, but the bench has run away before.
         """
         if self._runaway is not None and any(isinstance(c, Start) for c in commands):
             raise self._runaway
@@ -107,7 +107,7 @@ class SerialLine:
                 raise self._gone(error) from None
 
     def receive(self) -> bytes:
-        """Return what has arrived; b"" where nothing has.
+        """Return the bytes that have arrived, or b"".
 
         Raises
         ------
@@ -121,15 +121,15 @@ class SerialLine:
                 raise self._gone(error) from None
 
     def overhear(self) -> bytes:
-        """Return what has arrived while no run is on; where the motor is on, stop it.
+        """Return the bytes that have arrived between runs; if the motor is on, stop it.
 
-        Lines of the last run may still be under way, and a stop may have been lost: until `clear`
+        Lines of the last run may still be under way, and a stop may have been lost. Until `clear`,
         the bench is only told to stop again.
 
         Raises
         ------
         HardwareError : the line is gone.
-        Runaway : the motor is on although no run is.
+        Runaway : the motor is on between runs.
         """
         with self._lock:
             data = self.receive()
@@ -142,20 +142,20 @@ class SerialLine:
             return data
 
     def _run_away(self, why: str) -> None:
-        """Remember, and raise, that the bench did what nothing told it to."""
+        """Remember, and raise, that the bench acted without an order."""
         self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
         raise self._runaway
 
     @contextmanager
     def watched(self, tell: Callable[[str], None]) -> Iterator[None]:
-        """Look at the line in a thread whenever no run is on: people and computing take their time.
+        """Watch the line in a thread between runs, during slow work of people and programs.
 
-        The thread sends no heartbeat: a run that hangs is still cut by the bench. At the end the
+        The thread sends no heartbeat, so a run that hangs is still cut by the bench. At the end the
         bench is told to stop once more.
 
         Parameters
         ----------
-        tell : called from the thread, once, where the bench runs away.
+        tell : called from the thread, once, if the bench runs away.
         """
         over = threading.Event()
 
@@ -184,7 +184,7 @@ class SerialLine:
                 self.stop()
 
     def part(self) -> None:
-        """Stop the bench for good, and see that it does.
+        """Stop the bench for good, and check that it does.
 
         Raises
         ------
@@ -207,7 +207,7 @@ class SerialLine:
         self._write([Signal.STOP] if self.knows("s") else STOCK_STOP)
 
     def drain(self, *, longest: float = 1.0) -> bytes:
-        """Return what still comes until the line is quiet, s."""
+        """Return the bytes that arrive until the line is quiet for this time, s."""
         heard, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
         while True:
@@ -220,15 +220,15 @@ class SerialLine:
             time.sleep(_LOOK)
 
     def clear(self, *, queries: int = _QUERIES) -> None:
-        """Read away all that the bench has sent: what comes from now on answers what is sent next.
+        """Read away everything the bench has sent, so that the next bytes answer the next command.
 
-        Silence tells nothing, for a busy computer keeps bytes for any while; but what comes behind
-        the answer to a query was sent after it. A stock bench answers nothing.
+        Silence proves nothing, as a busy computer may hold bytes back. But bytes behind the answer
+        to a query were sent after it. A stock bench gives no answer.
 
         Raises
         ------
         HardwareError : the line or the bench is gone.
-        Runaway : the motor is on although no run is.
+        Runaway : the motor is on between runs.
         """
         with self._lock:
             self._in_run = False
@@ -246,7 +246,7 @@ class SerialLine:
         Raises
         ------
         HardwareError : nothing there speaks this protocol.
-        Runaway : the motor is on although no run is.
+        Runaway : the motor is on between runs.
         """
         self.send(*STOCK_STOP)
         before: bytes | None = None
@@ -275,10 +275,10 @@ class SerialLine:
         self.send(Signal.RESET)
 
     def _answer(self, beginning: bytes = b"?") -> bytes | None:
-        """Send a query; return the line that answers it, which begins so, or None.
+        """Send a query; return the answering line with this beginning, or None.
 
-        Answers to earlier queries may still come, before it; where some came and then none for a
-        while, the others are lost.
+        Answers to earlier queries may come first. If some came, and then none for a while, the
+        others are lost.
         """
         self.send(Signal.QUERY)
         self._asked += 1
@@ -299,8 +299,8 @@ class SerialLine:
         return answers[-1]
 
     def _try_stock(self) -> None:
-        """Have a stock bench stream for a moment, which tells how many encoders it has."""
-        # A run of 0.1 s that does nothing shows whether a stock bench is there at all.
+        """Let a stock bench stream for a moment, to count its encoders."""
+        # A run of 0.1 s without motion shows whether a stock bench is there at all.
         self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
         self._in_run, self._is_cleared = False, True  # in it the motor must be off
         heard, end = b"", time.monotonic() + FIRST_LINE
@@ -325,7 +325,7 @@ class SerialLine:
 
 
 class _Ear:
-    """Hears that the motor is on, from two lines in a row: a garbled one is alone."""
+    """Notices that the motor is on, from two lines in a row: a single one may be garbled."""
 
     def __init__(self) -> None:
         self._tail, self._on = b"", False
@@ -335,7 +335,7 @@ class _Ear:
         if not data:
             return 0
         *lines, self._tail = (self._tail + data).split(b"\n")
-        self._tail = self._tail[-512:]  # bytes; more without an end is noise
+        self._tail = self._tail[-512:]  # bytes; more without a line end is noise
         for reading in filter(None, map(parse_reading, lines)):
             before, self._on = self._on, reading.duty != 0
             if before and self._on:
@@ -375,7 +375,7 @@ def _opened(port: str, *, baud: int) -> "serial.SerialBase":
             opened.open()
         except (serial.SerialException, ValueError, OSError) as error:
             failure = _plain(error)
-            if isinstance(error, ValueError):  # an URL of no known form: trying again is no use
+            if isinstance(error, ValueError):  # a URL of no known form: a retry cannot help
                 break
             continue
         return opened
@@ -401,7 +401,7 @@ def _say_ports() -> str:
 
 
 def port_names() -> Sequence[str]:
-    """Return the serial ports of this machine, each with what is plugged in there."""
+    """Return the serial ports of this machine, each with the device plugged in."""
     return [
         f"{port.device} ({port.description})" if port.description != "n/a" else port.device
         for port in sorted(list_ports.comports())

@@ -1,8 +1,8 @@
-"""Runs on the bench, one at a time: rest, start, watch every line, stop; whatever happens, stop.
+"""Runs on the bench, one at a time: rest, start, watch every line, and always stop.
 
-A run is watched by one loop that looks at the port every few milliseconds, writes what came to the
-raw file, keeps the bench's watchdog awake and checks the limits. So is the rest before it. The loop
-is in no thread of its own: if it hangs, the heartbeat ends and the bench cuts its motor itself.
+One loop watches a run. Every few milliseconds it reads the port, writes the bytes to the raw file,
+sends the heartbeat and checks the limits. The rest before the run works in the same way. The loop
+has no thread of its own: if it hangs, the heartbeat ends and the bench cuts its motor itself.
 """
 
 import gc
@@ -32,16 +32,16 @@ from pipeline.errors import HardwareError
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.plan_words import hold_words
 
-SILENCE = 0.5  # s without a byte in mid-run: the bench is gone
-_NEARLY = 100.0  # ms before the end at which silence is the end; after it lines are too many
-_STILL = 4  # counts a cart at rest may flicker; a run in which no free cart moves more is none
+SILENCE = 0.5  # s without a byte during a run: the bench is gone
+_NEARLY = 100.0  # ms before the end after which silence is the end; later lines are too many
+_STILL = 4  # counts that a cart at rest may flicker; in a valid run some free cart moves more
 _LOOK = 0.003  # s between looks at the port
-_AFTER_END = 0.02  # s the last lines may still be under way
+_AFTER_END = 0.02  # s that the last lines may take to arrive
 
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep Python from looking for garbage: among all lines of a run that takes 0.1 s."""
+    """Keep Python from collecting garbage: among all lines of a run that takes 0.1 s."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -52,17 +52,17 @@ def _no_collection() -> Iterator[None]:
 
 
 class Session:
-    """A bench and what is known of it: who holds which carts, how long its period is.
+    """A bench and its state: which carts are held, by whom, and its true period.
 
     Parameters
     ----------
-    carts : of the submission; a bench that describes itself may have more, whose travel is
-        watched as well.
-    buttons : looked at before anything moves and at every look at the port.
+    carts : of the submission; a bench that describes itself may have more, whose travel is watched
+        too.
+    buttons : read before anything moves and at every look at the port.
 
     Attributes
     ----------
-    wish : the button that ended the run, or the rest before it; None: none did.
+    wish : the button that ended the run, or the rest before it; None: no button.
     """
 
     def __init__(
@@ -83,18 +83,18 @@ class Session:
         self._period = 1e3 * line.bench.period
         self._zeroed_at = -1  # resets of the line when the carts were zeroed at rest
         self._swings_out = False  # the last run took a cart past its travel
-        self._free: tuple[int, ...] | None = None  # as a person was last told
+        self._free: tuple[int, ...] | None = None  # as a person was last asked
         self._beat = float("-inf")
-        self._latest_beat = 0.0  # s, the longest without a heartbeat in this run
+        self._latest_beat = 0.0  # s, the longest time without a heartbeat in this run
         self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
-        """Have the carts held or freed and at rest; return what is to be said of it, or "".
+        """Have the carts held or freed and brought to rest; return a problem, or "".
 
         Raises
         ------
-        HardwareError : the carts cannot come to rest, or nobody could see that they do.
-        Runaway : the motor is on, or a cart is past its travel, where the bench is to do nothing.
+        HardwareError : the carts cannot come to rest, or nobody can check it.
+        Runaway : the motor is on, or a cart is past its travel, without an order.
         """
         recording = order.recording
         self.wish = None
@@ -110,7 +110,7 @@ class Session:
         if self._line.knows("h"):
             if recording.release:
                 self._line.send(Hands(held=held, released=recording.release))
-                time.sleep(1.7)  # s a virtual hand takes to pull a cart out
+                time.sleep(1.7)  # s that a virtual hand takes to pull a cart out
         elif recording.release:
             self._observer.confirm(
                 f"Pull cart {recording.release} out and hold it still, nearer than limits.travel "
@@ -124,8 +124,8 @@ class Session:
         """Carry out one run and write its raw file.
 
         Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
-        what came is in the file; an interrupt goes on to the caller. One that is held is asked for
-        with `let_in` while lines come: once the last one is there, the run is whole.
+        the data are in the file; an interrupt goes on to the caller. A held interrupt is let in
+        with `let_in` while lines arrive. Once the last line is there, the run is whole.
         """
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
@@ -163,7 +163,7 @@ class Session:
                 "is the motor on?"
             )
         fit = stream.fit()
-        if stream.lines > 1000 and not partial:  # enough to tell a clock's period
+        if stream.lines > 1000 and not partial:  # enough to determine a clock's period
             self._say_other_period(fit.period)
             self._period = fit.period
         return RunOutcome(
@@ -187,11 +187,11 @@ class Session:
 
     @property
     def _stated(self) -> float | None:
-        """The ms from line to line, of a bench whose waves are known to the ms."""
+        """The ms between lines of a bench whose waves are known to the ms."""
         return self._period if self._line.bench.commands else None
 
     def _say_other_period(self, period: float) -> None:
-        """Say once that the bench does not keep to the period (ms) that it stated."""
+        """Report once that the bench does not keep its stated period (ms)."""
         stated = 1e3 * self._line.bench.period
         if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER_PERIOD:
             return
@@ -214,7 +214,7 @@ class Session:
         )
 
     def _rest(self, order: Order) -> str:
-        """Wait, in a run that does nothing, until the carts have come to rest."""
+        """Wait, in a run without motion, until the carts have come to rest."""
         recording = order.recording
         if recording.settle <= 0:
             return ""
@@ -226,7 +226,7 @@ class Session:
                 # Carts that a run took too far swing back by themselves.
                 carts=0 if self._swings_out else self._zeroed,
                 period=self._stated,
-                since=1e3 * recording.settle - 500,  # the half second told of below
+                since=1e3 * recording.settle - 500,  # the half second described below
             )
             self._look_on(nothing, watch)
             self._swings_out = False
@@ -244,11 +244,11 @@ class Session:
         return f"not at rest when the run began: {swings} within half a second"
 
     def _look_on(self, nothing: Order, watch: LineWatch) -> None:
-        """Carry out an order to do nothing.
+        """Carry out an order to rest.
 
         Raises
         ------
-        HardwareError : it did not go on to its end; Runaway : because something was done.
+        HardwareError : it ended early; Runaway : because the bench acted.
         """
         settle = nothing.recording.settle
         trouble = self._carry_out(nothing, self._stream(()), seconds=settle, watch=watch)
@@ -258,14 +258,14 @@ class Session:
 
     @property
     def _zeroed(self) -> int:
-        """How many carts have a true zero: all or none."""
+        """The number of carts with a true zero: all or zero."""
         return self._moving if self._line.resets == self._zeroed_at else 0
 
     def _zero_at_rest(self, recording: Recording) -> None:
-        """Zero the bench before the motor's first run on this line: it was opened at any time.
+        """Zero the bench before the motor's first run on this line, which was opened at any time.
 
-        After a line that was lost the carts still swing; where they were then is no zero for the
-        travel limit. A hand's run waits with the zero: what is held by hand is never quite at rest.
+        After a lost line the carts still swing, so their position then is no zero for the travel
+        limit. A run by hand is not zeroed: a cart held by hand is never quite at rest.
         """
         if self._zeroed or not recording.amplitude:
             return
@@ -275,11 +275,11 @@ class Session:
         self._zeroed_at = self._line.resets
 
     def _by_hand(self) -> str:
-        """Return why somebody wants this run to end, or "".
+        """Return why a person wants this run to end, or "".
 
         Raises
         ------
-        Stopped : the whole session is to end.
+        Stopped : the whole session must end.
         """
         self.wish = self._buttons.pressed
         match self.wish:
@@ -304,7 +304,7 @@ class Session:
         begin: Callable[[], None] = lambda: None,
         arrived: Callable[[bytes], None] = lambda data: None,
     ) -> str:
-        """Start what an order asks for and listen to its end; return why it ended early, or "".
+        """Start a run and listen to its end; return why it ended early, or "".
 
         Whatever ends it, the bench is told to stop.
         """
@@ -333,7 +333,7 @@ class Session:
             self._beat = now
 
     def _lateness(self) -> str:
-        """Return what to say of a bench whose watchdog had reason to cut the motor, or ""."""
+        """Return a message if the bench's watchdog had reason to cut the motor, or ""."""
         if self._latest_beat < WATCHDOG:
             return ""
         return (
@@ -342,9 +342,9 @@ class Session:
         )
 
     def _stop(self, *, always: bool) -> None:
-        """Stop the bench; a stock one, which that zeroes, only if the run did not end by itself.
+        """Stop the bench; a stock one, whose stop zeroes it, only if the run did not end by itself.
 
-        Then the line is cleared: nothing asked for what the bench streams after that.
+        Then the line is cleared, as any later lines were not asked for.
         """
         try:
             try:
@@ -373,7 +373,7 @@ class Session:
         end = 1e3 * seconds
         since = last = time.monotonic()
         first: int | None = None  # ms of the first line
-        unread: float | None = None  # since when what comes is no line
+        unread: float | None = None  # the time since which no valid line has come
         while True:
             self._heartbeat()
             now = time.monotonic()
@@ -391,9 +391,9 @@ class Session:
                         return watch.stop("the bench went on past the end of the run")
                 else:
                     unread = now if unread is None else unread
-                    if now - unread > 0.25:  # s: the motor may be on, and nobody sees
+                    if now - unread > 0.25:  # s: the motor may be on, and nobody sees it
                         return watch.stop("what the bench sends cannot be read: nothing is watched")
-            if why := self._by_hand():  # after the limits: what they say is never unsaid
+            if why := self._by_hand():  # after the limits, whose message must never be lost
                 return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:

@@ -1,4 +1,4 @@
-"""Signals that end a program: turned into an exception, or held while something is finished."""
+"""Signals that end a program: turned into an exception, or held until some work is finished."""
 
 import signal
 import threading
@@ -16,7 +16,7 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stopping_on_signals() -> Iterator[None]:
-    """Turn signals that end a program into an exception: a run is stopped and saved first."""
+    """Turn signals that end a program into an exception, so a run is stopped and saved."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -25,7 +25,7 @@ def stopping_on_signals() -> Iterator[None]:
         raise Stopped(f"signal {number}")
 
     numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    # One that is ignored stays so: nohup means a closed terminal to end nothing.
+    # An ignored one stays ignored: with nohup a closed terminal must not end the program.
     before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) == signal.SIG_DFL}
     try:
         yield
@@ -36,7 +36,10 @@ def stopping_on_signals() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C and its like until the block is over; calling what it yields lets them in."""
+    """Hold Ctrl-C and similar signals until the block is over;
+
+    the yielded function lets them in.
+    """
     waiting: list[int] = []
 
     def let_in() -> None:
@@ -51,7 +54,7 @@ def signals_held() -> Iterator[Callable[[], None]]:
         waiting.append(number)
 
     numbers = [getattr(signal, name) for name in ("SIGINT", *_ENDING) if hasattr(signal, name)]
-    # What is ignored, or ends the program at once, stays as it is.
+    # A signal that is ignored, or ends the program at once, stays as it is.
     before = {n: signal.signal(n, hold) for n in numbers if callable(signal.getsignal(n))}
     try:
         yield let_in

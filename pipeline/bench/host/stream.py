@@ -1,8 +1,8 @@
-"""Lines out of lumps of bytes, and everything that went wrong on the way.
+"""From chunks of bytes to lines, with a count of every fault on the way.
 
-A line is judged when the next one is there: a bench's clock never goes back and no cart jumps out
-and back within two lines, so a line that stands out between its neighbours was garbled though it
-can still be read. That costs one line of delay and no line that was right.
+A line is judged when the next one is there. A bench's clock never goes back, and no cart jumps out
+and back within two lines. So a readable line that differs from both neighbours was garbled. This
+costs one line of delay and no valid line.
 """
 
 from array import array
@@ -14,9 +14,9 @@ from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
 
-# An encoder that stands still in a window (ms) though it moved in the one before and the motor
-# drives on as much (duty counts; less moves no cart) is stuck; so is one that never moved, of the
-# driven cart, or beside a neighbour that did.
+# An encoder is stuck if it stands still in a window (ms) although it moved in the one before and
+# the motor drives as hard (duty counts; less moves no cart). An encoder that never moved is stuck
+# if it is on the driven cart, or beside a moving neighbour.
 _WINDOW, _DRIVEN = 1000, 8
 
 
@@ -25,14 +25,14 @@ class Stream:
 
     Parameters
     ----------
-    encoders : fields of a line that are counts.
-    period : ms from line to line, as expected; `stated`: by the bench itself.
+    encoders : number of fields that are counts.
+    period : expected ms between lines; `stated`: by the bench itself.
     free : the carts that can move; their encoders are watched.
     closed : the loop is closed: its duty may kick for a single line when an encoder flickers.
 
     Attributes
     ----------
-    broken : what the bench's clock did, after which no line belongs to this run; "": nothing.
+    broken : a fault of the bench's clock, after which no line belongs to this run; "": none.
     """
 
     def __init__(
@@ -49,41 +49,41 @@ class Stream:
         self._closed = closed
         self._expected = period
         self._tail = b""
-        self._before: Reading | None = None  # the last line handed on
+        self._before: Reading | None = None  # the last line passed on
         self._held: Reading | None = None  # waits for its successor
         self._stamps = array("q")
         self._missing = _MissingSoFar(period)
         self._garbled = 0
-        self._garbled_lines = 0  # a merger of two is one garbled place and two lines
+        self._garbled_lines = 0  # two merged lines are one garbled place and two lines
         self._late = 0
         self._resets = 0
         self.broken = ""
-        # The least of arrival minus stamp, s: of the second before, and of this one.
+        # The smallest difference of arrival and stamp, s: in the second before, and in this one.
         self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
 
     @property
     def lines(self) -> int:
-        """How many valid lines were handed on."""
+        """The number of valid lines passed on."""
         return len(self._stamps)
 
     @property
     def latest(self) -> int:
-        """The stamp of the newest line, judged or not, ms; -1 of none."""
+        """The stamp of the newest line, judged or not, ms; -1 without lines."""
         newest = self._held or self._before
         return -1 if newest is None else newest.ms
 
     @property
     def widest(self) -> int:
-        """The counts that the free cart which moved most went from end to end."""
+        """The range in counts of the free cart that moved most."""
         return self._watch.widest
 
     def fit(self) -> StampFit:
-        """Return the clock that explains the stamps; takes too long for a run under way."""
+        """Return the clock that explains the stamps; too slow during a run."""
         return fit_stamps(np.array(self._stamps), period=self._expected, stated=self._stated)
 
     def anomalies(self, fit: StampFit | None = None) -> Anomalies:
-        """Return all that went wrong so far; lost lines are estimated until there is a `fit`."""
+        """Return all faults so far; lost lines are estimated until there is a `fit`."""
         missing = self._missing.lines if fit is None else fit.missing
         return Anomalies(
             lost=max(0, missing - self._garbled_lines),
@@ -96,11 +96,11 @@ class Stream:
     def feed(self, data: bytes, *, since: float, now: float) -> list[Reading]:
         """Return the lines that are now known to be valid.
 
-        The data came between `since`, when the port was last found empty, and `now` (s, of any
-        clock that runs on): a host that was busy elsewhere does not make lines late.
+        The data came between `since`, when the port was last found empty, and `now` (s, on any
+        steady clock). So a host that was busy does not make lines late.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")
-        if len(self._tail) > 512:  # bytes without an end: noise
+        if len(self._tail) > 512:  # bytes without a line end: noise
             lines.append(self._tail)
             self._tail = b""
         valid: list[Reading] = []
@@ -113,7 +113,7 @@ class Stream:
         return valid
 
     def finish(self) -> list[Reading]:
-        """Return the line that still waited for its successor; the run is over."""
+        """Return the line that still waited for its successor at the end of the run."""
         last, self._held = self._held, None
         if last is None or (self._before is not None and last.ms < self._before.ms):
             return []
@@ -140,7 +140,7 @@ class Stream:
         self._garbled_lines += lines
 
     def _judge(self, after: Reading) -> list[Reading]:
-        """Return the line held back if its neighbours bear it out, and hold this one."""
+        """Return the waiting line if its neighbours confirm it, and let this one wait."""
         if self.broken:
             return []
         before, held, self._held = self._before, self._held, after
@@ -181,20 +181,20 @@ class Stream:
 
     def _time(self, reading: Reading, *, since: float, now: float) -> None:
         due = 1e-3 * reading.ms
-        if now - self._lead_from > 1.0:  # s; then the two clocks are set by one another anew
+        if now - self._lead_from > 1.0:  # s; then the two clocks are aligned again
             self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
         self._new_lead = min(self._new_lead, now - due)
-        # 0.02 s behind the earliest lines: they waited somewhere for one another.
+        # 0.02 s behind the earliest lines: they waited somewhere for each other.
         self._late += since - due > min(self._lead, self._new_lead) + 0.02
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
-    """Tell a line that its two neighbours, which agree with one another, speak against."""
+    """Return whether a line contradicts both neighbours, which agree with each other."""
     if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
         return True
     if held.ms < before.ms:
         return True
-    # A hit on an end stop makes a true reading stand out by so many counts a line.
+    # A hit on an end stop moves a true reading by this many counts a line.
     room = 32 * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
@@ -206,9 +206,9 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
 class _MissingSoFar:
     """Lines missing, second by second.
 
-    A clock skips a stamp now and then by itself; a second whose stamps one even clock explains
-    lacks none, and tells the period for those that do lack some. Until there was one, the least ms
-    a line of any second is nearer to the true period, if few lines are lost.
+    A clock itself skips a stamp now and then. If one even clock explains the stamps of a second, no
+    line is missing, and it gives the period for other seconds. Until then, the smallest mean
+    spacing of any second is nearest to the true period, if few lines are lost.
     """
 
     def __init__(self, period: float) -> None:
@@ -218,7 +218,7 @@ class _MissingSoFar:
         self.lines = 0
 
     def tick(self, ms: int) -> None:
-        """Take note of a stamp."""
+        """Record a stamp."""
         self._stamps.append(ms)
         span, count = ms - self._stamps[0], len(self._stamps) - 1
         if span < _WINDOW or not count:
@@ -227,7 +227,7 @@ class _MissingSoFar:
             self._period, self._seen_even = even, True
         else:
             measured = span / count
-            near = abs(measured / self._expected - 1) < 0.005  # so far off a clock may well be
+            near = abs(measured / self._expected - 1) < 0.005  # a clock may be off by this much
             first = self._period == self._expected
             if near and not self._seen_even and (first or measured < self._period):
                 self._period = measured
@@ -250,7 +250,7 @@ class _EncoderWatch:
 
     @property
     def stuck(self) -> int:
-        """How many encoders froze while driven on, or never moved though their carts had to."""
+        """The number of encoders that froze while driven, or never moved though carts had to."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
         pushed = self._driven.width >= _DRIVEN
         never = {
@@ -259,17 +259,17 @@ class _EncoderWatch:
             if width == 0
             and pushed
             and (encoder == 0 or max(moved.values()) >= 200)
-            and self._earlier is not None  # a run of less than a window tells nothing
+            and self._earlier is not None  # a run shorter than a window shows nothing
         }
         return len(self._frozen | never)
 
     @property
     def widest(self) -> int:
-        """The greatest range of any encoder watched, counts."""
+        """The largest range of any watched encoder, counts."""
         return max((seen.width for seen in self._overall.values()), default=0)
 
     def see(self, readings: Sequence[Reading]) -> None:
-        """Take note of valid lines, in order."""
+        """Record valid lines, in order."""
         if not readings:
             return
         for encoder in self._encoders:
@@ -299,7 +299,7 @@ class _EncoderWatch:
 
 
 class _Range:
-    """The least and the greatest of whole numbers."""
+    """The smallest and the largest of some integers."""
 
     def __init__(self) -> None:
         self._low: int | None = None
@@ -307,11 +307,11 @@ class _Range:
 
     @property
     def width(self) -> int:
-        """The distance from the least to the greatest; 0 of none."""
+        """Their difference; 0 without any."""
         return 0 if self._low is None else self._high - self._low
 
     def widen(self, values: Sequence[int]) -> None:
-        """Take in some more."""
+        """Include some more."""
         low, high = min(values), max(values)
         self._high = high if self._low is None else max(self._high, high)
         self._low = low if self._low is None else min(self._low, low)

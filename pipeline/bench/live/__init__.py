@@ -1,1 +1,1 @@
-"""Who watches a session: the terminal, a page in the browser."""
+"""Views of a session: the terminal, a page in the browser."""

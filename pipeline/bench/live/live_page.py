@@ -1,9 +1,9 @@
-"""A page in the browser that shows a session at the bench while it goes on.
+"""A page in the browser that shows a session at the bench while it runs.
 
-The desk shows it among its own pages; `cartlab acquire --web` serves it by itself, to this computer
-alone and only to who has the address, which holds a secret that is made anew for every session.
-Requests that another page makes are refused. Whoever serves looks for news a few times a second, so
-however slow a browser reads, the acquisition never waits.
+The desk shows it among its own pages. `cartlab acquire --web` serves it alone, to this computer
+only, and only to visitors with the address, which holds a secret for this session. Requests from
+other pages are refused. The server polls for news a few times a second, so a slow browser never
+delays the acquisition.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from pipeline.resources import TEMPLATES
 from pipeline.web.guard import Guard, list_own_names, refuse
 from pipeline.web.server import Served
 
-_LARGEST_ANSWER = 200  # bytes of what a button sends
+_LARGEST_ANSWER = 200  # largest body of a button's request, bytes
 _FILES = {
     "": ("live.html", "text/html"),
     "live.js": ("live.js", "text/javascript"),
@@ -41,18 +41,18 @@ _FILES = {
 def stream_news(
     session: ShownSession, *, is_over: Callable[[], bool], last_words: str = ""
 ) -> Response:
-    """Return the news of a session as they come, in the server's own loop.
+    """Return the news of a session as it comes, in the server's own loop.
 
     Parameters
     ----------
-    is_over : whether nothing comes any more.
-    last_words : an event that tells so.
+    is_over : whether the session has ended.
+    last_words : an event that says so.
     """
     if session.viewers >= 8:  # each costs a little of the processor
         return PlainTextResponse("too many pages show this session", status_code=503)
 
     async def news() -> AsyncIterator[str]:
-        """Send what changed as it changes; a page that reads slowly gets less, not later."""
+        """Send changes as they happen; a slow page gets less, not later."""
         session.viewers += 1
         try:
             said, over = time.monotonic(), is_over()
@@ -77,7 +77,7 @@ def stream_news(
 
 
 def press_button(session: ShownSession, wish: str, number: str) -> int:
-    """Pass on a button; return the status to answer with, 204 where it is heeded."""
+    """Pass on a button; return the status to answer with, 204 if it is accepted."""
     try:
         heeded = session.heed(wish, int(number))
     except ValueError:
@@ -86,12 +86,12 @@ def press_button(session: ShownSession, wish: str, number: str) -> int:
 
 
 def live_view() -> str:
-    """Return what a page shows of a session, with its buttons, for live.js to fill."""
+    """Return the view of a session, with its buttons, for live.js to fill."""
     return (TEMPLATES / "live-view.html").read_text(encoding="utf-8")
 
 
 class LivePage(LiveState):
-    """An observer that a browser shows; a context, in which the page is served.
+    """An observer with a page in the browser; a context manager that serves the page.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class LivePage(LiveState):
 
     Attributes
     ----------
-    url : of the page, the secret in it: for the person's eyes, not for a file or a log.
+    url : of the page, including the secret: for the person only, not for a file or a log.
     """
 
     def __init__(self, folder: Path, *, port: int = 0) -> None:
@@ -145,7 +145,7 @@ class LivePage(LiveState):
         return Response(text.replace("<!-- the view -->", live_view()), media_type=kind)
 
     async def _press(self, request: Request) -> Response:
-        """Take a button: `done` of an instruction, or what is wanted of a turn, by its number."""
+        """Take a button: `done` with an instruction, or a wish for a turn, by its number."""
         if int(request.headers.get("content-length", _LARGEST_ANSWER + 1)) > _LARGEST_ANSWER:
             return PlainTextResponse("too long", status_code=413)
         try:
@@ -160,13 +160,13 @@ class LivePage(LiveState):
 
 
 class _SecretPath:
-    """The door of who knows the secret, with which every address begins."""
+    """Access for visitors with the secret, with which every address begins."""
 
     arrivals = False
 
     def __init__(self, secret: str, *, port: int) -> None:
         self.sites = list_own_names(port)
-        self._secret = f"{secret}/"  # links of the page go on from the slash
+        self._secret = f"{secret}/"  # relative links of the page start at the slash
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
         """Return the rest of the path."""

@@ -1,4 +1,7 @@
-"""What a live page shows: told by the acquisition in one thread, asked by a server in another."""
+"""The content of a live page:
+
+written by the acquisition in one thread, read by a server in another.
+"""
 
 import threading
 from abc import ABC, abstractmethod
@@ -23,11 +26,11 @@ from pipeline.submission import (
 Phase = Literal["waiting", "settling", "recording", "thinking", "over"]
 FRAME = 1 / 30  # s between looks for news
 
-_APART = 5  # ms between points shown: no eye sees more on a screen of ten seconds
+_APART = 5  # ms between points shown: a screen of ten seconds cannot show more
 
 
 class ShownSession(ABC):
-    """What pages show of a session, told in one thread, asked in another; their buttons go here.
+    """The content that pages show, written in one thread and read in another; and their buttons.
 
     Attributes
     ----------
@@ -39,21 +42,24 @@ class ShownSession(ABC):
         self.version = self.viewers = 0
         self._lock = threading.Lock()
         self._run = 0
-        # What a page has not fetched after 12 s is left out.
+        # Points that a page has not fetched within 12 s are dropped.
         self._points: deque[Sequence[float]] = deque(maxlen=2400)
-        self._end = 0  # points of this run, those that are gone included
+        self._end = 0  # points of this run, including dropped ones
         self._counters: Mapping[str, int] = _count(0, Anomalies())
 
     @abstractmethod
     def snapshot(self) -> dict[str, Any]:
-        """Return all but the points, for JSON."""
+        """Return everything except the points, for JSON."""
 
     @abstractmethod
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button: `done` of an instruction or a wish of a turn; tell whether it counts."""
+        """Take a button:
+
+        `done` with an instruction or a wish for a turn; return whether it counts.
+        """
 
     def points(self, *, run: int, start: int) -> dict[str, Any]:
-        """Return the points since `start` of a run; of another run than the present: all.
+        """Return the points since `start` of a run; all points if the run has changed.
 
         Each is (t in s, input, target, x1, x2, …). `end` is where the next ones start; `counters`
         are those of the run so far.
@@ -70,11 +76,11 @@ class ShownSession(ABC):
             }
 
     def follow(self, *, version: int = 0) -> Iterator[list[tuple[str, Mapping[str, Any]]]]:
-        """Yield, whenever asked, what changed since the last time: kind of news and content.
+        """Yield, at each request, what changed since the last one: kind of news and content.
 
         Parameters
         ----------
-        version : of the state that is known already.
+        version : of the state that the reader has already.
         """
         run = start = 0
         while True:
@@ -91,7 +97,7 @@ class ShownSession(ABC):
     def _keep(
         self, run: int, points: Sequence[Sequence[float]], counters: Mapping[str, int]
     ) -> None:
-        """Add points of a run, which may be another than before; the caller has the lock."""
+        """Add points of a run, which may be a new one; the caller has the lock."""
         if run != self._run:
             self._run, self._end = run, 0
             self._points.clear()
@@ -101,15 +107,15 @@ class ShownSession(ABC):
 
 
 class LiveState(ShownSession):
-    """An observer that remembers what there is to see.
+    """An observer that stores what pages show.
 
     Parameters
     ----------
-    folder : of the submission, whose units are shown; it is there once a plan is told.
+    folder : of the submission, whose units are shown; it exists once a plan is announced.
 
     Attributes
     ----------
-    buttons : what is pressed on the page, for the acquisition to heed.
+    buttons : those pressed on the page, for the acquisition.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -125,7 +131,7 @@ class LiveState(ShownSession):
         self._phase: Phase = "waiting"
         self._instruction: tuple[int, str] | None = None  # its number, its text
         self._asked = 0
-        self._stage = ""  # of what it thinks about
+        self._stage = ""  # what it is computing
         self._thoughts = 0
         self._thought = ""
         self._remarks: deque[str] = deque(maxlen=20)
@@ -135,7 +141,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------- by the acquisition
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Tell what will be recorded, and the ids of what already is."""
+        """Announce the recordings, and the ids of those that exist."""
         submission = load_submission(self._folder)
         with self._lock:
             self._submission, self._plan, self._done = submission, plan, set(done)
@@ -146,7 +152,7 @@ class LiveState(ShownSession):
 
         Raises
         ------
-        ConfigError : the page was closed meanwhile; nobody can confirm any more.
+        ConfigError : the page was closed meanwhile, so nobody can confirm.
         """
         with self._lock:
             self._asked += 1
@@ -162,18 +168,18 @@ class LiveState(ShownSession):
                 raise ConfigError(f"nobody confirmed: {instruction}")
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Tell that the carts come to rest first."""
+        """Announce that the carts come to rest first."""
         self._change("settling", recording)
 
     def started(self, recording: Recording) -> None:
-        """Tell that the bench streams."""
+        """Announce that the bench streams."""
         with self._lock:
             self._last_ms, self._lines = -_APART, 0
             self._keep(self._run + 1, [], _count(0, Anomalies()))
         self._change("recording", recording)
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Keep a few of the lines that came."""
+        """Keep a few of the lines that arrived."""
         kept = []
         for reading in batch:
             if reading.ms - self._last_ms >= _APART:
@@ -184,7 +190,7 @@ class LiveState(ShownSession):
             self._keep(self._run, kept, _count(self._lines, anomalies))
 
     def finished(self, outcome: RunOutcome) -> None:
-        """Tell how the run ended."""
+        """Announce how the run ended."""
         name = outcome.recording.id
         with self._lock:
             if outcome.partial:
@@ -197,20 +203,20 @@ class LiveState(ShownSession):
         self._change("waiting", None)
 
     def remark(self, sentence: str) -> None:
-        """Tell what concerns no single run."""
+        """Announce something that concerns no single run."""
         with self._lock:
-            if sentence not in self._remarks:  # an exploration opens the line once a turn
+            if sentence not in self._remarks:  # an exploration opens the line once in each turn
                 self._remarks.append(sentence)
             self.version += 1
 
     def thinking(self, stage: str) -> None:
-        """Tell what the data are asked meanwhile."""
+        """Announce what is being computed."""
         with self._lock:
             self._stage = stage
         self._change("thinking", None)
 
     def thought(self, sentence: str) -> None:
-        """Tell what is known, what is doubted, what is recorded next and why."""
+        """Announce what is known, what is doubted, and the next recording with its reason."""
         with self._lock:
             self._thoughts += 1
             self._thought = sentence
@@ -222,7 +228,7 @@ class LiveState(ShownSession):
             self.version += 1
 
     def _point(self, reading: Reading) -> tuple[float, ...]:
-        """Return a line in the submission's units, or in counts where it states none."""
+        """Return a line in the submission's units, or in counts if it states none."""
         position, drive, carts = 1.0, 1.0, len(reading.counts)
         if self._submission is not None:
             system = self._submission.system
@@ -237,7 +243,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------------ by the server
 
     def answer(self, number: int) -> bool:
-        """Take a person's word that instruction `number` is done; an earlier one's is void."""
+        """Confirm instruction `number`; an earlier one does not count."""
         with self._lock:
             if self._instruction is None or self._instruction[0] != number:
                 return False
@@ -247,7 +253,7 @@ class LiveState(ShownSession):
             return True
 
     def press(self, wish: Wish, *, turn: int) -> bool:
-        """Press a button; return whether it will be heeded."""
+        """Press a button; return whether it will be accepted."""
         heeded = self.buttons.press(wish, turn=turn)
         with self._lock:
             self.version += 1
@@ -255,17 +261,20 @@ class LiveState(ShownSession):
         return heeded
 
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button: `done` of an instruction or a wish of a turn; tell whether it counts."""
+        """Take a button:
+
+        `done` with an instruction or a wish for a turn; return whether it counts.
+        """
         if wish == "done":
             return self.answer(number)
         return wish in WISHES and self.press(wish, turn=number)
 
     def end(self) -> None:
-        """Tell that nothing comes any more."""
+        """Announce the end."""
         self._change("over", None)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all but the points, for JSON."""
+        """Return everything except the points, for JSON."""
         with self._lock:
             system = self._submission.system if self._submission else None
             recordings = self._plan.recordings if self._plan else ()
@@ -295,7 +304,7 @@ class LiveState(ShownSession):
             }
 
     def _waits(self) -> str:
-        """Return in one sentence what the program is about, or waiting for."""
+        """Return in one sentence what the program is doing, or waiting for."""
         if self._phase == "over":
             return "The session is over."
         if self.buttons.pressed == "stop":
@@ -326,7 +335,7 @@ class LiveState(ShownSession):
 
 
 def _unit(scale: InputScale | PositionScale | None) -> str:
-    """Return the unit that counts are turned into; they stay counts where no scale is stated."""
+    """Return the unit that counts are converted to; without a scale they stay counts."""
     return scale.unit if scale and scale.per_count else "counts"
 
 

@@ -1,4 +1,4 @@
-"""Who watches a session at the bench and may press a button: the terminal, a web page, a test."""
+"""Observers of a session at the bench: the terminal, a web page, a test."""
 
 import threading
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ WISHES: tuple[Wish, ...] = get_args(Wish)
 
 @dataclass(frozen=True, kw_only=True)
 class Anomalies:
-    """What went wrong on the line, in how many places.
+    """Faults on the line, with their numbers.
 
     Attributes
     ----------
     lost : lines that never came, by their time stamps.
-    garbled : lines that say nothing, or a merger of several.
-    late : lines that came in a lump, long after they were due.
-    resets : the bench's clock began again in mid-run.
+    garbled : unreadable lines, and merged ones.
+    late : lines that came together, long after they were due.
+    resets : the bench's clock started again during the run.
     stuck : encoders that did not move although the motor did.
     """
 
@@ -32,7 +32,7 @@ class Anomalies:
     stuck: int = 0
 
     def __str__(self) -> str:
-        """Say what there is, "12 lines lost, 3 late"; "none" where there is nothing."""
+        """Return a list such as "12 lines lost, 3 late", or "none"."""
         words = [
             (self.lost, "line" if self.lost == 1 else "lines", "lost"),
             (self.garbled, "garbled"),
@@ -51,10 +51,10 @@ class RunOutcome:
     ----------
     lines : valid lines kept.
     partial : why it ended early; "": it did not.
-    remarks : what a person should know, a sentence each.
-    is_astray : the bench did what nothing told it to: nothing more is asked of it.
-    is_unsafe : to go on was not safe: the same is not tried again.
-    wish : the button that ended it; None: none did.
+    remarks : notes for the person, one sentence each.
+    is_astray : the bench acted without an order, so it gets no more orders.
+    is_unsafe : going on was not safe, so the same is not tried again.
+    wish : the button that ended it; None: no button.
     """
 
     recording: Recording
@@ -68,10 +68,10 @@ class RunOutcome:
 
 
 class Observer(Protocol):
-    """What acquisition tells while it goes on; every call returns at once but `confirm`."""
+    """Events of an acquisition; every call returns at once except `confirm`."""
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Tell what will be recorded, and the ids of what already is."""
+        """Announce the recordings, and the ids of those that exist."""
         ...
 
     def confirm(self, instruction: str) -> None:
@@ -84,42 +84,42 @@ class Observer(Protocol):
         ...
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Tell that the carts come to rest first."""
+        """Announce that the carts come to rest first."""
         ...
 
     def started(self, recording: Recording) -> None:
-        """Tell that the bench streams."""
+        """Announce that the bench streams."""
         ...
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Hand on the lines that came, in order; `anomalies` are those of this run so far."""
+        """Pass on new lines, in order; `anomalies` are those of this run so far."""
         ...
 
     def finished(self, outcome: RunOutcome) -> None:
-        """Tell how the run ended."""
+        """Announce how the run ended."""
         ...
 
     def remark(self, sentence: str) -> None:
-        """Tell what concerns no single run."""
+        """Announce something that concerns no single run."""
         ...
 
     def thinking(self, stage: str) -> None:
-        """Tell what the data are asked meanwhile, the bench at rest."""
+        """Announce what is being computed while the bench rests."""
         ...
 
     def thought(self, sentence: str) -> None:
-        """Tell what is known, what is doubted, what is recorded next and why."""
+        """Announce what is known, what is doubted, and the next recording with its reason."""
         ...
 
 
 class Observers:
-    """Several observers as one; the first of them has the person confirm."""
+    """Several observers as one; the first of them asks a person to confirm."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = tuple(observers)
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
-        """Tell what will be recorded, and the ids of what already is."""
+        """Announce the recordings, and the ids of those that exist."""
         for observer in self._observers:
             observer.planned(plan, done)
 
@@ -129,51 +129,51 @@ class Observers:
             observer.confirm(instruction)
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Tell that the carts come to rest first."""
+        """Announce that the carts come to rest first."""
         for observer in self._observers:
             observer.settling(recording, seconds)
 
     def started(self, recording: Recording) -> None:
-        """Tell that the bench streams."""
+        """Announce that the bench streams."""
         for observer in self._observers:
             observer.started(recording)
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Hand on the lines that came."""
+        """Pass on new lines."""
         for observer in self._observers:
             observer.readings(batch, anomalies)
 
     def finished(self, outcome: RunOutcome) -> None:
-        """Tell how the run ended."""
+        """Announce how the run ended."""
         for observer in self._observers:
             observer.finished(outcome)
 
     def remark(self, sentence: str) -> None:
-        """Tell what concerns no single run."""
+        """Announce something that concerns no single run."""
         for observer in self._observers:
             observer.remark(sentence)
 
     def thinking(self, stage: str) -> None:
-        """Tell what the data are asked meanwhile."""
+        """Announce what is being computed."""
         for observer in self._observers:
             observer.thinking(stage)
 
     def thought(self, sentence: str) -> None:
-        """Tell what is known, what is doubted, what is recorded next and why."""
+        """Announce what is known, what is doubted, and the next recording with its reason."""
         for observer in self._observers:
             observer.thought(sentence)
 
 
 class Buttons:
-    """What a person wants done with the run at hand: pressed in one thread, done in another.
+    """A person's wish for the present run: pressed in one thread, carried out in another.
 
-    A button does nothing by itself. The acquisition says what it would heed now, looks at every
-    turn of its loop what was pressed, and decides.
+    A button does nothing by itself. The acquisition states which buttons it would accept now,
+    checks them in every turn of its loop, and decides.
 
     Attributes
     ----------
-    turn : which try of which recording the offer is about; a press for another is void.
-    offered : what would be heeded now besides "stop", which always is.
+    turn : the try and the recording of the offer; a press for another turn does not count.
+    offered : buttons accepted now besides "stop", which always is.
     """
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class Buttons:
 
     @property
     def pressed(self) -> Wish | None:
-        """What was pressed in this turn; "stop" stays pressed."""
+        """The button pressed in this turn; "stop" stays pressed."""
         return self._pressed
 
     def begin(self) -> None:
@@ -196,12 +196,12 @@ class Buttons:
                 self._pressed = None
 
     def offer(self, *wishes: Wish) -> None:
-        """Say what would be heeded now; what was pressed before in this turn stays so."""
+        """Set the accepted buttons; a button already pressed in this turn stays pressed."""
         with self._lock:
             self.offered = wishes
 
     def press(self, wish: Wish, *, turn: int) -> bool:
-        """Press one; return whether it will be heeded. "stop" will, at any time."""
+        """Press a button; return whether it is accepted. "stop" is, at any time."""
         with self._lock:
             if wish != "stop" and (self._pressed or turn != self.turn or wish not in self.offered):
                 return False

@@ -1,4 +1,4 @@
-"""A session at the bench, watched in the terminal; next to silent where stderr is none."""
+"""A session at the bench, shown in the terminal; nearly silent if stderr is not a terminal."""
 
 import sys
 import time
@@ -26,7 +26,7 @@ class Terminal:
 
     Parameters
     ----------
-    yes : whatever a person is asked to do is taken as done.
+    yes : take everything a person is asked to do as done.
     """
 
     def __init__(self, *, yes: bool = False, console: Console | None = None) -> None:
@@ -94,7 +94,7 @@ class Terminal:
         self._console.print(Text(sentence), soft_wrap=True)
 
     def _ask(self, question: str, *, keys: str) -> str:
-        """Return what is typed in answer; `keys`: what to type.
+        """Return what is typed in answer; `keys`: the keys to choose from.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class Terminal:
                 self._live.start()
 
     def thinking(self, stage: str) -> None:
-        """Show what the data are asked."""
+        """Show what is being computed."""
         self._view.thinking = stage
 
     def thought(self, sentence: str) -> None:
@@ -121,7 +121,7 @@ class Terminal:
         self.remark(sentence)
 
     def vetoes(self, recording: Recording) -> bool:
-        """Ask whether a recording is to be left out.
+        """Ask whether to leave out a recording.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class Terminal:
 
 
 class _View:
-    """What is shown at the moment."""
+    """The present picture."""
 
     def __init__(self) -> None:
         self.plan: tuple[Recording, ...] = ()
@@ -152,7 +152,7 @@ class _View:
         self._traces, self._arrived = [], deque()
 
     def take(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Take in lines; one in a batch is as much as a sparkline shows."""
+        """Take in lines; one in each batch is enough for a sparkline."""
         last, now = batch[-1], time.monotonic()
         self._ms, self._anomalies = last.ms, anomalies
         if len(self._traces) != len(last.counts):
@@ -184,20 +184,20 @@ class _View:
         )
         lines = [Text(f"{run.id} ({run.kind}): {state}")]
         for number, trace in enumerate(self._traces, start=1):
-            shown = list(trace)  # at once: the lines come in another thread
+            shown = list(trace)  # at once, as the lines come in another thread
             if shown:
                 lines.append(Text(f"  encoder {number} {shown[-1]:>7}  {sparkline(shown)}"))
         return lines
 
     def _rate(self) -> float:
-        arrived = list(self._arrived)  # at once: the lines come in another thread
+        arrived = list(self._arrived)  # at once, as the lines come in another thread
         if len(arrived) < 2 or arrived[-1][0] == arrived[0][0]:
             return 0.0
         return sum(n for _, n in arrived[1:]) / (arrived[-1][0] - arrived[0][0])
 
 
 def _forget_keys() -> None:
-    """Drop what was typed before the question: it is no answer to it, and a motor may start."""
+    """Drop keys typed before the question: they are no answer to it, and a motor may start."""
     try:
         import termios
     except ImportError:  # Windows
@@ -210,7 +210,7 @@ def _forget_keys() -> None:
 
 
 def sparkline(values: Sequence[int]) -> str:
-    """Return values as a row of bars, the least lowest."""
+    """Return values as a row of bars, the smallest lowest."""
     low, high = min(values), max(values)
     step = (high - low) / (len(_BARS) - 1) or 1.0
     return "".join(_BARS[round((value - low) / step)] for value in values)

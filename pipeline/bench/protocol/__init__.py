@@ -1,1 +1,1 @@
-"""What host and bench say to each other, and the clock behind it."""
+"""The messages between host and bench, and the clock behind them."""

@@ -1,4 +1,4 @@
-"""What arrives at a bench, cut into commands; noise and lost bytes never swallow a stop."""
+"""Cut the bytes that arrive at a bench into commands; noise and lost bytes never hide a stop."""
 
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -18,7 +18,7 @@ from pipeline.bench.protocol.messages import (
     Wave,
 )
 
-# What firmware can hold in 32 bits, and no bench needs more.
+# The limits of 32-bit firmware; no bench needs more.
 _LONGEST_FIELD = 32  # characters
 _LARGEST_NUMBER = 1e9
 _LARGEST_AMPLITUDE = 1_000_000
@@ -28,17 +28,17 @@ _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 
 
 class CommandReader:
-    """Cuts what arrives at a bench into commands; what is none is counted and dropped.
+    """Cuts the bytes that arrive at a bench into commands; anything else is counted and dropped.
 
-    A field that cannot stand where it stands ends the command before it and may begin another. If
-    it ends in the letter of a stop or a reset it is that, whatever noise comes before; so is an
-    `s` that seemed to be the wave of a start that then breaks off. So a lost byte never swallows
-    the stop that follows.
+    A field that does not fit its place ends the command before it and may begin another. If it ends
+    in the letter of a stop or a reset it counts as such, whatever noise comes before. So does an
+    `s` that seemed to be the wave of a start which then breaks off. So a lost byte never hides the
+    stop that follows.
 
     Parameters
     ----------
     encoders : of the bench; state feedback has two gains for each.
-    extensions : the letters it knows beyond the stock bench's; none: no query either.
+    extensions : the letters known beyond the stock bench's; without any, no query either.
     """
 
     def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:
@@ -52,7 +52,7 @@ class CommandReader:
     def feed(self, data: bytes) -> list[Command]:
         """Return the commands that are now complete, in order."""
         *whole, rest = (self._rest + data.decode("latin-1")).split(";")
-        self._rest = rest[-_LONGEST_FIELD - 1 :]  # what is longer stays too long
+        self._rest = rest[-_LONGEST_FIELD - 1 :]  # longer ones are just too long
         return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
 
     def _take(self, field: str) -> list[Command]:
@@ -110,7 +110,7 @@ def _whole_within(lowest: int, highest: int) -> _Reader:
 
 
 def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
-    """Return what follows each letter."""
+    """Return the kinds of field after each letter."""
     waves = "".join(w for w in Wave if w not in (Wave.CHIRP, Wave.MULTISINE) or w in extensions)
     frequency = _number_within(*FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)

@@ -1,8 +1,8 @@
-"""What host and bench say to each other: one command or one line of text at a time.
+"""The messages between host and bench: one command or one line of text at a time.
 
-docs/protocol.md specifies it in words. Commands are fields that each end in a semicolon; the
-first letter tells which follow. The stock bench knows `d`, `g` and `z`; one that answers `?;` says
-which others it knows.
+docs/protocol.md specifies it in words. Commands are fields that each end in a semicolon; the first
+letter defines the others. The stock bench knows `d`, `g` and `z`; a bench that answers `?;` lists
+its extensions.
 """
 
 import math
@@ -18,12 +18,12 @@ FULL_SCALE = 4096  # duty counts: 5 V
 HEARTBEAT_EVERY = 0.03  # s
 WATCHDOG = 0.1  # s after the last heartbeat the motor is cut
 PULSE = 0.05  # s a delta wave is on
-NOMINAL_PERIOD = 1e-3  # s from line to line
-CHIRP_SPAN = 20.0  # a chirp ends at so many times the frequency it starts at, unless told
-FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with any other is dropped
-EXTENSIONS = frozenset("cfhkms")  # the commands, `?` aside, that the stock bench does not know
+NOMINAL_PERIOD = 1e-3  # s between lines
+CHIRP_SPAN = 20.0  # the default ratio of a chirp's end frequency to its start
+FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with another frequency is dropped
+EXTENSIONS = frozenset("cfhkms")  # the commands, except `?`, that the stock bench does not know
 
-# What firmware can hold in 32 bits, and no bench needs more.
+# The limits of 32-bit firmware; no bench needs more.
 MOST_TONES = 64  # of a multisine
 _Read = TypeVar("_Read")
 _LONGEST_COUNT = 10  # digits of a field of a line
@@ -35,8 +35,8 @@ class Wave(StrEnum):
     """The shape of the target over one period 1/FREQ.
 
     delta is a short pulse as the period begins; square is zero for half a period, then the
-    amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps
-    once, logarithmically, over the whole run; multisine is the sum of the tones told.
+    amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps once,
+    logarithmically, over the whole run; multisine is the sum of the stored tones.
     `pipeline.bench.protocol.waves` has the formulas.
     """
 
@@ -75,7 +75,10 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class PidGains:
-    """`g`: duty = kp e + ki ∫e dt + kd de/dt, e in encoder counts; the loop of the next starts."""
+    """`g`:
+
+    duty = kp e + ki ∫e dt + kd de/dt, e in encoder counts; used by later closed-loop starts.
+    """
 
     kp: float
     ki: float
@@ -92,19 +95,19 @@ class StateGains:
 
 @dataclass(frozen=True, kw_only=True)
 class ChirpEnd:
-    """`c`: where the chirps that follow end, Hz."""
+    """`c`: the end frequency of later chirps, Hz."""
 
     frequency: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tone:
-    """`m`: one sine of the multisines that follow; of harmonic 0: forget those told so far.
+    """`m`: one sine of later multisines; harmonic 0 clears those stored so far.
 
     Attributes
     ----------
     harmonic : of the wave's frequency.
-    share : its amplitude, of the wave's.
+    share : its amplitude relative to the wave's.
     phase : rad, at the start.
     """
 
@@ -115,12 +118,12 @@ class Tone:
 
 @dataclass(frozen=True, kw_only=True)
 class Hands:
-    """`h`: a virtual bench's hands hold some carts and, in the next run, let one go.
+    """`h`: a virtual bench's hands hold some carts and, in the next run, release one.
 
     Attributes
     ----------
-    held : the carts that cannot move.
-    released : the cart pulled out and let go; 0: none.
+    held : the held carts.
+    released : the cart pulled out and released; 0: none.
     """
 
     held: tuple[int, ...] = ()
@@ -132,18 +135,18 @@ class Signal(StrEnum):
 
     RESET = "z"  # stop, count and clock from zero, forget gains
     STOP = "s"
-    HEARTBEAT = "k"  # the first since a reset arms the watchdog
+    HEARTBEAT = "k"  # the first one after a reset arms the watchdog
     QUERY = "?"
 
 
 Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Tone | Hands | Signal
 
-# A bench that knows no `s` is stopped by a run that does nothing, then reset.
+# A bench without `s` is stopped by a run that does nothing, then reset.
 STOCK_STOP: tuple[Command, ...] = (Start(wave=Wave.DELTA, frequency=1.0, amplitude=0), Signal.RESET)
 
 
 def encode(command: Command) -> bytes:
-    """Return a command as it goes over the line."""
+    """Return a command as it is sent over the line."""
     match command:
         case Start(wave=wave, encoder=encoder):
             loop = "o" if encoder is None else "c"
@@ -160,7 +163,7 @@ def encode(command: Command) -> bytes:
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
-            # The empty field ends whatever a lost byte left open; stock benches know no stop.
+            # The empty field ends a command left open by a lost byte; stock benches have no stop.
             fields = ["", "s"] if command is Signal.STOP else [command.value]
     return "".join(f"{field};" for field in fields).encode("ascii")
 
@@ -194,7 +197,7 @@ def format_reading(reading: Reading) -> bytes:
 
 
 def parse_reading(line: bytes) -> Reading | None:
-    """Return what a line says, its end stripped or not; None: it is no line of the stream."""
+    """Return the content of a line, with or without its end; None: not a line of the stream."""
     text = line.decode("latin-1").rstrip("\r\n")
     if not _LINE.fullmatch(text):
         return None
@@ -204,18 +207,18 @@ def parse_reading(line: bytes) -> Reading | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """What a bench answers to `?;`: itself, on one line that starts with a question mark.
+    """A bench's answer to `?;`: its description, on one line that starts with a question mark.
 
     Attributes
     ----------
     name : in one word.
-    encoders : how many fields of a line are counts: two or three.
+    encoders : number of fields that are counts: two or three.
     carts : how many of them are carts.
-    period : s from line to line, as it should be.
+    period : nominal s between lines.
     baud : of the line.
-    commands : the letters beyond the stock ones that it knows, with `c` for the chirp and `m` for
-        the multisine too.
-    input_unit, input_per_count : the input in its unit is duty counts times this.
+    commands : the letters known beyond the stock ones, with `c` also for the chirp and `m` for the
+        multisine.
+    input_unit, input_per_count : the input in its unit is this times the duty counts.
     position_unit, position_per_count : likewise of the encoders.
     """
 
@@ -252,7 +255,7 @@ def parse_description(line: bytes) -> Description:
 
     Raises
     ------
-    DataError : it is none, or of a version this program does not speak.
+    DataError : it is not a description, or of a version this program does not know.
     """
     text = line.decode("ascii", "replace").strip()
     head, *words = text.split(" ")

@@ -1,8 +1,8 @@
-"""How many lines a run of time stamps lacks, and the true period behind them.
+"""The number of lines that a run's time stamps lack, and the true period behind them.
 
 Stamps are whole milliseconds. Near 1 kHz a clock of 1.0024 ms skips a stamp every 417 ms although
-no line is lost, so a difference of two tells nothing by itself. But the clock's own skips are
-evenly spaced, like the teeth of a comb, and losses are not.
+no line is lost, so one difference proves nothing. But the clock's own skips are evenly spaced, like
+the teeth of a comb, and losses are not.
 """
 
 from collections.abc import Sequence
@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 Stamps = NDArray[np.int64]
 
-OTHER_PERIOD = 0.02  # of a period: no clock is so far off the one that is stated
-_SLOW = 1.5  # ms; from this period on each difference tells by itself
-_MOST_ABSENT = 0.2  # of the stamps; more is a slower clock
-_CLOSEST_TEETH = 20  # a clock of 1.05 ms; one further off is no bench's that aims at 1 kHz
-_TOOTH_SLACK = 1  # ms a tooth may be off: stamps are rounded
+OTHER_PERIOD = 0.02  # of a period: no clock differs more from the stated one
+_SLOW = 1.5  # ms; from this period on, each difference is conclusive
+_MOST_ABSENT = 0.2  # of the stamps; more means a slower clock
+_CLOSEST_TEETH = 20  # a clock of 1.05 ms; no bench that aims at 1 kHz is further off
+_TOOTH_SLACK = 1  # ms by which a tooth may be off: stamps are rounded
 _FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps tried as the comb's first two teeth
 
 
@@ -28,7 +28,7 @@ class StampFit:
     Attributes
     ----------
     period : ms from line to line.
-    missing : lines that the clock ticked and that are not there.
+    missing : ticks of the clock without a line.
     """
 
     period: float
@@ -36,11 +36,11 @@ class StampFit:
 
 
 def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampFit:
-    """Return the clock behind stamps (n,) in ms, never falling; `period` (ms) is what is expected.
+    """Return the clock behind stamps (n,) in ms, never falling; `period` (ms) is the expected one.
 
-    The expectation counts only where the stamps do not tell: a short run with losses, a clock
-    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond. Where the bench itself
-    `stated` it, it counts as well where more lines are missing than a comb can be told from.
+    The expectation is used only if the stamps are not conclusive: a short run with losses, a clock
+    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond. If the bench itself
+    `stated` it, it is also used if too many lines are missing to find a comb.
     """
     n = stamps.size
     if n < 2 or stamps[-1] == stamps[0]:
@@ -55,20 +55,20 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
         return StampFit(period=period, missing=missing)
     usual = float(np.median(steps))
     if usual >= _SLOW:
-        measured = float(steps[steps < usual + _SLOW].mean())  # rounding makes two usual steps
+        measured = float(steps[steps < usual + _SLOW].mean())  # rounding gives two usual steps
         lost = int((np.round(steps / measured) - 1).clip(min=0).sum())
         return StampFit(period=span / (n - 1 + lost), missing=lost)
     if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has leapt
         if stated or period >= 1 / (1 - _MOST_ABSENT):
             return StampFit(period=period, missing=missing)
-        return StampFit(period=span / (n - 1), missing=0)  # not the bench that is expected
+        return StampFit(period=span / (n - 1), missing=0)  # not the expected bench
     if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
         return StampFit(period=period, missing=missing)
     seen = np.zeros(span + 1, dtype=np.bool_)
     seen[stamps - stamps[0]] = True
     absent = np.flatnonzero(~seen).tolist()
     teeth = _comb(absent)
-    chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # of a tooth that is none
+    chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # of a false tooth
     # Losses look like this comb by chance less often than once in a hundred runs.
     if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < 0.01:
         spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
@@ -86,11 +86,11 @@ def even_period(stamps: Stamps) -> float | None:
 
 
 def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
-    """Return the clock of those pieces that are even, where it is another than the stated one.
+    """Return the clock of the even pieces, if it differs from the stated one.
 
-    Lines that a bench loses leave no long piece even, unless they are few.
+    If a bench loses lines, no long piece is even, unless few are lost.
     """
-    long = 200  # lines of a piece, which mostly lacks some if one in a hundred is lost
+    long = 200  # lines of a piece, which usually lacks some if one in a hundred is lost
     pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
     even = [period for piece in pieces if (period := even_period(piece)) is not None]
     if len(even) < max(0.25 * len(pieces), 1):
@@ -108,28 +108,28 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
 
 def _comb(absent: Sequence[int]) -> list[int]:
-    """Return the absent stamps (ascending) that are the clock's own skips: the longest comb.
+    """Return the missing stamps (ascending) that are the clock's own skips: the longest comb.
 
-    Every tooth of it must be there, from the first absent stamps to the last.
+    Every tooth of it must be there, from the first missing stamps to the last.
     """
     there = frozenset(absent)
     best: list[int] = []
     for i, first in enumerate(absent[:_FIRST_TEETH]):
         for second in absent[i + 1 : i + 1 + _SECOND_TEETH]:
-            # Closer teeth are the rarer find: a comb may miss none, so the most teeth win.
+            # Closer teeth are a rarer find, as a comb may not lack any: the most teeth win.
             teeth = _follow(first, second, there=there, last=absent[-1])
             best = max(best, teeth, key=len)
     return best
 
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
-    """Return the teeth from the first two on; [] where one is missing before the end."""
+    """Return the teeth starting with the first two; [] if one is missing before the end."""
     if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]
     while True:
         back = teeth[-16:]  # a clock may drift
-        # Two teeth tell their spacing to a millisecond, many to a fraction of it.
+        # Two teeth determine their spacing to a millisecond, many to a fraction of it.
         expected = back[-1] + (back[-1] - back[0]) / (len(back) - 1)
         slack = _TOOTH_SLACK + 1.0 / (len(back) - 1)
         low, high = int(np.ceil(expected - slack)), int(np.floor(expected + slack))

@@ -1,4 +1,4 @@
-"""The target of a run over time: what a bench follows, and what a plan can know beforehand."""
+"""The target of a run over time, as a bench follows it and a plan knows it in advance."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ def target_at(
 
     Parameters
     ----------
-    chirp_end : Hz, where a chirp ends; None: at `CHIRP_SPAN` times the frequency it starts at.
+    chirp_end : Hz, end of a chirp; None: `CHIRP_SPAN` times its start frequency.
     tones : of a multisine.
     """
     return nearest_count(start.amplitude * shape_at(start, t, chirp_end=chirp_end, tones=tones))
@@ -51,7 +51,7 @@ def shape_at(
 
 
 def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:
-    """Return the integral of a frequency that grows by the same factor in every second."""
+    """Return the integral of a frequency that grows by the same factor every second."""
     span = CHIRP_SPAN if chirp_end is None else chirp_end / start.frequency
     if span == 1.0:
         return start.frequency * t

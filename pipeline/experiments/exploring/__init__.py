@@ -1,1 +1,1 @@
-"""The bench that investigates itself: record, identify, doubt, choose, again."""
+"""Exploring a bench: record, identify, look for gaps, choose the next recording, again."""

@@ -26,12 +26,12 @@ def explore_bench(
     seconds: float,
     vetoes: Callable[[Recording], bool] = lambda recording: False,
 ) -> tuple[Turn, ...]:
-    """Explore the bench at a port; return what was known turn by turn.
+    """Explore the bench at a port; return what was known in each turn.
 
     Parameters
     ----------
-    observers, buttons : see `acquire`; "skip" vetoes a recording that was chosen, before it begins
-        or while it goes on, and "stop" ends the exploration, also while it thinks.
+    observers, buttons : see `acquire`; "skip" vetoes a chosen recording, before or during it, and
+        "stop" ends the exploration, also while it computes.
     goal, seconds, vetoes : see `Exploration`.
 
     Raises

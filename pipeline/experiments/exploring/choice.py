@@ -1,4 +1,4 @@
-"""Which recording an exploration makes next, and why."""
+"""The next recording of an exploration, and its reason."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -15,11 +15,11 @@ from pipeline.gap.types import Gap
 from pipeline.results import Analysis
 
 SETTLED = ("named", "none")
-# Noises squared, times seconds: explanations that no recording sets further apart stay in dispute.
-# Read 200 times a second, of which every tenth reading is news, the criterion would differ by 20.
+# Noises squared, times seconds: explanations that no recording separates further stay in dispute.
+# At 200 readings a second, every tenth of which is independent, the criterion would differ by 20.
 _APART = 1.0
-_HARD = 0.8  # of what takes the carts as far as they may go: as good as that
-_FAR_OUT = "far"  # the aim of what shows what acts far out
+_HARD = 0.8  # of the amplitude that moves the carts as far as allowed: equivalent
+_FAR_OUT = "far"  # the aim of a recording that shows effects far out
 
 
 def choose_recording(
@@ -31,19 +31,19 @@ def choose_recording(
     refused: Sequence[Recording],
     commands: frozenset[str],
 ) -> tuple[Recording | None, str]:
-    """Return what to record next and why; None where all is known, or nothing would help.
+    """Return the next recording and its reason; None if all is known, or nothing would help.
 
-    First what tells explanations apart, then what makes the worst parameter better known, then
-    what shows what acts far out.
+    First a recording that distinguishes explanations, then one that improves the worst parameter,
+    then one that shows effects far out.
 
     Parameters
     ----------
     missing : the parameters that are not known well enough, with their relative errors.
-    refused : nothing that resembles one of these.
+    refused : nothing similar to these.
     commands : the extensions of the protocol that the bench knows.
     """
     named = gap is None or gap.verdict in SETTLED
-    # A name that leaves more than noise is one of its contenders still.
+    # A name that leaves more than noise is still one of its contenders.
     settled = gap is None or (named and not gap.contenders)
     end = "" if named else WORDS.text("undecided")
     decides = gap and gap.proposal
@@ -55,7 +55,7 @@ def choose_recording(
         return recording, WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
     if missing and named:
         worst = max(missing, key=lambda name: missing[name])
-        # What is open was refused, or is the next to be chosen: it tells nothing yet.
+        # An open recording was refused, or is chosen next: it contains no information yet.
         made = plan.model_copy(update={"recordings": ()})
         try:
             found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
@@ -63,7 +63,7 @@ def choose_recording(
             end = str(error)
         else:
             return found.recordings[0], found.said
-    # Each once: carts that something holds back go no further the second time.
+    # Each once: carts that are held back go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
     for recording, unseen in _reach_far_out(analysis, plan.limits):
@@ -78,7 +78,7 @@ def choose_recording(
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield what shows what acts far out, with what has not been seen so far: "", all has.
+    """Yield recordings that show effects far out, with the part not seen so far; "": all is seen.
 
     A step as large as the carts may rest, and a sweep that swings them to both sides.
     """

@@ -1,4 +1,4 @@
-"""What somebody wants to know of a bench, and how long they wait for it."""
+"""The goal of an exploration: which errors to reach, and how long it may take."""
 
 from dataclasses import dataclass
 
@@ -11,13 +11,13 @@ from pipeline.submission.complaints import nearest
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorGoal:
-    """How well what is to be known: every parameter whose name begins so; "": all of them."""
+    """The error to reach for every parameter whose name begins so; "": all of them."""
 
     prefix: str = ""
     error: float = 0.01
 
     def missing(self, errors: dict[str, float | None]) -> dict[str, float]:
-        """Return the parameters that are not known so well yet, with their errors.
+        """Return the parameters whose errors are still too large, with these errors.
 
         Raises
         ------
@@ -39,7 +39,7 @@ def read_error_goal(text: str) -> ErrorGoal:
 
     Raises
     ------
-    ConfigError : it is none of these.
+    ConfigError : it has none of these forms.
     """
     before, _, after = text.partition("%")
     *name, share = before.split() or [""]
@@ -57,7 +57,7 @@ def read_time(text: str) -> float:
 
     Raises
     ------
-    ConfigError : it is none of these.
+    ConfigError : it has none of these forms.
     """
     number = text.strip().rstrip("minsech ")
     unit = text.strip()[len(number) :].strip()

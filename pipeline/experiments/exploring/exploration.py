@@ -1,4 +1,4 @@
-"""Record, identify, look for the gap, choose, record: until it is known, or time is up."""
+"""Record, identify, look for the gap, choose, record, until all is known or time is up."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -38,21 +38,21 @@ from pipeline.submission.models import MOST_CARTS
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
-_FIRST = "sweep"  # of the plan that is proposed where nothing is known: it needs no hands
-_SEARCH = 300.0  # s that a look for the gap may take; most take ten
-_OFTEN = 2  # times that one recording is to tell explanations apart, before another has its turn
+_FIRST = "sweep"  # of the plan proposed when nothing is known: it needs no hands
+_SEARCH = 300.0  # s for one search for the gap; most take ten
+_OFTEN = 2  # recordings made to distinguish explanations before another kind's turn
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recorded:
-    """What came off of the recordings asked for.
+    """The result of the requested recordings.
 
     Attributes
     ----------
-    ids : of what was recorded.
-    seconds : that all tries took.
-    vetoed : somebody at the bench did not want what is not there.
-    why : else, what became of it, as far as that is known.
+    ids : of the recordings made.
+    seconds : total time of all tries.
+    vetoed : a person at the bench refused the missing ones.
+    why : otherwise, why they are missing, as far as known.
     """
 
     ids: tuple[str, ...]
@@ -65,28 +65,27 @@ class Recorded:
 class Exploration:
     """A bench that is explored into a submission, turn by turn.
 
-    The submission, gap/gap.json and the diary stand in its folder after each turn, so whatever
-    ends it leaves them as they were. A recording that somebody adds to plan.toml meanwhile comes
-    before what would be chosen.
+    The submission, gap/gap.json and the diary are in its folder after each turn, whatever ends it.
+    A recording that a person adds to plan.toml comes before the program's own choice.
 
     Attributes
     ----------
     record : carries out recordings of the plan by their ids; the first call makes submission and
-        plan where there are none.
-    goal : how well what is to be known.
-    seconds : at the bench, rests included; no recording is begun that would go beyond. One that is
-        broken off counts each time it is tried.
-    tell : takes a sentence at each turn.
-    progress : takes a few words, often, while the data are asked; what it raises ends the
+        plan if they are missing.
+    goal : the errors to reach.
+    seconds : time at the bench, rests included; no recording begins that would exceed it. An
+        interrupted one counts each time it is tried.
+    tell : called with a sentence in each turn.
+    progress : called often, with a few words, during computations; an exception it raises ends the
         exploration.
-    vetoes : whether somebody does not want what was chosen; another is chosen then.
-    turns : what was known, turn by turn.
-    made, spent : what was recorded since the last turn, and the time at the bench, s.
-    ours : ids of the plan that nobody has added; what else is open there, somebody has.
-    refused : recordings that were vetoed or did not come off.
-    asked : recordings that were to decide between explanations, and are there.
-    lost : what became of the last one chosen, where it is not there.
-    failures : how many in a row did not come off.
+    vetoes : returns whether a person refuses the chosen recording; then another is chosen.
+    turns : what was known in each turn.
+    made, spent : recordings since the last turn, and the time at the bench, s.
+    ours : ids of the plan that the program added; other open ones were added by a person.
+    refused : recordings that were vetoed or failed.
+    asked : recordings made to decide between explanations.
+    lost : why the last chosen recording is missing, if it is.
+    failures : number of failures in a row.
     """
 
     folder: Path
@@ -111,8 +110,8 @@ class Exploration:
         Raises
         ------
         DataError : the first recordings do not identify the carts.
-        ConfigError : the goal is for a parameter that such carts do not have, or the first sweep
-            alone takes longer than is allowed.
+        ConfigError : such carts do not have the goal's parameter, or the first sweep alone takes
+            too long.
         """
         self._begin()
         self._look()
@@ -121,7 +120,7 @@ class Exploration:
         return tuple(self.turns)
 
     def _begin(self) -> None:
-        """Make the first runs where nothing is recorded, if the goal can be met at all."""
+        """Make the first runs if nothing is recorded, and if the goal can be met at all."""
         submission = load_submission(self.folder) if (self.folder / NAME).exists() else None
         self._check_goal(submission and submission.system)
         known = submission is not None and bool(submission.experiments)
@@ -151,7 +150,7 @@ class Exploration:
                 self._record([step.id for step in steps])
 
     def _check_goal(self, system: System | None) -> None:
-        """Refuse a goal that no such carts can meet; None: nobody has said how many there are."""
+        """Refuse a goal that such carts cannot meet; None: their number is not known yet."""
         if system:
             names = parameter_names(system.carts, rigid=not system.bench.tied)
         else:
@@ -169,7 +168,7 @@ class Exploration:
         return self.spent + session_time(recordings) <= self.seconds
 
     def _look(self) -> None:
-        """Identify the carts and look for the gap, as the data stand now."""
+        """Identify the carts and look for the gap with the present data."""
         analysis = analyse(load_submission(self.folder), progress=self.progress)
         self.gap: Gap | None = None
         try:
@@ -180,7 +179,7 @@ class Exploration:
         self.analysis = _identify_beside(analysis, self.gap)
 
     def _propose(self, analysis: Analysis) -> None:
-        """Find what would decide between the explanations, and keep it in gap.json."""
+        """Find the recording that decides between the explanations, and keep it in gap.json."""
         if self.gap is None:
             return
         often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
@@ -191,7 +190,7 @@ class Exploration:
         write_file(place / "gap.json", json_text(self.gap))
 
     def _take_turn(self) -> Recording | None:
-        """Tell what is known; return the recording to make next, which stands in the plan."""
+        """Report what is known; return the next recording, which is in the plan."""
         self.progress("what to record next")
         gap, errors = self.gap, relative_errors(self.analysis)
         missing = self.goal.missing(errors)
@@ -203,11 +202,11 @@ class Exploration:
         said, but = "; ".join(filter(None, parts)), ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
-        elif recording and self.failures >= 3:  # in a row: it is not the choice of recording
+        elif recording and self.failures >= 3:  # in a row: the choice of recording is not the cause
             but = WORDS.text("none_came", count=self.failures)
         if but:
             said, recording = f"{said}, but {but}", None
-        wanting = bool(but or (self.failures and not recording))  # what was still wanted
+        wanting = bool(but or (self.failures and not recording))  # the last wish
         turn = Turn(
             seconds=self.spent,
             recorded=self.made,
@@ -227,7 +226,7 @@ class Exploration:
         return recording
 
     def _choose(self, missing: dict[str, float]) -> tuple[Recording | None, str]:
-        """Return the recording to make next as it stands in the plan, and why."""
+        """Return the next recording as written in the plan, and its reason."""
         plan, recording = load_plan(load_submission(self.folder)), None
         try:
             recording, why = choose_recording(
@@ -240,7 +239,7 @@ class Exploration:
             )
         except DataError as error:
             why = str(error)
-        # After all that took its time: somebody may have chosen meanwhile.
+        # The computation took time: a person may have chosen meanwhile.
         submission = load_submission(self.folder)
         done = {experiment.id for experiment in submission.experiments}
         still = [one for one in load_plan(submission).recordings if one.id not in done]
@@ -255,7 +254,7 @@ class Exploration:
         return recording, WORDS.text("therefore", name=recording.id, why=why)
 
     def _try_out(self, recording: Recording) -> None:
-        """Record what was chosen and look again, or keep in mind that it was not to be had."""
+        """Record what was chosen and look again, or remember that it failed."""
         self.ours.add(recording.id)
         if self.vetoes(recording):
             came = Recorded(ids=(), seconds=0.0, vetoed=True)
@@ -272,15 +271,15 @@ class Exploration:
         key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
         values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
         self.lost = WORDS.text(key, **values) + "; "
-        self._propose(self.analysis)  # which recording decides is open again
+        self._propose(self.analysis)  # the question which recording decides is open again
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
-    """Return the analysis with the carts as they are beside the effects that act on them.
+    """Return the analysis with the carts as identified together with their effects.
 
     Raises
     ------
-    DataError : neither with effects nor without them the carts are identified.
+    DataError : the carts are identified neither with effects nor without them.
     """
     fit, acting = analysis.fit, gap is not None and bool(gap.model.terms)
     if fit is None or not (fit.converged or acting):
@@ -294,7 +293,7 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
     if covariance is None or not model.chain.is_tied:
         return analysis
     names = tuple(gap.chain_std)
-    # What the linear chain leaves is no noise: the encoders' own is.
+    # The residual of the linear chain is not noise; the encoders' own noise is used.
     noise = {name: np.ones_like(left) for name, left in fit.standardised.items()}
     parameters = named_estimates(model.chain, names=names, covariance=covariance, source="gap")
     fit = replace(
@@ -310,5 +309,5 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
 
 
 def _shape(recording: Recording) -> str:
-    """Return what a recording is, whatever it is called."""
+    """Return the content of a recording, without its name."""
     return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()

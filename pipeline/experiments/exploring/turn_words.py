@@ -1,4 +1,4 @@
-"""A turn of an exploration in words: what is known, what is in doubt, and between what."""
+"""A turn of an exploration in words: what is known, and what is in doubt."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def tell_known(missing: dict[str, float], errors: dict[str, float | None]) -> st
 
 
 def tell_doubt(gap: Gap) -> str:
-    """Say what acts beside the linear carts, or between which explanations that is open."""
+    """Name the effects beside the linear carts, or the explanations in dispute."""
     named = abridge([effect_name(found.effect, found.where) for found in gap.effects])
     times = "a gap"
     if gap.noise_floor:
@@ -56,7 +56,7 @@ def tell_doubt(gap: Gap) -> str:
 
 
 def list_explanations(gap: Gap) -> tuple[WeighedExplanation, ...]:
-    """Return the models that may be true, the chosen first; of a named gap the one."""
+    """Return the models that may be true, the chosen one first; for a named gap, only that."""
     contenders = [(one, one.weight) for one in gap.contenders]
     if gap.verdict == "named":
         contenders = [(gap.model, 1.0)]
