@@ -218,13 +218,13 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         *((f"a grade, {p}", f"{np.median(s):.2f} s, at most {max(s):.2f} s")
           for p, s in costs["seconds"].items()),
         ("a grade, a third of each", f"{mean:.2f} s"),
-        ("the client, a hand-in", f"{1e3 * costs['client']:.0f} ms, "
+        ("the client, per submission", f"{1e3 * costs['client']:.0f} ms, "
             f"and {1e3 * costs['pack']:.0f} ms to pack it for a cluster"),
         ("cores that one client keeps busy", f"{mean / client:.0f}"),
         ("comparing n submissions", ", ".join(
             f"{s:.1f} s ({n})" for n, s in costs["compare"].items())),
-        ("… that is", f"{1e3 * a:.1f} ms each and {1e6 * b:.0f} µs a pair"),
-        ("a hand-in, packed", f"{costs['handed_in'] / 1e3:.0f} kB"),
+        ("… that is", f"{1e3 * a:.1f} ms each and {1e6 * b:.0f} µs per pair"),
+        ("a submission, packed", f"{costs['handed_in'] / 1e3:.0f} kB"),
         ("in the gradebook", f"{costs['kept'] / 1e3:.0f} kB"),
     ]  # fmt: skip
     measured = ["| what | costs |", "| --- | --- |", *(f"| {x} | {y} |" for x, y in rows)]
@@ -239,7 +239,7 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         (1_000_000, Cluster(machines=8, clients=10)),
     ]
     simulated = [
-        "| hand-ins | cores | clients | arithmetic, h | simulated, h | with faults, h "
+        "| submissions | cores | clients | arithmetic, h | simulated, h | with faults, h "
         "| core-hours paid | core-seconds done twice | clients busy |",
         "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -261,7 +261,7 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         )
 
     compared = [
-        "| compared with one another | of one core | fingerprints and grades |",
+        "| submissions compared | one core | fingerprints and grades |",
         "| --- | --- | --- |",
     ]
     for n in (100, 1_000, 10_000, 100_000, 1_000_000):
@@ -269,7 +269,7 @@ def tables(costs: dict[str, Any]) -> dict[str, str]:
         span = f"{seconds / HOUR:,.1f} h" if seconds > HOUR else f"{seconds:,.0f} s"
         compared.append(f"| {n:,} | {span} | {n * costs['kept'] / 1e9:,.2f} GB |")
     needed = [
-        "| hand-ins | core-hours | cores for a night of 8 h | clients | to store | to pay |",
+        "| submissions | core-hours | cores for a night of 8 h | clients | to store | to pay |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for n in (200, 10_000, 1_000_000):
