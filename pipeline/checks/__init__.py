@@ -1,1 +1,1 @@
-"""Consistency checks: what the data, the estimates, the carts and the loops must obey."""
+"""Consistency checks of the data, the estimates, the carts and the loops."""

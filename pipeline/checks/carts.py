@@ -1,4 +1,4 @@
-"""Checks of the fitted carts: does the fit explain the data, and is its chain a real one."""
+"""Checks of the fitted carts: does the fit explain the data, and is its chain a possible one."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -15,9 +15,9 @@ from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT
 
 _REDUNDANCY = 1e-9  # two routes to one number through unrounded values
-_BELOW_ZERO = 2.0  # standard errors that a mass, damping or spring may be below it
-# Share of its larger neighbour: no bench's masses, dampers or springs differ fifty times. Where
-# there is no spring, dry friction and loose screws feign one of up to 1 % of the next.
+_BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
+# Share of its larger neighbour: on no bench masses, dampers or springs differ fifty times. Without
+# a spring, dry friction and loose screws look like one of up to 1 % of the next.
 NEGLIGIBLE = 0.02
 
 
@@ -89,7 +89,7 @@ def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
 
 
 def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
-    """Return the masses, dampings and springs that are said to be there, by name."""
+    """Return the masses, dampings and springs that are declared, by name."""
     values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
     values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
     springs = enumerate(zip(chain.k, bench.stiff, strict=True), start=1)
@@ -97,10 +97,9 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 
 
 def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
-    """Fail for each mass, damping or spring that may as well not be there.
+    """Fail for each mass, damping or spring that may not exist.
 
-    It is zero within its error, or negligible beside the larger of its neighbours of the same
-    sort.
+    It is zero within its error, or negligible beside its larger neighbour of the same kind.
     """
     if not fit.converged:
         return []
@@ -134,7 +133,7 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
 
 
 def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
-    """Return the larger of the neighbours of the same sort that are positive, or ""."""
+    """Return the larger of the positive neighbours of the same kind, or ""."""
     read = read_name(name)
     assert read.cart is not None
     beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]
@@ -194,7 +193,7 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
     """The further from the motor, the smaller the static displacement."""
     names = [gain_name(cart, n=chain.n) for cart in range(1, chain.n + 1)]
     gains = [values[name] for name in names]
-    # Equal gains are right where no spring holds the far end: rounding then decides the sign.
+    # Without a spring at the far end equal gains are right, and rounding decides the sign.
     rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
     good = rise <= _REDUNDANCY and min(gains) >= 0
     return Check(
@@ -208,11 +207,11 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
 
 
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
-    """Resonances, nulls and the carts alone interlace, but for heavy damping."""
+    """Resonances, nulls and the carts alone interlace, except with heavy damping."""
     damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
     checks = []
     for low, middle, high, _ in brackets(n):
-        # How far outside the bracket, in percent of the value.
+        # Distance outside the bracket, in percent of the value.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
         good = excess <= _REDUNDANCY
         reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""

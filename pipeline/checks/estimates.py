@@ -1,4 +1,7 @@
-"""Checks of single estimates: two ways to one number; decays and steps against their models."""
+"""Checks of single estimates:
+
+two estimates of one number; decays and steps against their models.
+"""
 
 from collections.abc import Sequence
 
@@ -18,7 +21,7 @@ from pipeline.words.numbers import abridge
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
-    """Judge every parameter that was measured in two ways; a wide error is no agreement."""
+    """Judge every parameter that was measured in two ways; a wide error means no agreement."""
     verdicts: dict[bool | None, tuple[CheckOutcome, str]] = {
         True: ("pass", "agree"),
         False: ("fail", "disagree"),
@@ -48,7 +51,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
 
 
 def _advice(row: ParameterRow) -> str:
-    """Return what to look at, of what the two estimates rest on."""
+    """Return which recordings to look at, of those behind the two estimates."""
     name, before, after = read_name(row.name), row.initial, row.final
     assert before is not None
     assert after is not None
@@ -85,7 +88,7 @@ def _advice(row: ParameterRow) -> str:
 def check_decays(
     decays: Sequence[LogDecrement], *, records: Sequence[Record] = (), bench: Bench
 ) -> list[Check]:
-    """Ask of every decay whether viscous damping alone explains it."""
+    """Check for every decay whether viscous damping alone explains it."""
     checks, kinds = [], {record.id: record.kind for record in records}
     for decay in decays:
         if (test := decay.friction) is None:
@@ -119,11 +122,10 @@ def check_decays(
 def check_steps(
     steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Bench
 ) -> list[Check]:
-    """Ask whether every step has one gain: a cart that sticks has at least an interval of them.
+    """Check whether every step has one gain; for a cart that sticks there is at least an interval.
 
-    A step that shows one gain may still be held off by friction: it stops short alike on the way
-    out and back. So it passes only where several edges agree and nothing shows dry friction on
-    that cart.
+    A step with one gain may still be held off by friction, if it stops short equally on the way out
+    and back. So it passes only if several edges agree and nothing shows dry friction on that cart.
     """
     rubs: dict[int, list[str]] = {}
     for decay in decays:
@@ -143,7 +145,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         width = high - low
         outcome, found = (
             "fail",
-            (  # the rest points show the least that friction can hold
+            (  # the rest points show the least friction that can hold
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
                 f"{bench.units.gain}, and it may be farther off."
             ),

@@ -1,4 +1,4 @@
-"""Checks of loops: the designed one held against python-control, those that ran against the log."""
+"""Checks of loops: the designed one against python-control, those that ran against the log."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -15,13 +15,13 @@ from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 if TYPE_CHECKING:
     import control
 
-# Of the coefficients of a loop's polynomial, which are of the size of their binomials. Rounding
-# leaves 1e-13 of them on plants that a bench can be; the other programs' gains up to 1e-8.
+# Of the coefficients of a loop's polynomial, relative to their binomials. Rounding leaves 1e-13 of
+# them on realistic plants; the other programs' gains up to 1e-8.
 _SAME_LOOP = 1e-6
 
 
 def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
-    """Return the margins of the designed loop, the observer and the delay in it.
+    """Return the margins of the designed loop, including its observer and delay.
 
     Raises
     ------
@@ -37,11 +37,11 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
 
 
 def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
-    """Ask whether c2d with dlqr or place of python-control gives the same loop.
+    """Check that c2d with dlqr or place of python-control gives the same loop.
 
     Its value is the largest difference of a coefficient of the loop's polynomial, poles in z, from
-    the poles asked for, or with LQR from the loop of the other program; or the error of the static
-    gain from the reference, whichever is larger.
+    the desired poles, or with LQR from the loop of the other program; or the relative error of the
+    static gain, whichever is larger.
     """
     names = f"python-control's c2d and {'place' if design.Q is None else 'dlqr'}"
     try:
@@ -59,7 +59,7 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
 
 
 def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
-    """Return a failed check for each run of which the log or the stated controller is wrong."""
+    """Return a failed check for each run with a wrong log or a wrong stated controller."""
     notes: dict[str, list[str]] = {}
     for check in hardware:
         if check.contradicted:
@@ -82,7 +82,7 @@ def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
 
 
 def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, Array, float]:
-    """Return the polynomials of our loop, of theirs and of the one wanted, and our static gain."""
+    """Return the polynomials of our loop, of theirs and of the desired one, and our static gain."""
     import control
 
     sampled = control.sample_system(chain.to_control(), design.sample_time)
@@ -95,7 +95,7 @@ def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, Array, f
     z = np.exp(design.sample_time * design.requested_poles)
     try:
         gains = control.place(sampled.A, sampled.B, z)
-    except ValueError:  # poles asked for twice
+    except ValueError:  # a pole requested twice
         gains = control.place_acker(sampled.A, sampled.B, z)
     return ours, _polynomial(sampled, gains), _from_roots(z), level
 

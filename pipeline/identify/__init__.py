@@ -1,1 +1,1 @@
-"""From records to carts: which records hold what happened, and the carts that these show."""
+"""From records to carts: which records hold what happened, and the carts identified from them."""

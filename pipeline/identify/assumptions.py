@@ -1,4 +1,7 @@
-"""What all numbers rest on: springs, units, scales, sign, held carts; each with its support."""
+"""The assumptions behind all numbers:
+
+springs, units, scales, sign, held carts, with their support.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -19,7 +22,7 @@ Support = Literal["supported", "contradicted", "open"]
 def list_assumptions(
     submission: Submission, *, data: Ingested, fit: ChainFit | None, checks: Sequence[Check]
 ) -> tuple[Assumption, ...]:
-    """Return what was stated or taken of the bench, in the order of `submission.toml`."""
+    """Return the statements and assumptions about the bench, in the order of `submission.toml`."""
     system, failed = submission.system, [c for c in checks if c.outcome == "fail"]
     return (
         *_springs(system, fit=fit, failed=failed),
@@ -35,7 +38,7 @@ def _springs(
 ) -> Iterator[Assumption]:
     n, names = system.carts, spring_names(system.carts)
     springs = [any(system.springs)] if n == 1 else system.springs
-    abouts = [" and ".join(names)] if n == 1 else names  # of one cart the sum is known
+    abouts = [" and ".join(names)] if n == 1 else names  # for one cart the sum is known
     values = physical_values(fit.chain, bench=system.bench) if fit else {}
     vanishing = {check.parameter for check in failed if check.kind == "vanishing"}
     unit = system.bench.units.stiffness
@@ -101,7 +104,7 @@ def _units(
 
 
 def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assumption]:
-    """Yield what a count is, where any recording holds counts that were converted."""
+    """Yield the size of a count, if any recording holds counts that were converted."""
     system = submission.system
     own = {e.id: e.input.per_count for e in submission.experiments if e.input}
     for role, stated, scales in (
@@ -152,7 +155,7 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
 def _free_carts(
     records: Sequence[Record], *, n: int, failed: Sequence[Check]
 ) -> Iterator[Assumption]:
-    """Yield which carts were free, for all recordings of which the same is said."""
+    """Yield the free carts, once for all recordings with the same ones."""
     if n == 1:
         return
     wrong = {check.run for check in failed if check.kind == "setup"}

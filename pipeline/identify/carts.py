@@ -1,4 +1,4 @@
-"""Every number that records give of the carts, and the fit of them all."""
+"""All estimates of the carts from records, and the joint fit."""
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ _WORDS = phrases("skipped")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identified:
-    """What the stages make of some records, up to the fit."""
+    """The results of the stages from some records, up to the fit."""
 
     decays: Sequence[LogDecrement]
     gains: Sequence[StepGain]
@@ -73,9 +73,9 @@ def identify(
     progress: Progress,
     measured: dict[str, Any],
 ) -> Identified:
-    """Take the records, but for those without, through the stages up to the fit.
+    """Take the records, except for those left out, through the stages up to the fit.
 
-    `measured` keeps what single records tell, for the next call with other records left out.
+    `measured` caches the results of single records, for the next call with other records left out.
     """
     log = Log(measured=measured)
     used = [record for record in data.records if record.id not in without]
@@ -91,7 +91,7 @@ def identify(
     gains = _step_gains(runs, bench=bench, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(used, log=log)
-    # What a check says of a decay or a step in full is not said twice.
+    # A note that a check of a decay or step gives in full is not repeated.
     notes = [
         *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
         *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
@@ -122,7 +122,10 @@ def identify(
 
 
 def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
-    """Return the initial and final estimates side by side; what the fit leaves open is skipped."""
+    """Return the initial and final estimates side by side;
+
+    those that the fit leaves open are skipped.
+    """
     fit, final = found.fit, found.fit.parameters if found.fit else {}
     if fit and not final:
         found.log.skip(Stage.NAMED_PARAMETERS, _WORDS.text("untied"))
@@ -146,8 +149,8 @@ def _counted(carts: Sequence[int]) -> str:
 def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
     """Return the steps and sweeps of all carts together.
 
-    Runs of single carts are left to the initial estimates, so that initial and final estimates
-    come from different data and comparing them is a check.
+    Runs of single carts are left to the initial estimates, so that initial and final estimates use
+    different data and their comparison is a check.
     """
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
     runs = [r for r in runs if len(r.free) == n]
@@ -164,7 +167,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
 def _log_decrements(
     runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
-    """Each cart alone: its decays, or the ring-down of its steps where there is no decay."""
+    """For each cart alone: its decays, or the ring-down of its steps if there is no decay."""
     decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):
@@ -192,7 +195,7 @@ def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement
 
     Raises
     ------
-    DataError : none of them does.
+    DataError : there is none.
     """
     if not pieces:
         raise DataError("a force that was not measured acts on a cart throughout")
@@ -217,7 +220,7 @@ def _sticks(decay: LogDecrement) -> bool:
 def _skip_without(
     log: Log, stage: Stage, what: str, *, out: Sequence[Record], cart: int | None = None
 ) -> None:
-    """Note that there is none of some records, or that all of them are left out."""
+    """Note that some kind of record is missing, or that all of its records are left out."""
     if out:
         reason = _WORDS.text("all_left_out", what=what, runs=abridge([r.id for r in out]))
         log.skip(stage, reason, cart=cart)
@@ -262,7 +265,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
 def _frequency_response(
     data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, log: Log
 ) -> Sequence[FrequencyResponse]:
-    """From dwells; else from the students' own table; else from steps and sweeps."""
+    """From dwells, else from the students' own table, else from steps and sweeps."""
     if sines:
         return collect_dwells(sines)
     if data.tables:

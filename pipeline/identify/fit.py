@@ -1,4 +1,4 @@
-"""The fit of all carts: to the dwells, or to steps and sweeps where the dwells contradict them."""
+"""The fit of all carts: to the dwells, or to steps and sweeps if the dwells contradict them."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
@@ -27,10 +27,10 @@ class Fitted:
 
     Attributes
     ----------
-    fits : how all records follow it, also those that it is made without.
-    by_dwells : whether it rests on dwells, and they follow it.
-    conflict : by id, the records that contradict one another so that nothing tells which are
-        right, each with the reason: there is no fit then.
+    fits : how all records follow it, including those that it does not use.
+    by_dwells : whether it uses dwells, and they follow it.
+    conflict : by id, the records that contradict each other so that nobody can tell which are
+        right, with the reason; then there is no fit.
     """
 
     fit: ChainFit | None = None
@@ -41,12 +41,12 @@ class Fitted:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Runs:
-    """The records of a submission, as one round of identification takes them.
+    """The records of a submission, as used in one round of identification.
 
     Attributes
     ----------
-    used : to identify the carts; `left_out` are not, but they are held against the fit.
-    driven : of those used, the steps and sweeps of all carts together.
+    used : for identifying the carts; `left_out` records are only compared with the fit.
+    driven : the steps and sweeps of all carts together, among those used.
     """
 
     used: Sequence[Record]
@@ -62,7 +62,7 @@ def fit_carts(
     bench: Bench,
     log: Log,
 ) -> Fitted:
-    """Return the Bode fit where the records follow it, else the joint fit in time."""
+    """Return the Bode fit if the records follow it, else the joint fit in time."""
     if not _is_seen(bench.n, runs.used, responses):
         log.skip(Stage.FINAL_ESTIMATES, _WORDS.text("unseen_cart", cart=bench.n))
         return Fitted()
@@ -92,7 +92,7 @@ def fit_carts(
             return Fitted(conflict=conflict)
     if contrary and _votes(mine) != _votes(theirs):
         better = _votes(mine) < _votes(theirs)
-    else:  # one that dwells follow gives way only to one that they follow more closely yet
+    else:  # a fit that dwells follow is replaced only by one that they follow more closely
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
@@ -103,7 +103,7 @@ def fit_carts(
 
 
 def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
-    """Whether a cart moves in any recording: a last one that does not may not be there."""
+    """Whether a cart moves in any recording; if the last one does not, it may not exist."""
     return cart in {response.cart for response in responses} or any(
         cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
     )
@@ -131,8 +131,8 @@ def _fit_points(
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
     """Whether the points are not explained, and most motions are few encoder steps.
 
-    Rounding then hides the rest of a transient: beside a sharp resonance a dwell's amplitude is
-    off by several of its errors.
+    Rounding then hides the rest of a transient: near a sharp resonance a dwell's amplitude is off
+    by several of its errors.
     """
     assert fitted.fit is not None
     motions = [(r.position(cart), r.encoder_step(cart)) for r in dwells for cart in r.carts]
@@ -151,13 +151,13 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
 
 
 def _held(fit: ChainFit | None, runs: Runs) -> Fitted | None:
-    """Return a fit with how all records follow it."""
+    """Return a fit with a measure of how all records follow it."""
     records = [*runs.used, *runs.left_out]
     return Fitted(fit=fit, fits=follow(records, fit.chain)) if fit else None
 
 
 def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
-    """Return the kinds of which most records follow."""
+    """Return the kinds with most records following."""
     return {
         kind
         for kind, ids in _by_kind(records, fitted).items()
@@ -166,12 +166,15 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
 
 
 def _votes(kinds: Set[str]) -> int:
-    """Return how many ways of recording follow: steps and sweeps are logged in one way."""
+    """Return the number of ways of recording that follow:
+
+    steps and sweeps are logged in one way.
+    """
     return len({"step" if kind == "sweep" else kind for kind in kinds})
 
 
 def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
-    """Return the kinds of which most records follow no carts like the fitted ones."""
+    """Return the kinds with most records following no carts like the fitted ones."""
     assert fitted.fit is not None
     chain, by_id = fitted.fit.chain, {record.id: record for record in records}
 
@@ -198,9 +201,9 @@ def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
 def _conflict(
     records: Sequence[Record], fitted: Fitted, *, mine: Set[str], theirs: Set[str]
 ) -> dict[str, RecordingFault]:
-    """Return why kinds that follow a chain and those that follow another may not be used.
+    """Return why kinds that follow different chains may not be used.
 
-    None are where no known mistake leads from the one to the other: the carts may be such.
+    There is no conflict if no known mistake relates the two: the carts may be that way.
     """
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
@@ -221,7 +224,7 @@ def _conflict(
 
 
 def _decay_dampings(initial: Mapping[str, Estimate], *, n: int) -> dict[int, Estimate]:
-    """Return by cart the damping ratio it has alone, as far as decays tell."""
+    """Return by cart its damping ratio alone, if decays give it."""
     own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
     return {
         cart: zeta

@@ -1,4 +1,4 @@
-"""What could not run, and what a reader must know."""
+"""Stages that could not run, and warnings."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -12,14 +12,14 @@ T = TypeVar("T")
 
 @dataclass
 class Log:
-    """What could not run and what a reader must know, collected along the way."""
+    """Skipped stages and warnings, collected along the way."""
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     measured: dict[Any, Any] = field(default_factory=dict)  # by stage, run and cart
 
     def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
-        """Run one stage, `of` a recording if of one; data that do not support it are a reason."""
+        """Run one stage, perhaps for one recording `of`; unsuitable data are noted as a reason."""
         try:
             return run()
         except DataError as error:
@@ -27,7 +27,7 @@ class Log:
             return None
 
     def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
-        """Run a stage of one record, which tells the same whatever others are left out."""
+        """Run a stage of one record, whose result does not depend on which others are left out."""
         key = stage, of, cart
         if key not in self.measured:
             try:
@@ -49,16 +49,16 @@ class Log:
         cart: int | None = None,
         missing: str = "",
     ) -> None:
-        """Note why a stage did not run, and what would let it."""
+        """Note why a stage did not run, and what it would need."""
         self.skipped.append(
             Skipped(stage=stage, run=run, cart=cart, reason=reason, missing=missing)
         )
 
     def warn(self, texts: Iterable[str]) -> None:
-        """Add what is not said yet."""
+        """Add a warning, unless it is there already."""
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
     def add(self, other: "Log") -> None:
-        """Add what another log holds."""
+        """Add the content of another log."""
         self.skipped += other.skipped
         self.warn(other.warnings)

@@ -1,4 +1,4 @@
-"""What a reader must know of the records as such, beside what the checks say."""
+"""Warnings about the records as such, beside those of the checks."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -15,14 +15,14 @@ from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
 # m/s: the carts of a bench reach 0.4, those of inverted pendulums 3; centimetres read as metres
-# make 15 to 40.
+# give 15 to 40.
 _FASTEST = 10.0
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
-    """Return what reading mended, which decays are in another unit, and a `unit` of none of them.
+    """Return the notes of reading, decays in another unit, and a `unit` that fits no record.
 
-    That of the decays does no harm.
+    The unit of decays does no harm.
     """
     units = find_other_units(data.records, decays=True)
     return [
@@ -37,7 +37,7 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
 
 
 def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
-    """Return in which records a hand acts on a cart, and when; but not that a decay is let go."""
+    """Return in which records a hand acts on a cart, and when, except for releases of decays."""
     return by_note(
         (
             one.experiment,
@@ -54,7 +54,7 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
 
 
 def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
-    """Return that the carts run faster than any, in two kinds of experiments: one may be a slip."""
+    """Return that the carts are impossibly fast in two kinds of experiments; one may be a slip."""
     metres = conversion(unit, "m")
     fastest: dict[str, tuple[float, str]] = {}
     for record in records if metres else ():
@@ -67,23 +67,23 @@ def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
 
 
 def _speed(record: Record) -> float:
-    """Return how fast the fastest cart runs, position units/s, but for what jumps for a moment."""
+    """Return the speed of the fastest cart, position units/s, without momentary jumps."""
     span = max(1, ceil(0.02 / record.sample_time))
     moved, took = record.y[:, span:] - record.y[:, :-span], record.t[span:] - record.t[:-span]
     if not took.size:
         return 0.0
-    # An encoder's jump is no speed: over 20 ms, by the fastest hundredth left out.
+    # An encoder's jump is not a speed: over 20 ms, without the fastest hundredth.
     return float(np.quantile(np.abs(moved) / took, 0.99, axis=1).max())
 
 
 def is_reversed(records: Sequence[Record]) -> bool:
-    """Whether a positive input, as the bench counts it, drives cart 1 towards negative x."""
+    """Whether a positive input, in the bench's counting, drives cart 1 towards negative x."""
     signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
     return sum(1 if sign > 0 else -1 for sign in signs) < 0
 
 
 def turn_of_the_gains(records: Sequence[Record]) -> list[str]:
-    """Return that the bench's input counts against the designed gains, where it does."""
+    """Return a warning if the bench's input has the opposite sign of the designed gains."""
     if not is_reversed(records):
         return []
     return [_WORDS.text("reversed")]

@@ -1,8 +1,8 @@
-"""Which springs a new submission has, as far as its steps tell; what they do not is marked.
+"""The springs of a new submission, as far as its steps show them; unsure ones are marked.
 
-Behind cart 1 the static force of the motor goes through every spring alike, so the static gains
-show their stiffnesses in ratios: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far
-wall all carts move alike, and then a spring wall-1 holds them, if anything does.
+Beyond cart 1 the motor's static force goes through every spring equally. So the static gains give
+ratios of stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall all carts
+move equally, and then a spring wall-1 holds them, if anything does.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ from pipeline.submission.load import NAME, spring_names
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """What `fill` found: by file, and in the set-up what a person has to say."""
+    """The results of `fill`: by file, and for the set-up the open questions."""
 
     files: tuple[Found, ...]
     doubts: tuple[str, ...]
@@ -40,7 +40,7 @@ class Filled:
 
 @dataclass(frozen=True, kw_only=True)
 class Springs:
-    """Which springs there are, why, and which of them nothing tells (numbers from 1)."""
+    """The springs present, the reason, and the unsure ones (numbers from 1)."""
 
     present: tuple[bool, ...]
     why: str
@@ -70,11 +70,11 @@ def fill(folder: Path) -> Filled:
 
 
 def find_springs(submission: Submission) -> Springs:
-    """Return the springs of a submission by its steps, as far as these can be read."""
+    """Return the springs of a submission by its steps, if these can be read."""
     steps = tuple(one for one in submission.experiments if one.kind == "step")
     try:
         records = read_data(submission.model_copy(update={"experiments": steps})).records
-    except SubmissionError:  # there is none, or none that can be read
+    except SubmissionError:  # there is none, or none can be read
         records = ()
     return decide_springs(records, n=submission.system.carts)
 
@@ -91,9 +91,9 @@ def _state_springs(submission: Submission) -> None:
 
 
 def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
-    """Return the springs that n carts have by their steps; those between carts are taken as there.
+    """Return the springs of n carts by their steps; those between carts are assumed.
 
-    Only steps in which all carts are free and measured tell.
+    Only steps with all carts free and measured are used.
     """
     every = (True,) * (n + 1)
     steps = [r for r in records if r.kind == "step" and len(r.free) == len(r.carts) == n]
@@ -111,7 +111,7 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
     low, high = np.median(ratios, axis=0)
     if low > NEGLIGIBLE:
         return Springs(present=every, why="static gains cannot tell", open=(1,))
-    # A bench's weakest spring is a tenth and more of the one before it.
+    # A bench's weakest spring is at least a tenth of the one before it.
     if high < 0.1:
         why = "static gains are equal, so none at the far wall"
         return Springs(present=(*every[:-1], False), why=why, open=())
@@ -128,7 +128,7 @@ def _stays_away(step: Record) -> bool:
 
 
 def _gains(step: Record) -> list[StepGain]:
-    """Return the static gains of all carts, [] where one does not settle."""
+    """Return the static gains of all carts, [] if one does not settle."""
     try:
         return [fit_step_gain(step, cart=cart) for cart in sorted(step.carts)]
     except DataError:
@@ -142,7 +142,7 @@ def _ratio(before: StepGain, last: StepGain) -> tuple[float, float]:
 
 
 def _bounds(gain: StepGain) -> tuple[float, float]:
-    """Return the least and the largest static gain, in size, that a step allows."""
+    """Return the smallest and the largest static gain, in size, that a step allows."""
     slack = SIGMA_LIMIT * gain.gain_std
     ends = gain.interval or (gain.gain - slack, gain.gain + slack)
     low, high = sorted(abs(end) for end in ends)

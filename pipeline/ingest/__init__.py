@@ -1,1 +1,1 @@
-"""From every known file form to `Record`: units, signs and clocks are settled here."""
+"""From every known file form to `Record`, with units, signs and clocks settled."""

@@ -54,7 +54,7 @@ def _ratios(table: FileTable, column: Column) -> Array:
 
 
 def _measured(values: Array, table: FileTable, column: Column) -> Array:
-    """Return positive values that a bench measures, each of them."""
+    """Return the values, all of them positive and within those of a bench."""
     for extreme in (values.min(), values.max()):
         refuse_extreme(extreme, what=f"{table.source}: {column.name!r}")
     return values
@@ -74,7 +74,7 @@ def _positive(table: FileTable, column: Column) -> Array:
 def frequency_responses(
     points: Points, *, experiments: Sequence[str] = ()
 ) -> tuple[tuple[FrequencyResponse, ...], str]:
-    """Return one response a cart, repeats averaged, and where its standard errors come from.
+    """Return one response for each cart, repeats averaged, and the source of its standard errors.
 
     Rows at one frequency are repeats: their pooled relative spread is the standard error of all
     points. Without enough of them it is 1 %.
@@ -89,7 +89,7 @@ def frequency_responses(
         squares += float(((logs - means[which]) ** 2).sum())
         freedom += logs.size - omega.size
         averaged[cart] = (omega, np.exp(means), repeats)
-    # Degrees of freedom of repeats that show the true spread.
+    # Degrees of freedom from which repeats show the true spread.
     spread = np.sqrt(squares / freedom) if freedom >= 3 and squares > 0 else None
     relative = _RATIO_SPREAD if spread is None else float(spread)
     source = (

@@ -1,4 +1,4 @@
-"""What channels themselves tell: an encoder's step, a mirror, a stuck encoder, a clipped input."""
+"""Properties of single channels: an encoder's step, a mirror, a stuck encoder, a clipped input."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over
 
 
 def encoder_step(x: Array) -> float:
-    """Return the step all values are multiples of, 0 where none is seen.
+    """Return the step of which all values are multiples, 0 if there is none.
 
     The smallest distances between levels are one step; the step is refined by a line through all
     levels, which must lie on it.
@@ -34,10 +34,10 @@ def encoder_step(x: Array) -> float:
 
 
 def mirrors(reference: Array, x1: Array) -> bool:
-    """Tell a commanded position that only repeats encoder 1, as an ECP logs it in open loop.
+    """Return whether a commanded position only repeats encoder 1, as an ECP logs it in open loop.
 
-    Both in counts. The copy is read a little later than the sample before and a little earlier
-    than the sample itself, so it lies between the two; a true reference leads or waits.
+    Both in counts. The copy is read a little later than the sample before and a little earlier than
+    the sample itself, so it lies between the two; a true reference leads or lags.
     """
     moving = np.flatnonzero(np.diff(x1)) + 1
     if moving.size < 3 or np.ptp(reference) == 0.0:
@@ -52,11 +52,11 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
     """Return (first, last) sample of every stretch in which a moving encoder stood still.
 
     The reading freezes at speed and, if it comes back, comes back with a jump; a cart that stops
-    slows down first. A coarse encoder shows no speed: there the jump alone tells, where it is far
-    beyond any other move.
+    slows down first. A coarse encoder does not show speed: there only the jump counts, if it is far
+    larger than any other move.
     """
     moves = np.abs(np.diff(x))
-    # At rest that long at a turning point a cart moves less than one step.
+    # At rest for this long at a turning point a cart moves less than one step.
     still = [run for run in _runs(moves == 0.0, least=10) if run[0] > 0]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
@@ -87,17 +87,18 @@ def _runs(still: np.ndarray, *, least: int) -> list[list[int]]:
 def saturation(u: Array) -> float | None:
     """Return the limit at which a varied input was clipped, or None.
 
-    A clipped input enters its extreme with a jump, holds it and leaves with a jump, and takes it
-    far more often than the next value; the crest of a sine, even if rounded to a few digits, and
-    a controller that creeps up to its last value do not.
+    A clipped input enters its extreme with a jump, holds it, leaves with a jump, and takes it far
+    more often than the next value. The crest of a sine, even if rounded to a few digits, does not,
+    nor does a controller that creeps up to its last value.
     """
     levels, counts = np.unique(u, return_counts=True)
-    # A stepped input, of few levels, is at its extremes by design.
+    # A stepped input with few levels is at its extremes by design.
     if levels.size <= 20:
         return None
     for top, following in ((-1, -2), (0, 1)):
         limit, gap = levels[top], abs(levels[top] - levels[following])
-        # So many times as often as the next level; the rounded crest of a sine takes it 1.4 times.
+        # This many times as often as the next level; the rounded crest of a sine takes it 1.4
+        # times.
         if limit == 0.0 or counts[top] < 5 * counts[following]:
             continue
         at_limit = u == limit
@@ -105,20 +106,20 @@ def saturation(u: Array) -> float | None:
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
             m = last - first + 1
-            # m samples of a crest, a parabola, lie within one level where it falls by so many to
-            # the next; rounding adds one.
+            # m samples of a crest, a parabola, are within one level if it falls by this many to the
+            # next; rounding adds one.
             if min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
                 return abs(float(limit))
     return None
 
 
 def never_changes(name: str) -> str:
-    """Return in words that a position stands still, while another or the input does not."""
+    """Return a sentence if a position stands still while another or the input changes."""
     return f"{name!r} never changes: a held cart, or an encoder that is stuck"
 
 
 def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
-    """Return in words what is wrong with the input and the positions (heading to values)."""
+    """Return the faults of the input and the positions (heading to values), in words."""
     problems = []
     moving = any(np.ptp(x) > 0 for x in positions.values())
     for name, x in positions.items():

@@ -1,7 +1,7 @@
-"""Sample times: checked, and straightened where the file had rounded them.
+"""Sample times: checked, and straightened if the file had rounded them.
 
-Near 1 kHz the stamps of a millisecond clock hardly tell its period: a short record looks perfectly
-even. The records of a session were made by one clock, so together they do.
+Near 1 kHz the stamps of a millisecond clock hardly show its period: a short record looks perfectly
+even. The records of a session share one clock, so together they do.
 """
 
 from collections.abc import Sequence
@@ -15,14 +15,14 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import FileTable
 
-SLOW = 0.5  # s between samples; no bench records slower
-FEWEST_SAMPLES = 8  # any estimate needs some
+SLOW = 0.5  # s between samples; no bench records more slowly
+FEWEST_SAMPLES = 8  # the least for any estimate
 _GAP = 4.0  # usual intervals without a sample: time is missing
-_ROUNDING_BAND = 0.65  # of the rounding step: half of it, and what the fit of a short piece errs
-# Rounding steps all stamps lie within; one where nothing but the rounding moves them, more where
-# the clock's ticks are late at times.
+_ROUNDING_BAND = 0.65  # of the rounding step: half of it, plus the error of a short piece's fit
+# Rounding steps around a line: one if stamps are only rounded, more if some of the clock's ticks
+# are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
-_HAIR = 1e-6  # of a rounding step: what doubles err
+_HAIR = 1e-6  # of a rounding step: the error of doubles
 _NO_ROOM = 10 * _HAIR  # a strip this sure of its slope is held by stamps that flicker, not by time
 
 
@@ -32,10 +32,10 @@ class Clock:
 
     Attributes
     ----------
-    t : (n,) s; straightened where `pieces` is not 0.
-    rounding : s; the decimal step all stamps are multiples of, 0 where there is none.
-    pieces : how many straight lines replaced the rounded stamps; 0: the stamps as they are.
-    period : s; the interval of those lines where they have one, which is the session's; or None.
+    t : (n,) s; straightened unless `pieces` is 0.
+    rounding : s; the decimal step of which all stamps are multiples, 0 without one.
+    pieces : number of straight lines that replaced the rounded stamps; 0: the stamps are unchanged.
+    period : s; the interval of those lines if they share one, which is the session's; or None.
     stopped : sample (from 0) where time does not advance, or None.
     gaps : samples (from 0) before which time is missing.
     """
@@ -66,7 +66,7 @@ class Clock:
 
 
 def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float | None) -> Array:
-    """Return the sample times (n,) in s as they stand in the file, or from the stated rate.
+    """Return the sample times (n,) in s as written in the file, or from the stated rate.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 def clock_notes(
     table: FileTable, column: Column, clock: Clock, *, sample_rate: float | None
 ) -> list[str]:
-    """Return what is to be said of the clock behind a time column.
+    """Return notes on the clock behind a time column.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def clock_notes(
         notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
     if len(clock.gaps) > 3:
         notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
-    # Of a stated rate that the time column contradicts.
+    # Relative difference of a stated rate that the time column contradicts.
     if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > 0.01:
         notes.append(
             f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
@@ -141,10 +141,10 @@ def read_clock(stamps: Array) -> Clock:
 def read_clocks(session: Sequence[Array]) -> list[Clock]:
     """Check the time stamps of every record of a session and undo their rounding.
 
-    Stamps rounded to a step that matters against the sample interval are replaced by straight
-    lines (one where the clock is even; more where it drifts or missed a beat) that stay within
-    the rounding, all with one period where one explains them. A clock that no such lines explain
-    is uneven in truth: its stamps are kept.
+    Stamps rounded to a step that matters against the sample interval are replaced by straight lines
+    that stay within the rounding: one if the clock is even; more if it drifts or missed a beat. All
+    lines have one period if one explains them. A clock that no such lines explain is truly uneven,
+    and its stamps are kept.
     """
     rounded = [_rounded(stamps) for stamps in session]
     clocks: list[Clock] = []
@@ -172,12 +172,12 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
 
 
 def decimal_step(values: Array) -> float:
-    """Return the largest power of ten (1 s at most) that all values are multiples of, or 0."""
+    """Return the largest power of ten (1 s at most) of which all values are multiples, or 0."""
     # A file that prints time beyond the nanosecond has not rounded it.
     for digits in range(10):
         step = 10.0**-digits
         multiples = values / step
-        # A double near 1e5 s in steps of 1e-9 s is itself only good to a hundredth of the step.
+        # A double near 1e5 s in steps of 1e-9 s is itself accurate only to a hundredth of the step.
         rounding = 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(multiples).max()
         # Of a step; a value farther off is no multiple.
         if np.abs(multiples - np.round(multiples)).max() < min(rounding, 0.02):
@@ -192,8 +192,8 @@ def decimal_step(values: Array) -> float:
 class _Rounded:
     """The stamps of a record, and the stretches (start, end) that a straight line explains.
 
-    `even`: the stamps lie on a line as they are, so there is nothing to straighten unless other
-    records know the period better.
+    `even`: the stamps are on a line already, so nothing is straightened unless other records
+    determine the period better.
     """
 
     stamps: Array
@@ -202,7 +202,7 @@ class _Rounded:
     even: bool
 
     def straight(self, period: float | None) -> tuple[Array, int]:
-        """Return the times and the number of lines, their slope `period` or each its own."""
+        """Return the times and the number of lines, with slope `period` or one for each."""
         if self.even and period is None:
             return self.stamps, 0
         t = self.stamps.copy()
@@ -213,7 +213,7 @@ class _Rounded:
     def slopes(self, band: float) -> tuple[float, float]:
         """Return the least and the greatest period all stretches allow; least > greatest: none.
 
-        With its usual stamps all within `band` rounding steps of one line.
+        The usual stamps must be within `band` rounding steps of one line.
         """
         least, greatest = 0.0, np.inf
         for start, end in self.stretches:
@@ -240,7 +240,7 @@ def _rounded(stamps: Array) -> _Rounded:
 
 
 def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
-    """Return the stretches of the record that straight lines explain; none if it is not most."""
+    """Return the stretches that straight lines explain; none if they are not most of the record."""
     found = []
     waiting = [(0, stamps.size)]
     while waiting:
@@ -257,13 +257,16 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
-    """Return which stamps (n,) lie within the rounding of one line: all but a few late, or none."""
+    """Return which stamps (n,) are within the rounding of one line:
+
+    all but a few late ones, or none.
+    """
     off = np.abs(_line(stamps) - stamps) / rounding
     near = off <= _ROUNDING_BAND
     # A rare stamp may be a step off: a late tick, a beat.
     if off.max() <= 1.5 and near.mean() >= 0.99:
         return near
-    # A least-squares line leans where few stamps jump; a strip of the rounding's width does not.
+    # A least-squares line tilts where few stamps jump; a strip of the rounding's width does not.
     every = np.ones(stamps.size, dtype=np.bool_)
     low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
     # Of the rounding step off the line: more is a stamp that did not advance.
@@ -282,9 +285,9 @@ def _line(stamps: Array, *, slope: float | None = None) -> Array:
 def _periods(records: Sequence[_Rounded]) -> list[float | None]:
     """Return the period of each record's clock: one for all records that allow it.
 
-    Each record confines its period to an interval; the shorter the record, the wider. Records
-    are taken from the surest on and join the first whose period they allow, in the narrowest
-    band that does. None: the stamps are to be kept, or no one period explains the record.
+    Each record confines its period to an interval; the shorter the record, the wider. Records are
+    taken in order of certainty, and each joins the first whose period it allows, in the narrowest
+    band possible. None: the stamps are kept, or no single period explains the record.
     """
     groups: list[tuple[float, float, list[int]]] = []
     told = {
@@ -317,7 +320,7 @@ def _slopes(stamps: Array, usual: NDArray[np.bool_], *, width: float) -> tuple[f
 
 
 def _extreme_slope(index: Array, stamps: Array, *, width: float, side: int) -> float:
-    """Return the least (side -1) or greatest (1) slope of a strip of this width over all stamps.
+    """Return the smallest (side -1) or largest (1) slope of a strip of this width over all stamps.
 
     The strip's width is a convex function of its slope, piecewise straight: Newton's method from
     outside reaches the bound exactly. Past it, on the far side, where there is no such strip.

@@ -1,4 +1,4 @@
-"""Which column is what: time, input, reference, the position of each cart; and its unit."""
+"""The meaning of columns: time, input, reference, the position of each cart; and units."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -17,9 +17,9 @@ _POSITION = re.compile(
     r"x ?(\d)|enc(?:oder)? ?(\d)(?: pos(?:ition)?)?|(?:cart|pos|position) ?(\d) ?(?:pos(?:ition)?)?"
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
-_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, and of no use
+_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, but unused
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-# "time [ms]", "x1 (cm)", "x1_cm"; not every unit, for "u_in" is no inch.
+# "time [ms]", "x1 (cm)", "x1_cm"; not for every unit, since "u_in" is no inch.
 _UNIT = re.compile(
     r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
 )
@@ -38,7 +38,7 @@ _FACTORS = {
 }
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
-_PLAIN = ("count", "counts", "pulse", "pulses")  # of an encoder, or of what a controller puts out
+_PLAIN = ("count", "counts", "pulse", "pulses")  # of an encoder, or of a controller's output
 _SHARES = ("duty", "%")  # of the largest input
 
 
@@ -58,22 +58,22 @@ class Column:
 
     @property
     def is_counted(self) -> bool:
-        """The heading says that encoder counts stand here."""
+        """The heading says that this column holds encoder counts."""
         return bool(_COUNTED.search(self.name)) or self.unit in ("count", "counts")
 
     @property
     def is_duty(self) -> bool:
-        """The heading says that duty counts of the motor's amplifier stand here."""
+        """The heading says that this column holds duty counts of the motor's amplifier."""
         return "duty" in self.name.casefold()
 
 
 def holds_counts(table: FileTable, column: Column) -> bool:
-    """Tell encoder counts: whole numbers where the form or the heading speaks of an encoder."""
+    """Return whether it holds counts: whole numbers, if form or heading names an encoder."""
     return table.whole[column.index] and (table.form != "csv" or column.is_counted)
 
 
 def conversion(found: str | None, wanted: str) -> float | None:
-    """Return the factor from one unit to another; None where they are not of one quantity."""
+    """Return the factor from one unit to another; None if they measure different quantities."""
     if found is None or found == wanted:
         return 1.0
     a, b = _plain_micro(found), _plain_micro(wanted)
@@ -81,7 +81,7 @@ def conversion(found: str | None, wanted: str) -> float | None:
 
 
 def is_count(unit: str) -> bool:
-    """Tell whether a position unit is the encoder's own."""
+    """Return whether a position unit is the encoder's own."""
     return unit.rstrip("s") == "count"
 
 
@@ -97,7 +97,7 @@ def input_units() -> tuple[str, ...]:
 
 
 def is_known(unit: str, known: Collection[str]) -> bool:
-    """Tell whether a unit is one of those known, whichever way its µ is typed."""
+    """Return whether a unit is known, whichever way its µ is typed."""
     return _plain_micro(unit) in known
 
 
@@ -108,10 +108,10 @@ def _plain_micro(unit: str) -> str:
 def assign_columns(
     table: FileTable, *, explicit: Mapping[str, str | int] | None, free: tuple[int, ...]
 ) -> tuple[dict[str, Column], tuple[str, ...]]:
-    """Return the column of each role, and the headings that found none.
+    """Return the column of each role, and the headings without a role.
 
-    `explicit` (role to heading or number) goes before what the headings say. A single position
-    column without a number belongs to the one cart in `free`.
+    `explicit` (role to heading or number) wins over headings. A single position column without a
+    number belongs to the one cart in `free`.
 
     Raises
     ------
@@ -147,7 +147,7 @@ def _column(table: FileTable, index: int, role: str) -> Column:
 
 
 def _plain(name: str) -> str:
-    """Return a heading in small letters without its unit and signs."""
+    """Return a heading in lower case without its unit and signs."""
     return re.sub(r"[^a-z0-9]+", " ", _UNIT.sub("", name).casefold()).strip()
 
 

@@ -1,7 +1,7 @@
-"""What the files of a submission are, written into its `submission.toml`.
+"""Find out what the files of a submission are, and write it into its `submission.toml`.
 
-A table is added for every recording in `data/` that has none, and completed where it lacks what its
-file tells. What stands there is nobody's to change; what is not sure is said as a comment.
+Every recording in `data/` without a table gets one, and an incomplete table is completed from its
+file. Existing entries are never changed; doubts become comments.
 """
 
 import filecmp
@@ -41,8 +41,8 @@ from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 from pipeline.words.numbers import by_note, first_few
 
-UNSURE = "unsure: "  # begins a comment below a table, which whoever knows better takes out
-_TO_STATE = {  # what a file does not tell
+UNSURE = "unsure: "  # begins a comment below a table, to be removed by a person who knows
+_TO_STATE = {  # facts that a file does not show
     "columns": "columns = { }    # which is what, by name or number: time, input, x1, …",
     "sample_rate": "sample_rate = 0    # Hz",
 }
@@ -60,15 +60,14 @@ class Found:
     Attributes
     ----------
     file : below the submission's folder.
-    state : its table is new, completed or was there; or there is none, for it is a copy of another
-        file, or nothing tells what it is; or it cannot be read, or has a table and is not there;
-        or no table can name it; or it is not read, for it is no recording by its name, or lies
-        beside `data/`.
+    state : its table is new, completed or was there. Or it has no table, because it is a copy,
+        unknown, unreadable, or cannot be named by one. Or it has a table but is missing. Or it is
+        not read, because its name is not that of a recording, or it lies beside `data/`.
     experiment : the id of its table; "" without one.
-    carts : that were free, as far as the file tells; () all.
-    inspection : None where the file cannot be read.
-    remarks : what is wrong; unsure : what a person has to say.
-    advice : what to do for a file that is not read; "" where it may stay as it is.
+    carts : the free ones, as far as the file shows; () all.
+    inspection : None if the file cannot be read.
+    remarks : faults; unsure : questions for a person.
+    advice : what to do about a file that is not read; "" if it may stay as it is.
     """
 
     file: str
@@ -87,15 +86,15 @@ class Found:
 
 
 def data_files(folder: Path) -> list[str]:
-    """Return the recordings in `data/`, as they stand in `submission.toml`."""
+    """Return the recordings in `data/`, with their paths for `submission.toml`."""
     found = data_files_in(folder / "data")
     names = [path.relative_to(folder).as_posix() for path in found]
     return [name for name in names if outside(folder, name) is None]
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
-    """Return the files of a submission that are not looked into; those `named` have a table."""
-    if problem := leaves(folder, "data"):  # what is there is nobody's business here
+    """Return the files of a submission that are not inspected; those `named` have a table."""
+    if problem := leaves(folder, "data"):  # other files there are ignored
         return [Found(file="data", state="refused", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
@@ -116,7 +115,7 @@ def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -
 
     Parameters
     ----------
-    columns : which is what, as far as `submission.toml` says.
+    columns : their roles, as far as `submission.toml` gives them.
     """
     try:
         inspection = inspect_file(folder / file, columns=columns)
@@ -136,9 +135,9 @@ def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -
 
 
 def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the carts that a file shows to move, and what is not sure of it.
+    """Return the carts that move in a file, and what is unsure.
 
-    () stands for all: those of a table of ratios, and where none moves, which says nothing.
+    () means all: for a table of ratios, and if no cart moves, which proves nothing.
     """
     carts = _moving(inspection)
     little = hardly_moving(inspection)
@@ -154,7 +153,7 @@ def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
     if inspection.kind == "sine":  # near a null, a free cart hardly moves
         return ()
     ranges, carts = _ranges(inspection), _moving(inspection)
-    # Of the furthest cart's motion.
+    # Of the largest cart motion.
     return tuple(cart for cart in carts if ranges[cart] < 0.05 * max(ranges.values()))
 
 
@@ -162,7 +161,7 @@ def _moving(inspection: Inspection) -> tuple[int, ...]:
     if inspection.kind == "bode":
         return ()
     step = max((column.step or 0.0 for column in inspection.positions.values()), default=0.0)
-    # Encoder steps over a whole record; a cart that is free moves more.
+    # Encoder steps over a whole record; a free cart moves more.
     return tuple(cart for cart, travel in _ranges(inspection).items() if travel > 2.0 * step)
 
 
@@ -173,7 +172,7 @@ def _ranges(inspection: Inspection) -> dict[int, float]:
 def experiment_entry(
     inspection: Inspection, *, name: str, kind: Kind, file: str, carts: Sequence[int], n: int
 ) -> dict[str, Value]:
-    """Return the keys of the `[[experiments]]` table of a file; `n` carts has the system."""
+    """Return the keys of the `[[experiments]]` table of a file; the system has `n` carts."""
     entry: dict[str, Value] = {"id": name, "kind": kind}
     known = [cart for cart in carts if cart <= n]
     if known and len(known) < n:
@@ -186,7 +185,7 @@ def experiment_entry(
 
 
 def free_id(stem: str, taken: Iterable[str]) -> str:
-    """Return a name for an experiment after that of its file, unlike those taken."""
+    """Return a name for an experiment like that of its file, but unused."""
     base = _NO_NAME.sub("-", stem).strip("-.") or "record"
     names, number, name = set(taken), 1, base
     while name in names:
@@ -201,7 +200,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     Raises
     ------
     ConfigError : there is no such folder, or no recording in its `data/`.
-    SubmissionError : `submission.toml` is broken, or cannot be changed by a program.
+    SubmissionError : `submission.toml` is broken, or a program cannot change it.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder; copy your recordings into {folder / 'data'}")
@@ -284,7 +283,7 @@ class _Filling:
         return replace(found, state="new", experiment=name, remarks=remarks, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
-        """Give a table the keys that it cannot do without and its file tells."""
+        """Add the keys that a table needs and its file determines."""
         before = len(table)
         if "id" not in table:
             taken = [str(one.get("id", "")) for one in self._tables]
@@ -294,7 +293,7 @@ class _Filling:
         if "columns" not in table and inspection.guessed:
             table["columns"] = toml_item(inspection.guessed)
         carts = tuple(table.get("carts", range(1, self._n + 1)))
-        known = {NO_CLOCK} if "sample_rate" in table else set()  # said in the table, no news
+        known = {NO_CLOCK} if "sample_rate" in table else set()  # written in the table, no news
         if "columns" in table and not inspection.guessed:
             known.add(inspection.ranges)
         return replace(
@@ -308,7 +307,7 @@ class _Filling:
         )
 
     def missing(self) -> Iterator[Found]:
-        """Yield the files that have a table and are not there, with what may be meant."""
+        """Yield the files that have a table but are missing, with what may be meant."""
         files = {posix(str(table["file"])): table for table in self._tables}
         for file, table in files.items():
             wrong = outside(self._folder, file, taken=files)
@@ -319,7 +318,7 @@ class _Filling:
                 )
 
     def _same(self, file: str) -> str | None:
-        """Return another file of the submission that holds the very same, if in another form."""
+        """Return another file of the submission with the same samples, perhaps in another form."""
         for name in (posix(str(table["file"])) for table in self._tables):
             other = self._folder / name
             if other.is_file() and filecmp.cmp(other, self._folder / file, shallow=False):
@@ -343,7 +342,7 @@ class _Filling:
         return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
-        """Leave a table as a comment, to be filled in by who knows what the file is; once."""
+        """Leave a table as a comment, once, for a person who knows the file to fill in."""
         line = f"file = {json.dumps(found.file, ensure_ascii=False)}"
         if f"# {line}" in tomlkit.dumps(self._document).splitlines():
             return
@@ -357,7 +356,7 @@ class _Filling:
 
 
 def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:
-    """Return the remarks but those on carts that the table says are held: they stand still."""
+    """Return the remarks except those on carts that the table declares held."""
     assert found.inspection is not None
     positions = found.inspection.positions.items()
     known = {never_changes(column.name) for cart, column in positions if cart not in carts}
@@ -372,7 +371,7 @@ def has_fractions(found: Found) -> bool:
 
 
 def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
-    """Return what speaks against a unit of the positions, or "".
+    """Return what contradicts a unit of the positions, or "".
 
     Parameters
     ----------
@@ -387,14 +386,14 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
 
 
 def system_doubts(folder: Path) -> dict[str, str]:
-    """Return what stands marked as unsure beside the keys of `[system]`, by key."""
+    """Return the doubts marked beside the keys of `[system]`, by key."""
     system: Any = _read(folder).get("system", {})
     comments = {key: item.trivia.comment.removeprefix("# ") for key, item in system.value.items()}
     return {key: said for key, said in comments.items() if said.startswith(UNSURE)}
 
 
 def experiment_doubts(folder: Path) -> list[tuple[str, ...]]:
-    """Return what stands marked as unsure right below each table of an experiment."""
+    """Return the doubts marked right below each table of an experiment."""
     tables: Any = _read(folder).get("experiments", ())
     return [_marked(table) for table in tables]
 
@@ -404,7 +403,7 @@ def _read(folder: Path) -> tomlkit.TOMLDocument:
 
 
 def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = None) -> None:
-    """Put a value into `[system]`, and a doubt or a reason as the comment behind it."""
+    """Put a value into `[system]`, with a doubt or a reason as the comment behind it."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
         system: Any = document["system"]
@@ -416,19 +415,19 @@ def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = N
 
 
 def unsure(doubt: str) -> str:
-    """Return a comment that marks a doubt, which whoever knows better takes out."""
+    """Return a comment that marks a doubt, to be removed by a person who knows."""
     return UNSURE + doubt
 
 
 def _marked(table: Any) -> tuple[str, ...]:
-    """Return what stands marked as unsure right below a table."""
+    """Return the doubts marked right below a table."""
     own = table.as_string().partition("\n\n")[0]
     lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
     return tuple(line.removeprefix(UNSURE) for line in lines if line.startswith(UNSURE))
 
 
 def _unsure(found: Found, n: int) -> Iterator[str]:
-    """Yield what a person knows and no file tells."""
+    """Yield the facts that a person knows and no file shows."""
     assert found.inspection is not None
     if found.inspection.guessed:
         yield "the columns have no names, their numbers are guessed"
@@ -451,7 +450,7 @@ def _carts_seen(looked: Sequence[Found]) -> int:
 
 
 def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> None:
-    """Write the units that headings state into a new document; counts it takes without a word."""
+    """Write the units stated by headings into a new document; counts need no statement."""
     system: Any = document["system"]
     for inspection in (one.inspection for one in looked if one.inspection):
         for column in inspection.columns:
@@ -462,7 +461,10 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 
 
 def format_found(found: Sequence[Found]) -> str:
-    """Return a table of one line a file, what is wrong or not sure below; not of those not read."""
+    """Return a table with one line for each file, and faults and doubts below;
+
+    not for unread files.
+    """
     found = [one for one in found if one.state != "not_read"]
     rows = [
         (one.file, one.state, one.kind or "?", _carts_words(one), one.experiment or "-")
@@ -486,7 +488,7 @@ def format_found(found: Sequence[Found]) -> str:
 
 
 def format_passed_over(found: Iterable[Found]) -> list[str]:
-    """Return which files are not read, a line for each reason, and what to do."""
+    """Return which files are not read, one line for each reason, and what to do."""
     return _not_looked_into([one for one in found if one.state == "not_read"])
 
 

@@ -1,4 +1,4 @@
-"""Which files of a folder hold recordings, and what there is to say of every other."""
+"""The files of a folder: which hold recordings, and why others are not read."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -13,7 +13,7 @@ from pipeline.words.numbers import first_few
 
 _DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the rest of it is hidden
 _AS_TEXT = "save the recording as .csv"
-# Forms that are not read but may hold a recording: their names, and the advice to give.
+# Forms that are not read but may hold a recording, with the advice to give.
 _FORMS = {
     ".xlsx .xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each sheet as .csv"),
     ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
@@ -33,7 +33,7 @@ class NotRead:
     ----------
     file : its name, printable.
     reason : why it is not read.
-    advice : what to do, where it may hold a recording; else "".
+    advice : what to do if it may hold a recording; else "".
     """
 
     file: str
@@ -42,12 +42,12 @@ class NotRead:
 
 
 def data_files_in(folder: Path) -> list[Path]:
-    """Return what may hold data in a folder and those below, "2" before "10"."""
+    """Return the files that may hold data, in a folder and those below, "2" before "10"."""
     return [path for path in _entries(folder) if _is_recording(path)]
 
 
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
-    """Return every other file of a folder and those below, with what to do about it.
+    """Return every other file of a folder and those below, with advice.
 
     Names are below `root`, which no file may leave by a link. Hidden files are passed over.
     """
@@ -56,7 +56,7 @@ def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
 
 
 def refused(root: Path, name: str) -> NotRead | None:
-    """Return why a file below `root` is not opened, None where it may be."""
+    """Return why a file below `root` is not opened, None if it may be."""
     problem = outside(root, name)
     if problem is None:
         return None
@@ -67,7 +67,7 @@ def refused(root: Path, name: str) -> NotRead | None:
 
 
 def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
-    """Return the recordings that lie beside `data/`, but for those `named` in submission.toml."""
+    """Return the recordings beside `data/`, except those `named` in submission.toml."""
     known = set(named)
     found = []
     for path in sorted(folder.iterdir(), key=_natural) if folder.is_dir() else ():
@@ -81,7 +81,7 @@ def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
 
 
 def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return a line for each reason and advice, with the files that it is about."""
+    """Return a line for each reason and advice, with its files."""
     about: dict[str, list[str]] = {}
     for file, reason, advice in found:
         about.setdefault("; ".join(filter(None, (reason, advice))), []).append(file)
@@ -90,7 +90,7 @@ def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
 
 
 def _not_read(root: Path, name: str) -> NotRead:
-    """Say of a file, not a recording by its ending, what it is: by the ending, then by content."""
+    """Describe a file that is not a recording by its ending: by ending, then by content."""
     ending = Path(name).suffix.casefold()
     if ending in _FORM_OF:
         reason, advice = _FORM_OF[ending]
@@ -119,7 +119,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Return all that is no folder in a folder and those below; links are not followed."""
+    """Return everything except folders in a folder and those below; links are not followed."""
     return sorted(_walk(folder), key=_natural)
 
 

@@ -1,14 +1,15 @@
 """The sign of the input: stated, found from the data, or as in the other records.
 
-Which way the motor pushes shows in the input, held against the force that cart 1's motion asks for:
+The direction in which the motor pushes shows in the input, compared with the force that cart 1's
+motion requires:
 
     s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1
 
 holds for every record of a bench with one m, c, k and k', so all records decide s together. No
-derivative is taken: both sides are weighed with a bump that slides along the record
-(`modulating`). An input that reaches the carts late, by a
-delay or a lag, turns the phases above the resonance so far that such a record alone seems to have
-the other sign; together with the others' inertia and stiffness it does not.
+derivative is taken: both sides are weighted with a bump that slides along the record
+(`modulating`). An input that is late, by a delay or a lag, turns the phases above the resonance so
+far that such a record alone seems to have the other sign. Together with the others' inertia and
+stiffness it does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +32,7 @@ FEW_NAMES = 6  # more are not listed one by one
 
 @dataclass(frozen=True, kw_only=True)
 class Signs:
-    """By record, the sign that is stated, and the one that its data tell: 0 where they do not."""
+    """By record, the stated sign, and the sign of its data: 0 if unclear."""
 
     stated: Mapping[str, int]
     found: Mapping[str, int]
@@ -40,11 +41,11 @@ class Signs:
 def with_signs(
     records: list[Record], submission: Submission
 ) -> tuple[list[Record], list[str], Signs]:
-    """Return the records with signed inputs, what is to be said of signs found, and those stated.
+    """Return the records with signed inputs, notes on signs found, and those stated.
 
-    Where a record does not tell, it takes the sign of most others of its sort (under feedback or
-    not: a controller's log may count the other way), else of most others. A record whose own sign
-    is another than that of the system has the one that its data tell, else its own.
+    A record with an unclear sign takes that of most others of its kind (under feedback or not: a
+    controller's log may count the other way), else of most others. A record with a stated sign
+    other than the system's takes the sign of its data, else the stated one.
     """
     stated: dict[str, int] = {}
     disputed: set[str] = set()
@@ -86,7 +87,7 @@ def with_signs(
 def _say_signs(
     driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
 ) -> list[str]:
-    """Return what was found, and what was only taken."""
+    """Return which signs were found, and which were only assumed."""
     searched = [name for name in driven if name not in stated]
     if not searched:
         return []
@@ -106,7 +107,7 @@ def _say_signs(
     return [text]
 
 
-# ------------------------------------------------------------- what the data tell
+# --------------------------------------------------------- signs from the data
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -116,9 +117,9 @@ class _Weighed:
     Attributes
     ----------
     drive : (3, n) the input a sample early, as logged, and a sample late.
-    motion : (n, 4) what m, c, k and k' multiply.
-    complete : False where cart 2 is free and was not measured.
-    decisive : False for a dwell that is not complete: it may not be found to be contrary.
+    motion : (n, 4) factors of m, c, k and k'.
+    complete : False if cart 2 is free and was not measured.
+    decisive : False for a dwell that is not complete: it may not be called reversed.
     closed : recorded under feedback.
     """
 
@@ -129,17 +130,17 @@ class _Weighed:
     closed: bool
 
 
-@np.errstate(all="ignore")  # what overflows or vanishes is no finite number and tells nothing
+@np.errstate(all="ignore")  # overflow gives no finite number and no sign
 def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
-    """Return by record the sign of its logged input; 0, or nothing, where the data do not tell.
+    """Return by record the sign of its logged input; 0, or nothing, if the data are unclear.
 
-    One bench has one sign: a record has another only where its input is the opposite of the force
-    that the others' equation gives. What is logged under feedback may be another signal, so it
-    has no part in the equation where there are other records.
+    One bench has one sign. A record has another only if its input is the opposite of the force that
+    the others' equation gives. A signal logged under feedback may be something else, so it is left
+    out of the equation if there are other records.
 
     Parameters
     ----------
-    stated : by record, the sign that it is said to have; the others count as 1.
+    stated : by record, its stated sign; the others count as 1.
     """
     weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
     if not weighed:
@@ -147,7 +148,7 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     said = {name: stated.get(name, 1) for name in weighed}
     rule = [name for name, w in weighed.items() if w.complete] or list(weighed)
     rule = [name for name in rule if not weighed[name].closed] or rule
-    # Where as many count one way as the other, what each says alone is the better start.
+    # If equally many count either way, the sign of each record alone is the better start.
     alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
     for turned in (set[str](), alone):
         found = _settle(weighed, said, turned, rule=rule)
@@ -163,8 +164,8 @@ def _settle(
     *,
     rule: Sequence[str],
 ) -> dict[str, int]:
-    """Turn what is contrary to the equation of `rule` until nothing is; see `find_signs`."""
-    # Of turning contrary records and fitting again.
+    """Reverse records that contradict the equation of `rule` until none does; see `find_signs`."""
+    # Rounds of reversing such records and fitting again.
     for _ in range(5):
         signs = {name: -said[name] if name in turned else said[name] for name in weighed}
         sign, weights = _bench([weighed[name] for name in rule], [signs[name] for name in rule])
@@ -187,8 +188,8 @@ def _settle(
 def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Array]:
     """Return the sign, on top of `signs`, and m, c, k, k' of the equation that explains them all.
 
-    The sign is 0 where the other explains them nearly as well, or where a log that is early or
-    late by a sample would change it (a feedback law is never early).
+    The sign is 0 if the other explains them nearly as well, or if a log early or late by a sample
+    would change it (a feedback law is never early).
     """
     motion = np.vstack([w.motion for w in weighed])
     size = np.linalg.norm(motion, axis=0)
@@ -199,9 +200,9 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
         share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has the norm one
-        # Of the input's power: how much more the other sign must leave unexplained to be ruled out.
-        # Far above what an encoder's steps do; a cart's damping is worth more at every frequency
-        # that moves it.
+        # Of the input's power: how much more the other sign must leave unexplained to be excluded.
+        # It is far above the effect of an encoder's steps; a cart's damping has a larger effect at
+        # every frequency that moves it.
         sure = abs(share[0] - share[1]) > 1e-3 + 0.1 * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
@@ -210,10 +211,10 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
 
 
 def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
-    """Return the weights (4,), none negative, and the norm of what they leave of the drive."""
+    """Return the weights (4,), none negative, and the norm of the unexplained drive."""
     try:
         return nnls(motion, drive)
-    except RuntimeError:  # no end was found: nothing is explained
+    except RuntimeError:  # no solution was found: nothing is explained
         return np.zeros(motion.shape[1]), float(np.linalg.norm(drive))
 
 
@@ -225,7 +226,7 @@ def _cosine(w: _Weighed, weights: Array) -> float:
 
 
 def _weigh(record: Record) -> _Weighed | None:
-    """Return both sides of a record's equation; None where nothing drives or moves cart 1."""
+    """Return both sides of a record's equation; None if nothing drives or moves cart 1."""
     if record.u is None or 1 not in record.carts or 1 not in record.free:
         return None
     t, u, x = record.t, record.u, record.position(1)
@@ -246,7 +247,7 @@ def _weigh(record: Record) -> _Weighed | None:
     places = np.arange(1, last, max(width // 6, last // 400, 1))
     centred = [sliding_window_view(u, width)[places + shift] @ weight for shift in (-1, 0, 1)]
     centred += [sliding_window_view(a, width)[places] @ weights for a, weights in sides]
-    early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero drops out
+    early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero cancels
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)
     if not (np.all(np.isfinite(drive)) and np.all(np.isfinite(motion))):

@@ -1,4 +1,4 @@
-"""What a data file holds, before anything is made of it."""
+"""The content of a data file, before it is used."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -26,7 +26,7 @@ _MOST_COLUMNS = 16  # spelt out in a sentence
 class ColumnInspection:
     """One column: its heading, the role it would play, its range and the encoder step seen.
 
-    `whole` : it holds whole numbers only, as an encoder's counts are.
+    `whole` : it holds only whole numbers, like an encoder's counts.
     """
 
     name: str
@@ -45,13 +45,13 @@ class Inspection:
     Attributes
     ----------
     duration, interval, jitter : s; jitter is the rms deviation of the sample interval.
-    rate : Hz. None, as the other times, where the file has no time column.
+    rate : Hz. None, like the other times, if the file has no time column.
     kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
-    problems : what to look at before using the file.
-    unusable : those of the problems for which a report does not take the file.
-    needs : keys that its table in `submission.toml` has to state ("columns", "sample_rate").
+    problems : points to check before using the file.
+    unusable : those problems for which a report does not use the file.
+    needs : keys that its table in `submission.toml` must state ("columns", "sample_rate").
     variables : of a binary file, read or not.
-    guessed : column numbers by role, where the file has no headings and the signals tell.
+    guessed : column numbers by role, if the file has no headings but the signals reveal them.
     """
 
     file: str
@@ -78,7 +78,7 @@ class Inspection:
 
     @property
     def ranges(self) -> str:
-        """Which column runs from where to where, for who has to say what each is; "" if named."""
+        """The range of each column, for a person who must name them; "" if they are named."""
         if "columns" not in self.needs:
             return ""
         said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
@@ -90,17 +90,17 @@ class Inspection:
 
 
 def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspection:
-    """Look into one data file; what would stop a report is listed as a problem where it can be.
+    """Inspect one data file; anything that would stop a report is listed as a problem.
 
     Parameters
     ----------
-    columns : which is what, as far as that is stated; a column that is not there states nothing.
+    columns : their roles, if stated; a missing column states nothing.
 
     Raises
     ------
     SubmissionError : the file is missing, of no known form, or broken; names the path as given.
     """
-    real = Path(path).resolve()  # a link is the caller's own business here
+    real = Path(path).resolve()  # a link given on the command line is the caller's own choice
     table, _ = read_table(real.parent, real.name, shown=str(path))
     unusable = [table.cut_short] if table.cut_short else []
     problems = [*unusable]
@@ -172,7 +172,7 @@ def _inspect_columns(
 
 
 def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> dict[str, Any]:
-    """Return the JSON of a file that is not inspected, with the keys of one that is.
+    """Return the JSON entry of a file that is not inspected, with the keys of an inspected one.
 
     `state` is "broken" or "not_read"; `advice` says what to do.
     """
@@ -183,7 +183,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
 
 
 def _name_them(guessed: Mapping[str, int]) -> str:
-    """Return how to say what columns without names are; `guessed` may tell."""
+    """Return how to name columns without headings; `guessed` may help."""
     said = "the columns have no names: say in submission.toml which is what"
     if guessed:
         line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
@@ -195,10 +195,10 @@ def _name_them(guessed: Mapping[str, int]) -> str:
 
 
 def _suggest_columns(table: FileTable) -> dict[str, int]:
-    """Return each role's column, counted from 1; {} without a clock and encoders to be seen.
+    """Return each role's column, counted from 1; {} if no clock and encoders are visible.
 
-    After the clock come the encoders, which hold whole numbers, the first perhaps a commanded
-    position that only mirrors encoder 1; the input stands last, as in the exports of the ECP.
+    The encoders follow the clock and hold whole numbers; the first may be a commanded position that
+    only mirrors encoder 1. The input is last, as in the exports of the ECP.
     """
     time = next((i for i, column in enumerate(table.values) if _looks_like_a_clock(column)), None)
     if time is None:
@@ -221,12 +221,12 @@ def _looks_like_a_clock(values: Array) -> bool:
         return False
     clock = read_clock(values)
     regular = bool(clock.jitter < clock.mean_interval)
-    # No bench records slower or faster.
+    # No bench records more slowly or faster.
     return clock.stopped is None and 1e-5 < clock.mean_interval < SLOW and regular
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock, or None without one; remarks on it go to `problems`.
+    """Return the clock, or None without one; its notes go to `problems`.
 
     Raises
     ------
@@ -239,7 +239,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
         return None
     clock = read_clock(table.values[column.index] * factor)
     problems += clock_notes(table, column, clock, sample_rate=None)
-    # Of the interval, rms: a clock worth a word.
+    # Of the interval, rms: jitter worth mentioning.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
         problems.append(
             f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
@@ -251,7 +251,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
 def _guess(
     table: FileTable, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
 ) -> tuple[Kind | None, float | None]:
-    """Return the kind of experiment the signals look like, and the frequency of a dwell."""
+    """Return the kind of experiment that the signals look like, and the frequency of a dwell."""
     if "frequency" in columns:
         return "bode", None
     signals = {role: table.values[column.index] for role, column in columns.items()}
@@ -282,14 +282,14 @@ def _guess(
 
 
 def _follows(u: Array, reference: Array) -> bool:
-    """Tell an open loop whose target is the commanded input itself."""
+    """Return whether the target is the commanded input itself, as in an open loop."""
     if np.ptp(reference) == 0.0:
         return False
     return bool(abs(np.corrcoef(u, reference)[0, 1]) > 0.999)
 
 
 def is_stepped(u: Array) -> bool:
-    """Is the input flat between a few edges?"""
+    """Return whether the input is constant between a few edges."""
     # Of the input's range.
     edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
     # A sweep has more edges.
@@ -316,7 +316,7 @@ def line_frequency(t: Array, u: Array) -> float | None:
 
 
 def format_inspections(inspections: Sequence[Inspection]) -> str:
-    """Return a table of one line a file; what is wrong with files stands below, once."""
+    """Return a table with one line for each file, and each fault once below it."""
     head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
     rows: list[tuple[str, ...]] = [head]
     for one in inspections:

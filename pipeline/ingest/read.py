@@ -19,7 +19,7 @@ from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
-_FEW_COUNTS = 10  # a motor does not move at so few; whole numbers up to it are volts, typed in
+_FEW_COUNTS = 10  # a motor does not move at so few; smaller whole numbers are typed volts
 DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
@@ -31,11 +31,12 @@ class Ingested:
     Attributes
     ----------
     records : the time series, in the order of the submission.
-    tables : frequency responses the students reduced, one a cart.
+    tables : frequency responses that the students reduced, one for each cart.
     files : SHA-256 of each data file, by path, sorted.
-    unreadable : by experiment, why its file is not among them: missing, broken, another's.
-    signs : of the inputs, as stated and as the data tell them.
-    warnings : what concerns more than one record.
+    unreadable : by experiment, why its file is not included: missing, broken, of another
+        experiment.
+    signs : of the inputs, as stated and from the data.
+    warnings : those that concern more than one record.
     """
 
     records: tuple[Record, ...]
@@ -49,12 +50,11 @@ class Ingested:
 def read_data(submission: Submission) -> Ingested:
     """Read every experiment's file into a record in position and input units.
 
-    A file that is missing or broken, or does not hold what its experiment says, is that
-    experiment's problem.
+    A missing or broken file, or one that does not fit its experiment, affects that experiment only.
 
     Raises
     ------
-    SubmissionError : not one can be read; one line.
+    SubmissionError : no file can be read; one line.
     """
     if not submission.experiments:
         raise SubmissionError(
@@ -81,7 +81,7 @@ def read_data(submission: Submission) -> Ingested:
             else:
                 opened.append(_open(table, experiment, submission.system))
     records: list[Record] = []
-    clocks = read_clocks([o.stamps for o in opened])  # one clock made them all
+    clocks = read_clocks([o.stamps for o in opened])  # all of them share one clock
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock))
@@ -102,7 +102,7 @@ def read_data(submission: Submission) -> Ingested:
 
 @contextmanager
 def _noted(experiment: Experiment, unreadable: dict[str, str]) -> Iterator[None]:
-    """Keep an error as that of the experiment it is about."""
+    """Keep an error with its experiment."""
     try:
         yield
     except SubmissionError as error:
@@ -115,7 +115,7 @@ def _none_readable(unreadable: Mapping[str, str]) -> str:
 
 
 def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
-    """Return a warning if the input's scale is stated and no record's input is in counts."""
+    """Return a warning if the input has a stated scale that no record uses."""
     per_count = system.input.per_count
     driven = [record for record in records if record.u is not None and np.any(record.u)]
     if per_count is None or not driven or any(r.input_scale == per_count for r in driven):
@@ -165,9 +165,9 @@ def _refuse_cut(table: FileTable) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Opened:
-    """A file, its columns told apart; `positions` by cart, `stamps` (n,) s as they stand in it.
+    """A file with its columns identified; `positions` by cart, `stamps` (n,) s as written in it.
 
-    Reading it adds to `notes`, and to `headed` the units that its headings state.
+    Reading it adds `notes`, and to `headed` the units of its headings.
     """
 
     system: System
@@ -207,7 +207,7 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
 
 
 def _read_record(opened: _Opened, clock: Clock) -> Record:
-    """Return the record with the input's scale applied, but not yet a sign that must be found."""
+    """Return the record with the input's scale applied, but not yet an unknown sign."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     positions, notes = opened.positions, opened.notes
     notes += table.notes
@@ -271,12 +271,12 @@ def _check_carts(table: FileTable, experiment: Experiment, positions: list[Colum
 
 
 def _window(clock: Clock, experiment: Experiment) -> slice:
-    """Return the samples inside the experiment's window; all of them without one."""
+    """Return the samples inside the experiment's window; all of them without a window."""
     if experiment.window is None:
         return slice(None)
     start, end = experiment.window
     first, last = float(clock.t[0]), float(clock.t[-1])
-    # Of the record's length: "to the end" is often typed rounded up.
+    # Of the record's length: "to the end" is often rounded up.
     slack = max(0.01 * (last - first), 2 * clock.mean_interval)
     if start < first - slack or end > last + slack:
         raise SubmissionError(
@@ -315,7 +315,7 @@ def _position_scale(opened: _Opened, column: Column) -> float:
 def _unit_scale(
     opened: _Opened, column: Column, unit: str, role: Literal["position", "input"]
 ) -> float:
-    """Return the factor from the heading's unit to the submission's, and say what was done."""
+    """Return the factor from the heading's unit to the submission's, and add a note."""
     factor = conversion(column.unit, unit)
     if column.unit is not None:
         converts = factor is not None
@@ -330,7 +330,7 @@ def _unit_scale(
 
 
 def _input(opened: _Opened) -> tuple[Array | None, float]:
-    """Return the input in input units and the scale used, both without a sign to be found."""
+    """Return the input in input units and the scale used, both without an unknown sign."""
     table, experiment, stated = opened.table, opened.experiment, opened.system.input
     column = opened.columns.get("input")
     if column is None:
@@ -361,7 +361,7 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
 
 
 def _beyond_volts(values: Array) -> bool:
-    """Tell counts from volts typed in: whole numbers, perhaps written "512.0", and large ones."""
+    """Return whether they are counts, not volts: large whole numbers, perhaps written "512.0"."""
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 

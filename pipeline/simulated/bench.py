@@ -1,4 +1,4 @@
-"""A simulated bench: how its carts move in one run, and what the encoders say of it."""
+"""A simulated bench: the motion of its carts in one run, and its encoder readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ COUNT = 0.00227  # cm
 
 # A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])
-_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance the cart is held at
+_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance at which the cart is held
 _SHORTEST_STEP = 1e-5  # s of the simulator: a session then takes half an hour to simulate
 
 
@@ -31,7 +31,7 @@ class ReleasingHand:
     Attributes
     ----------
     position : where it holds the cart, position units from rest.
-    release, fade : s; from `release` on its force falls to zero in a straight line over `fade`.
+    release, fade : s; from `release` its force falls linearly to zero during `fade`.
     tremor : (3,) phases of its trembling, rad.
     """
 
@@ -51,15 +51,15 @@ class ReleasingHand:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BenchRun:
-    """One run: what is done to the carts.
+    """One run: the input, the free carts and hands.
 
     Attributes
     ----------
-    t, u : (n,) s and input, held between the samples; in a closed loop the bench finds u itself.
+    t, u : (n,) s and input, held between the samples; in a closed loop the bench computes u itself.
     free : the carts free to move.
     frequency : of a sine dwell, Hz.
-    reference, controller, input_limit : of a closed loop; `cart` is the one it steers.
-    keep_from : s; the recorder starts here, and its clock with it.
+    reference, controller, input_limit : of a closed loop; `cart` is the controlled one.
+    keep_from : s; the recorder starts here, with its clock.
     """
 
     id: str
@@ -79,9 +79,9 @@ class BenchRun:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TrueMotion:
-    """What truly happened: the input (n,) and the positions (n_carts, n) from the springs' rest.
+    """The true input (n,) and positions (n_carts, n) from the springs' rest.
 
-    Where a sensor has a scale of its own, positions are as it scales them.
+    If a sensor has its own scale, positions are scaled by it.
     """
 
     u: Array
@@ -90,20 +90,20 @@ class TrueMotion:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SimulatedBench:
-    """A plant with what is hidden in it, its encoders and its controller's clock.
+    """A plant with hidden effects, its encoders and its controller's clock.
 
     Attributes
     ----------
-    name : of the preset or the model's file; "": it has none.
-    effects : what the plant does beyond the linear chain; without any nothing is compiled.
-    told : one sentence for each effect, with its parameters; not for the submission.
-    travel : how far the carts are meant to move, position units.
+    name : of the preset or the model's file; "": no name.
+    effects : beyond the linear chain; without any nothing is compiled.
+    told : one sentence for each effect, with its parameters; never in the submission.
+    travel : intended motion of the carts, position units.
     count : the encoder step, position units.
     input_limit : the largest input, input units.
     sample_time : s, of the controller, the input and the log.
-    noise_counts : standard deviation of what shakes a free cart's encoder; 0.2 makes its reading
-        flicker between two counts.
-    zero_error_counts : the encoders are zeroed by hand, within this of the carts' rest.
+    noise_counts : standard deviation of a free cart's encoder noise; with 0.2 its reading flickers
+        between two counts.
+    zero_error_counts : encoders are zeroed by hand, within this of the carts' rest.
     """
 
     chain: Chain
@@ -139,11 +139,11 @@ class SimulatedBench:
             )
 
     def move(self, run: BenchRun) -> TrueMotion:
-        """Return how the carts move: the one place that knows the law of motion.
+        """Return the motion of the carts: the only place with the law of motion.
 
         Raises
         ------
-        DataError : the effects make the carts run away.
+        DataError : the effects make the carts diverge.
         """
         chain, x = self.chain, np.zeros((self.chain.n, run.t.size))
         rows = [cart - 1 for cart in run.free]
@@ -164,7 +164,7 @@ class SimulatedBench:
                     sample_time=self.sample_time,
                     input_limit=run.input_limit,
                     encoder_step=self.count,
-                    # Where the carts rest, the encoders are zeroed.
+                    # The encoders are zeroed where the carts rest.
                     rest=-plant.state[0::2] if plant else 0.0,
                     free=run.free,
                 ),
@@ -189,7 +189,7 @@ class SimulatedBench:
         error = self.zero_error_counts * self.count
         zero = rng.uniform(-error, error, size=(n_carts, 1))
         if run.controller is not None:
-            zero[:] = 0.0  # the controller needs its zero at rest, so that is seen to first
+            zero[:] = 0.0  # the controller needs its zero at rest, so this comes first
         shaken = np.isin(np.arange(1, n_carts + 1), run.free)[:, None]
         noise = self.noise_counts * self.count
         x = motion.x + zero + noise * shaken * rng.standard_normal((n_carts, n))
@@ -200,7 +200,7 @@ def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]
     """Return the positions (f, n) of the free carts, all but the hand's at rest until it lets go.
 
     The hand's force on its cart balances the springs at the release and fades from there, so the
-    decay begins softly, as a hand's does, and not with a step.
+    decay begins softly, as with a hand, not with a step.
     """
     A, B, C, _ = chain.state_space(free=free)
     row = sorted(free).index(hand.cart)
@@ -221,8 +221,8 @@ def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]
 def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingHand) -> Array:
     """Return the readings (n_carts, n) of a run with a hand in it, as `_release` does.
 
-    The hand pulls the cart out before the recorder starts, so friction and hidden masses are
-    where that leaves them; it then follows its tremor, and lets go as in the linear chain.
+    The hand pulls the cart out before the recorder starts, which sets the state of friction and
+    hidden masses. The cart then follows the hand's tremor, and is released as in the linear chain.
     """
     from pipeline.plant.nonlinear.augmented import SteppedBench
 
@@ -240,7 +240,7 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
     force = bench.let_go(cart, velocity=float(hand.hold(t[start])[1]))
     ramp = force * np.clip(1 - (t - t[start]) / hand.fade, 0.0, 1.0)
     for sample in range(start, t.size - 1):
-        # Between the samples the force runs straight; each short step takes its mean.
+        # Between the samples the force is linear; each short step takes its mean.
         steps = 10 if ramp[sample] != 0.0 else 1  # while the hand's force falls
         for share in (np.arange(steps) + 0.5) / steps:
             push = float((1 - share) * ramp[sample] + share * ramp[sample + 1])

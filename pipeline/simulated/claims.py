@@ -1,4 +1,4 @@
-"""What an honest student knows and writes: a model a little off the truth, rounded numbers."""
+"""The report of an honest student: a slightly wrong model, rounded numbers."""
 
 import math
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from pipeline.results import FeedbackDesign
 from pipeline.submission.toml_file import Value
 from pipeline.submission.toml_section import TypedNumber
 
-# A fit to some twenty dwells leaves about this much, as relative standard deviations.
+# Typical errors of a fit to some twenty dwells, as relative standard deviations.
 _FIT_ERROR_SPRING_OR_MASS = 0.005
-# Ruler, cursor and peak-picking: first estimates from steps and decays.
+# Ruler, cursor and peak-picking: initial estimates from steps and decays.
 _HAND_ERROR = 0.007
 _GUESSED_ZETA = TypedNumber(
     "0.10"
@@ -36,7 +36,7 @@ def believed_chain(chain: Chain, rng: np.random.Generator) -> Chain:
 def initial_estimates(
     chain: Chain, *, dwells_hz: Sequence[float], rng: np.random.Generator
 ) -> dict[str, Value]:
-    """Return the students' first estimates of every named parameter.
+    """Return the students' initial estimates of every named parameter.
 
     Gains come from the steps, each cart's own frequency and damping from its decay; resonances and
     nulls are the nearest dwell, and their dampings are guessed.
@@ -69,7 +69,7 @@ def state_space(believed: Chain) -> dict[str, Value]:
 
 
 def feedback(design: FeedbackDesign) -> dict[str, Value]:
-    """Return the controller and what the students' simulation of it showed."""
+    """Return the controller and the students' simulated results of it."""
     typed: dict[str, Value] = {
         "gains": [_significant(gain, 4) for gain in design.gains],
         "prefilter": _significant(design.prefilter, 4),

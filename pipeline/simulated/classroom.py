@@ -1,4 +1,4 @@
-"""A small class to show grading by: an honest team, a slip, a copied recording."""
+"""A small class that shows grading: an honest team, a slip, a copied recording."""
 
 import re
 import shutil
@@ -9,7 +9,7 @@ from pathlib import Path
 from pipeline.simulated.submission import write_submission
 
 PRESET = "throne-1dof"
-# What is wrong with whose hand-in, for those who want to see whether grading finds it.
+# The planted mistake of each submission, to compare with the result of grading.
 PLANTED = (
     "team-2 gives its frequencies in Hz",
     "team-3 hands in one of team-2's recordings as its own",
@@ -20,7 +20,7 @@ _FREQUENCY = re.compile(r"^omega_n = (.+)$", re.MULTILINE)
 
 
 def write_class(folder: Path) -> None:
-    """Write three hand-ins on one bench into a new `folder`, all of them or none."""
+    """Write three submissions on one bench into a new `folder`, all of them or none."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".class-") as scratch:
         teams = Path(scratch) / "class"
@@ -32,7 +32,7 @@ def write_class(folder: Path) -> None:
 
 
 def _in_hertz(file: Path) -> None:
-    """Divide the reported frequencies by 2π, as a team does that forgets it."""
+    """Divide the reported frequencies by 2π, like a team that forgets the factor."""
     text = file.read_text(encoding="utf-8")
     slip = _FREQUENCY.sub(lambda found: f"omega_n = {float(found[1]) / (2 * pi):.3g}", text)
     file.write_text(slip, encoding="utf-8", newline="\n")

@@ -1,6 +1,6 @@
 """The worked examples in `submissions/`.
 
-`python -m pipeline.simulated.examples` writes them anew.
+`python -m pipeline.simulated.examples` writes them again.
 """
 
 from dataclasses import dataclass

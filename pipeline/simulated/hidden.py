@@ -1,4 +1,4 @@
-"""What is hidden in a bench: effects named by the user, or the model that a `gap.json` found."""
+"""Hidden effects of a bench: named by the user, or taken from the model of a `gap.json`."""
 
 import json
 import math
@@ -38,12 +38,12 @@ def prepare_bench(
 
     Parameters
     ----------
-    hide : each `EFFECT` or `EFFECT:key=value,…`; keys are `cart` or `spring` and the parameters
-        of the law. What is left out gets a size that shows.
+    hide : each `EFFECT` or `EFFECT:key=value,…`; keys are `cart` or `spring` and the parameters of
+        the law. Omitted parameters get a clearly visible size.
 
     Raises
     ------
-    ConfigError : neither or both of preset and model, or what they or an effect say is wrong.
+    ConfigError : neither or both of preset and model, or an error in them or in an effect.
     """
     if (preset is None) == (model is None):
         raise ConfigError("name a bench: either --preset or --model")
@@ -69,13 +69,13 @@ def preset_bench(name: str) -> SimulatedBench:
 
 
 def usual_term(effect: Effect, chain: Chain, *, travel: float = 1.0) -> EffectTerm:
-    """Return the effect at its usual place, at a size that shows."""
+    """Return the effect at its usual place, at a clearly visible size."""
     place = _place(effect, chain, None, where=effect.key)
     return _term(effect, place, default_values(effect, chain, place=place, travel=travel))
 
 
 def default_values(effect: Effect, chain: Chain, *, place: int, travel: float) -> dict[str, float]:
-    """Return sizes at which the effect shows in a session."""
+    """Return sizes at which the effect is clearly visible in a session."""
     scales, side = _session_scales(effect, chain, place=place, travel=travel)
     return {
         p.name: float(f"{p.size(scales) * p.typical:.3g}") * (side if p.side else 1.0)
@@ -143,7 +143,7 @@ def _term(effect: Effect, place: int, values: Mapping[str, float]) -> EffectTerm
 def _place(effect: Effect, chain: Chain, at: float | None, *, where: str) -> int:
     """Return the cart or spring, or the usual one: cart 1, spring 2, or the only one there is.
 
-    Any that exists will do, also where no data could tell the effect from the linear chain.
+    Any existing one is accepted, even if no data could show the effect there.
     """
     if effect.place == "input":
         return 0
@@ -169,7 +169,7 @@ def _is_hard_to_tell(term: EffectTerm, chain: Chain) -> bool:
 def _refuse_impossible(
     parameter: EffectParameter, value: float, scales: PlaceScales, *, where: str
 ) -> None:
-    """Refuse a size the law has no meaning for."""
+    """Refuse a size without meaning in the law."""
     if parameter.signed or parameter.side:
         return
     lower = parameter.lower * parameter.size(scales)
@@ -179,7 +179,7 @@ def _refuse_impossible(
 
 
 def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str) -> None:
-    """Refuse friction that holds a cart at rest with less than it drags it in motion."""
+    """Refuse friction that is smaller at rest than in motion."""
     held, sliding = values.get("static_force"), values.get("force")
     if held is not None and sliding is not None and held < sliding:
         raise ConfigError(
@@ -189,7 +189,7 @@ def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str
 
 
 def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: str) -> None:
-    """Refuse an effect where the same, or another of its family, is already hidden."""
+    """Refuse an effect if the same one, or another of its family, is already hidden."""
     for other in present:
         related = other.effect.family and other.effect.family == term.effect.family
         if other.place == term.place and (other.effect is term.effect or related):
@@ -201,7 +201,7 @@ def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: st
 def _session_scales(
     effect: Effect, chain: Chain, *, place: int, travel: float
 ) -> tuple[PlaceScales, float]:
-    """Return typical sizes at a place in a session, and the side its larger step goes to.
+    """Return typical sizes at a place in a session, and the side of its larger step.
 
     They are those of the step; a spring is stretched further by the release of a cart.
     """
@@ -317,7 +317,7 @@ def _chain(entry: object, *, where: str) -> Chain:
 def _stored_effect(entry: object, bench: SimulatedBench, *, where: str) -> EffectTerm:
     """Return one effect; parameter values are numbers, or objects with a `value`.
 
-    Details of a contact that are not in the file get their usual size.
+    Contact details that are not in the file get their usual size.
     """
     fields = _mapping(entry, where=where)
     effect = _effect(str(fields.get("effect")), where=where)

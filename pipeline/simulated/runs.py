@@ -27,7 +27,7 @@ _REST = 0.5  # s of rest before a step and before a closed loop's
 
 @dataclass(frozen=True, kw_only=True)
 class SimulatedSession:
-    """A bench, and how thorough a session at it is.
+    """A bench, and the size of the session at it.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class SimulatedSession:
 
     @property
     def travel(self) -> float:
-        """How far the carts are meant to move, position units."""
+        """The intended motion of the carts, position units."""
         return self.bench.travel
 
     def clock(self, duration: float) -> Array:
@@ -61,7 +61,10 @@ class SimulatedSession:
 
 
 def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[BenchRun]:
-    """Release each cart by hand, the others held, several times; carts without a spring cannot."""
+    """Release each cart by hand, with the others held, several times;
+
+    carts without a spring are skipped.
+    """
     chain, runs = session.chain, []
     for cart in range(1, chain.n + 1):
         if chain.k[cart - 1] + chain.k[cart] == 0:
@@ -119,7 +122,7 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
     chain, runs = session.chain, []
     frequencies = dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
     for number, hertz in enumerate(frequencies, start=1):
-        # A session that saves space records one dwell in ten from rest.
+        # A compact session records one dwell in ten from rest.
         whole = session.transients or hertz == FIGURE_FREQUENCY or number % 10 == 0
         settled = SETTLED_DWELL if whole else 11.0  # time constants, after which nothing is left
         wait = settling_wait(chain, time_constants=settled)
@@ -187,5 +190,5 @@ def _all(session: SimulatedSession) -> tuple[int, ...]:
 
 
 def _typed(value: float, session: SimulatedSession) -> float:
-    """Return the input as one types it: two digits, within the limit."""
+    """Return the input as people type it: two digits, within the limit."""
     return min(float(f"{value:.2g}"), session.bench.input_limit)

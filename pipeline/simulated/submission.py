@@ -1,4 +1,4 @@
-"""A plant as a whole submission: `submission.toml` and the data a class would have recorded."""
+"""A plant as a whole submission: `submission.toml` and the data a class would record."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,15 +22,15 @@ from pipeline.submission.toml_section import toml_section
 
 @dataclass(frozen=True, kw_only=True)
 class Students:
-    """Who measured a simulated bench, and what they write of it beside their numbers.
+    """The people who measured a simulated bench, and the text beside their numbers.
 
     Attributes
     ----------
-    authors : ids; none: two that go with the seed, so that a class has no one twice.
-    title : of the submission; "": one that names the bench and the seed.
-    springs : which springs they say there are; none: those of the chain.
+    authors : ids; none: two that depend on the seed, so that a class has no duplicates.
+    title : of the submission; "": one with the bench and the seed.
+    springs : those they declare; none: those of the chain.
     time_decimals : of the log's stamps; 3 gives the rounded ones of an ECP export.
-    notes : text of `notes.md`; "": there is none.
+    notes : text of `notes.md`; "": no file.
     """
 
     authors: Sequence[str] = ()
@@ -52,19 +52,19 @@ def write_submission(
 ) -> None:
     """Write the submission of students who measured a bench; same arguments, same bytes.
 
-    Nothing written tells of the bench's effects, and the students believe in a linear chain.
+    No file mentions the bench's effects, and the students assume a linear chain.
 
     Parameters
     ----------
-    folder : made if need be; files of the same names are replaced.
+    folder : made if necessary; files of the same names are replaced.
     bench : the true plant, or a preset's name.
     compact : fewer repeats and dwells, most dwells without their transient: half the size.
-    reported : add what honest students claim, `[reported]`.
+    reported : add the numbers that honest students report, `[reported]`.
 
     Raises
     ------
     ConfigError : there is no such preset, or the simulation would never end.
-    DataError : the chain never settles, has no static gain, or runs away with its effects.
+    DataError : the chain never settles, has no static gain, or diverges with its effects.
     """
     bench = preset_bench(bench) if isinstance(bench, str) else bench
     bench.refuse_endless()
@@ -171,8 +171,8 @@ def _csv_text(
 ) -> str:
     """Return the log of one run: time, input, in a closed loop the reference, and x1 … xn.
 
-    `y` is (n_carts, n) whole counts, in position units; they are written with one digit
-    more than it takes to tell a count from the next.
+    `y` is (n_carts, n) whole counts, in position units, written with one digit more than is needed
+    to distinguish counts.
     """
     kept = run.t >= run.keep_from
     columns = {"time": _fixed(run.t[kept] - run.t[kept][0], time_decimals)}
@@ -187,7 +187,7 @@ def _csv_text(
 
 
 def _fixed(values: Array, decimals: int) -> list[str]:
-    """Format with fixed decimals, without the zeros that say nothing and without -0."""
+    """Format with fixed decimals, without trailing zeros and without -0."""
     texts = [f"{value:.{decimals}f}" for value in np.round(values, decimals) + 0.0]
     return [text.rstrip("0").rstrip(".") for text in texts] if decimals else texts
 

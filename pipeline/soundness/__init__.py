@@ -1,1 +1,1 @@
-"""What is wrong with a recording, or contradicts another: found here, and said in one place."""
+"""Faults of recordings, and contradictions between them: found here, worded in one place."""

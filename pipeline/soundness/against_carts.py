@@ -1,8 +1,8 @@
-"""Recordings that do not hold what happened: a dead or exchanged channel, a wrong clock, a cut.
+"""Recordings that do not hold what happened: a dead or swapped channel, a wrong clock, a cut.
 
-Friction may hold a cart still, a held cart is still by right, and a coarse encoder shows nothing
-of a small motion. So a channel is called dead only where the identified carts would have moved it
-far, and where runs that follow them leave friction too small to hold it.
+Friction may hold a cart still, a held cart is meant to be still, and a coarse encoder does not show
+a small motion. So a channel is called dead only if the identified carts would have moved it far,
+and if the runs that follow them limit friction to less than would hold it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence, Set
@@ -27,15 +27,15 @@ from pipeline.results import Record, StepGain
 from pipeline.soundness.fault import SAME, SIGMAS, RecordingFault
 from pipeline.soundness.other_readings import find_other_readings
 
-# A reading that stays while the input changes over half its range, and for this share of the record
-# after it; meanwhile the carts, as identified, must move by so many encoder steps, and by three
-# tenths of their motion, as a delay or play may hold one for a moment.
+# A constant reading while the input changes over half its range, and for this share of the record
+# after it. Meanwhile the identified carts must move by this many encoder steps, and by three tenths
+# of their motion, as a delay or play may hold one for a moment.
 _STILL, _SEEN_COUNTS = 0.2, 5.0
 _FEWEST_CYCLES = 1.5  # of a dwell: with fewer there is no steady state, whatever the damping
 
 
 def standing_still(records: Sequence[Record]) -> set[str]:
-    """Return the driven records in which a free cart's reading stays while the input changes."""
+    """Return the driven records with a constant reading of a free cart while the input changes."""
     return {
         record.id
         for record in records
@@ -46,19 +46,19 @@ def standing_still(records: Sequence[Record]) -> set[str]:
 def find_faults(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> dict[str, RecordingFault]:
-    """Return the records that do not hold what happened, by id, each with what is wrong.
+    """Return the records that do not hold what happened, by id, each with its fault.
 
     Parameters
     ----------
-    chain : the carts as identified from the records that are not in doubt; None where they could
-        not be: then only what no carts could do is found.
-    fits : how the records follow it, as `follow` has it.
+    chain : the carts as identified from the undoubted records; None if that failed: then only
+        faults that no carts could cause are found.
+    fits : how the records follow it, from `follow`.
     """
     readings = find_other_readings(records, chain=chain, fits=fits)
     misread = readings.mistaken
     everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
     copied = _copies(records)
-    steps: dict[int, float] = {}  # a dead channel shows none
+    steps: dict[int, float] = {}  # a dead channel shows no motion
     moving: set[int] = set()
     for record in records:
         for cart in measured(record):
@@ -71,7 +71,7 @@ def find_faults(
         )
         for cart in {cart for fit in fits.values() for cart in fit.lost}
     }
-    # However many are wrong: no bench is read a thousand times as slowly in some recordings.
+    # However many are wrong: no bench samples some recordings a thousand times more slowly.
     clocks = [record.sample_time for record in records]
     usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
     found: dict[str, RecordingFault] = {}
@@ -98,9 +98,10 @@ def find_faults(
 
 
 def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault]:
-    """Return the steps in which a cart moves farther than the one that pulls it, by id.
+    """Return the steps in which a cart moves further than the one that pulls it, by id.
 
-    The input acts on cart 1, springs do the rest: a static gain is at most that of the cart before.
+    The input acts on cart 1 and springs do the rest, so a static gain is at most that of the cart
+    before.
     """
     found: dict[str, RecordingFault] = {}
     by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
@@ -120,12 +121,12 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
 
 
 def _edges(y: np.ndarray) -> np.ndarray:
-    """Return where each stretch of one and the same reading starts, and where the last ends."""
+    """Return the starts of stretches of constant reading, and the end of the last."""
     return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
 
 
 def _still(record: Record, cart: int) -> Iterator[slice]:
-    """Yield the samples of one and the same reading over which the input changes far."""
+    """Yield stretches of constant reading over which the input changes far."""
     u, y = record.u, record.position(cart)
     if u is None:
         return
@@ -146,7 +147,7 @@ def _dead_channels(
     steps: Mapping[int, float],
     moving: Set[int],
 ) -> Iterator[RecordingFault]:
-    """Yield each free cart's reading that stays where the cart must have moved.
+    """Yield each free cart's reading that is constant although the cart must have moved.
 
     By cart, `friction` is the most that the records allow, `steps` has the encoder step; `moving`
     are the carts that any input ever moved.
@@ -162,7 +163,7 @@ def _dead_channels(
             continue
         force = force_on(record, chain, cart=cart)
         for still in _still(record, cart):
-            # Friction that holds a cart pulls at most as far to one side as then to the other.
+            # Friction that holds a cart on one side holds it equally on the other.
             if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
                 continue
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
@@ -179,10 +180,10 @@ def _frozen(
     friction: Mapping[int, float],
     steps: Mapping[int, float],
 ) -> Iterator[RecordingFault]:
-    """Yield each reading that stays for a while in which the carts moved it far.
+    """Yield each reading that stays constant for a while in which the carts moved it far.
 
-    For ten samples and more, by a fifth of its motion. Before and after it follows them, and what
-    pulls at it meanwhile no friction can hold.
+    For ten samples or more, by a fifth of its motion. Before and after it follows them, and the
+    force on it meanwhile exceeds any friction.
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
@@ -202,7 +203,7 @@ def _frozen(
                 continue
             elsewhere = float(np.mean(rest**2))
             follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
-            # It does follow them: it misses them by a quarter of that motion at most.
+            # It does follow them, with an error of at most a quarter of that motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
                 said = _span(record, part)
                 yield RecordingFault(code="froze_in_motion", run=record.id, cart=cart, said=said)
@@ -226,7 +227,7 @@ def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: f
 
 
 def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
-    """Return the records that hold the very samples of one of their kind before them."""
+    """Return the records with exactly the samples of an earlier one of their kind."""
     first: dict[tuple[object, ...], str] = {}
     copies = {}
     for record in records:
@@ -268,16 +269,16 @@ def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFau
 def _strays(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> Iterator[RecordingFault]:
-    """Yield the records that follow no carts like those that most records follow, and by how far.
+    """Yield the records that follow no carts like those of most records, and by how far.
 
-    Any cart that follows counts for the record: another may be near its null, and hardly move.
-    One that moves less than it should says nothing: friction may hold it.
+    One cart that follows is enough: another may be near its null, and hardly move. A cart that
+    moves less than it should proves nothing: friction may hold it.
     """
     if chain is None or not most_follow(fits):
         return
     for record in records:
         fit = fits.get(record.id)
-        # Friction makes no cart move further, so none that moves less is judged.
+        # Friction makes no cart move further, so a cart that moves less is not judged.
         if fit is None or fit.belongs or max(fit.reach.values()) < 0.8:
             continue
         # More than half of the power of every cart.

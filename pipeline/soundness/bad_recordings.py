@@ -1,4 +1,4 @@
-"""Every recording that does not hold what it should: left out, clipped, or not as stated."""
+"""Every recording with a fault: left out, clipped, or not as stated."""
 
 from collections.abc import Iterator
 
@@ -11,12 +11,12 @@ from pipeline.soundness.fault import RecordingFault, say, sound_ones
 from pipeline.soundness.late_channels import late_experiments
 from pipeline.soundness.stated import find_other_scales, find_wrong_setups, why_other_frequency
 
-# Relative: a stated frequency further from that of the input is another run's.
+# Relative: a stated frequency further from that of the input belongs to another run.
 _OTHER_RUN = 0.08
 
 
 def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
-    """Return the recordings that do not hold what they should, each with what is wrong."""
+    """Return the recordings that do not hold what they should, each with its fault."""
     found = dict(analysis.unreadable)
     found |= {one.experiment: one.reason for one in analysis.left_out if one.is_wrong}
     sound = sound_ones(analysis.records, analysis.left_out)
@@ -42,7 +42,7 @@ def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
 
 
 def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFault]:
-    """Yield the channels that are clipped, and an input of another frequency than stated."""
+    """Yield clipped channels, and inputs with another frequency than stated."""
     for cart in record.carts:
         if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
             continue

@@ -1,4 +1,4 @@
-"""What encoders alone show: that one is in another unit of length, or that it stuck."""
+"""Faults that encoders alone show: another unit of length, or a stuck encoder."""
 
 from collections.abc import Sequence
 
@@ -16,10 +16,10 @@ def find_other_units(
 ) -> dict[str, RecordingFault]:
     """Find the records whose encoder step is that of the others in another unit, by id.
 
-    A class of a dozen dwells was exported in one go, and so may all be wrong: the usual step is
-    what most kinds of experiment have, not most records. A step of 0.01 beside one of 0.001 is
-    how many decimals were written. A decay gives no length, so that it is as good in any unit:
-    those are looked for alone, with `decays`.
+    A class of a dozen dwells may have been exported together, and so may all be wrong: the usual
+    step is that of most kinds of experiment, not of most records. A step of 0.01 beside one of
+    0.001 only shows the number of decimals. A decay defines no length, so any unit is good: those
+    are searched alone, with `decays`.
     """
     found: dict[str, RecordingFault] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
@@ -49,15 +49,15 @@ def _alike(step: float, other: float) -> bool:
 
 
 def _is_decimal(step: float) -> bool:
-    """Whether a step is 1 of some decimal place, as numbers are written."""
+    """Whether a step is 1 in some decimal place, as numbers are written."""
     return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
 
 
 def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
     """Return the records in which a free cart's encoder stuck, by id.
 
-    Static friction stops a cart from a crawl, far below the fastest 2 % of its moves from sample to
-    sample; it does not stop one at speed, nor is it elsewhere when it moves on.
+    Static friction stops a cart from a crawl, far below the fastest 2 % of its moves between
+    samples. It does not stop a fast cart, nor is the cart elsewhere when it moves on.
     """
     found: dict[str, RecordingFault] = {}
     for record in records:

@@ -1,7 +1,8 @@
-"""A fault of a recording, and where it becomes a sentence: `templates/words/soundness.toml`.
+"""A fault of a recording, with its sentence from `templates/words/soundness.toml`.
 
-`tests/statistics/test_honest_records.py` shows that no honest record is accused, of sticking carts
-and coarse encoders too; `tests/grading/mistakes/test_faults.py` that wrong ones are found.
+`tests/statistics/test_honest_records.py` shows that honest records are not accused, even with
+sticking carts and coarse encoders; `tests/grading/mistakes/test_faults.py` shows that wrong ones
+are found.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,24 +13,24 @@ from pipeline.words.phrases import phrases
 
 _WORDS = phrases("soundness")
 
-# Who may bear witness: one record, or one kind of record, is right or wrong by chance.
+# The unit of evidence: one record, or one kind of record, may be wrong by chance.
 WITNESSES = 2
 SIGMAS = 4.0  # standard errors: by chance one number in 16,000 is as far off
 SAME = 0.02  # relative: of an encoder step, a clock or a length that a program sets for all
-SAME_SIZE = 0.2  # relative: two steps that friction treats alike
+SAME_SIZE = 0.2  # relative: two steps that friction affects equally
 
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingFault:
-    """What is wrong with a recording, or contradicts others.
+    """A fault of a recording, or its contradiction to others.
 
     Attributes
     ----------
-    code : of which sort; the key of its sentence.
-    run, cart : where; no cart where it is none's.
-    said : what stands in the sentence, already written as text.
-    value, limit : the number that shows it, and how large it may be at most, if there is one.
-    is_wrong : the recording does not hold what happened; else it only stands off others.
+    code : its kind; the key of its sentence.
+    run, cart : its place; no cart if it concerns none.
+    said : values in the sentence, as text.
+    value, limit : the number that shows it, and its largest allowed value, if there is one.
+    is_wrong : the recording does not hold what happened; else it only differs from others.
     """
 
     code: str
@@ -42,12 +43,12 @@ class RecordingFault:
 
     @property
     def reason(self) -> str:
-        """What is wrong, in words that follow the recording's name."""
+        """The fault in words that follow the recording's name."""
         return _WORDS.text(self.code, cart=self.cart, **self.said)
 
     @property
     def left_out(self) -> LeftOut:
-        """The recording as one that is not used."""
+        """The recording as an entry of the unused ones."""
         return LeftOut(experiment=self.run, reason=self.reason, is_wrong=self.is_wrong)
 
     def check(self, kind: CheckKind) -> Check:
@@ -64,11 +65,11 @@ class RecordingFault:
 
 
 def say(key: str, **values: str) -> str:
-    """Return a part of such a sentence, or one with others in it."""
+    """Return a part of such a sentence, or one that contains others."""
     return _WORDS.text(key, **values)
 
 
 def sound_ones(records: Sequence[Record], left_out: Sequence[LeftOut]) -> list[Record]:
-    """Return the records of which nothing is said to be wrong; they may stand off others."""
+    """Return the records without a serious fault; they may differ from others."""
     wrong = {one.experiment for one in left_out if one.is_wrong}
     return [record for record in records if record.id not in wrong]

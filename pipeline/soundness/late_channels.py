@@ -1,4 +1,4 @@
-"""Channels against each other: is one of them logged later than the others?"""
+"""Channels compared with each other: is one of them logged late?"""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,25 +8,25 @@ from pipeline.estimation.chain.channel_delay import ChannelDelay, find_channel_d
 from pipeline.results import LateChannel, Record
 from pipeline.soundness.fault import RecordingFault
 
-_LATE, _SURE = 2.0, 4.0  # samples, and standard errors, that a channel is late by at least
-# With its delay the carts' own law must leave so many times less. Friction, stops and stiff springs
-# on benches all over what a lab may have look like delays that leave 1.7 times less at most; 44 ms
-# leave 8 times on a bench with much friction, and thousands on one without.
+_LATE, _SURE = 2.0, 4.0  # samples, and standard errors, by which a late channel must be late
+# With its delay the residual of the carts' own law must fall by this factor. Friction, stops and
+# stiff springs on benches of every kind look like delays that lower it by 1.7 times at most. 44 ms
+# lower it by 8 times on a bench with much friction, and by thousands on one without.
 _BETTER = 5.0
 
 
 def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateChannel, ...]:
     """Find the carts whose channel is read later, or earlier, than that of the first one.
 
-    Each kind of experiment is asked alone: one may have been logged otherwise than another. A
-    delay of the input moves all channels alike, and is none of theirs.
+    Each kind of experiment is tested alone, as one may have been logged differently. A delay of the
+    input moves all channels equally and is not found here.
     """
     late: list[LateChannel] = []
     for kind in ("sine", "step", "sweep", "decay", "closed_loop"):
         alike = [record for record in records if record.kind == kind]
         if alike:
             late += _late_in(alike, kind=kind, carts=carts)
-    # Beside a late channel a right one is early.
+    # Compared with a late channel a right one is early.
     named = {one.cart for one in late if one.than == 1}
     return tuple(one for one in late if one.than not in named)
 
@@ -37,14 +37,14 @@ def _late_in(records: Sequence[Record], *, kind: str, carts: int) -> list[LateCh
     first, delay, limit = 1, 0.0, 0.0
     found: list[LateChannel] = []
     for cart in range(2, carts + 1):
-        if cart not in links:  # what comes after is held against this one
+        if cart not in links:  # later channels are compared with this one
             first, delay, limit = cart, 0.0, 0.0
             continue
         link = links[cart]
         if _shows(link, sample=sample):
             delay, limit = delay + link.delay, max(limit, _limit(link, sample=sample))
         elif abs(link.delay) + _SURE * link.std > _LATE * sample:
-            # It tells neither a delay nor that there is none.
+            # It shows neither a delay nor its absence.
             first, delay, limit = cart, 0.0, 0.0
         if abs(delay) > max(limit, _LATE * sample):
             found.append(
@@ -69,12 +69,12 @@ def _shows(link: ChannelDelay, *, sample: float) -> bool:
 
 
 def late_fault(late: LateChannel) -> RecordingFault:
-    """Return by how much a cart is read late, as a fault of the first of its recordings."""
+    """Return the delay of a cart's channel, as a fault of the first of its recordings."""
     when = "later" if late.delay > 0 else "earlier"
     said = {"delay": f"{1e3 * abs(late.delay):.3g}", "when": when, "than": str(late.than)}
     return RecordingFault(code="late_channel", run=late.experiments[0], cart=late.cart, said=said)
 
 
 def late_experiments(late: Sequence[LateChannel]) -> Mapping[str, str]:
-    """Return the experiments in which a cart is late, each with what is to be said of it."""
+    """Return the experiments in which a cart is late, each with its sentence."""
     return {name: late_fault(one).reason for one in reversed(late) for name in one.experiments}

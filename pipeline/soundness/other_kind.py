@@ -1,4 +1,4 @@
-"""Recordings of another experiment: an input of another kind, a file that is cut or a copy."""
+"""Recordings of another experiment: another kind of input, a truncated file or a copy."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -13,7 +13,7 @@ from pipeline.soundness.fault import SAME, WITNESSES, RecordingFault
 def find_other_kinds(
     records: Sequence[Record], *, files: Mapping[str, str]
 ) -> dict[str, RecordingFault]:
-    """Return the records that are no whole recording of the kind stated, by id.
+    """Return the records that are not a complete recording of their kind, by id.
 
     `files` has the digest of each data file.
     """
@@ -47,10 +47,10 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
-    """Yield that a file looks cut: its repeats run for one and the same time, over twice as long.
+    """Yield files that look truncated: the repeats all have one duration, over twice as long.
 
-    Whoever stops by hand stops anywhere. A repeat whose clock is in another unit lasts long with
-    no more samples.
+    A person who stops by hand stops at any time. A repeat whose clock is in another unit lasts long
+    with no more samples.
     """
     if record.kind not in ("decay", "step"):
         return

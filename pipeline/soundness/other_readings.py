@@ -1,7 +1,8 @@
-"""Which records follow the carts only if they are read otherwise, and whose mistake that is.
+"""Records that follow the carts only if they are read differently, and who made the mistake.
 
-A unit, or a clock, is that of all that one program logged. A single record that moves a tenth as
-far is odd and no more: an amplifier at its limit, a dead zone or friction does as much.
+A unit, or a clock, applies to everything that one program logged. A single record that moves a
+tenth as far is odd and no more: an amplifier at its limit, a dead zone or friction has that effect
+too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,11 +18,11 @@ from pipeline.soundness.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault
 
 @dataclass(frozen=True, kw_only=True)
 class OtherReadings:
-    """The records that follow only if read otherwise, by id.
+    """The records that follow only if read differently, by id.
 
     Attributes
     ----------
-    mistaken : read as they are they do not hold what happened.
+    mistaken : as they are, they do not hold what happened.
     odd : … or the bench did something that no chain does.
     """
 
@@ -32,9 +33,9 @@ class OtherReadings:
 def find_other_readings(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> OtherReadings:
-    """Find the records that follow the chain only if they are read otherwise.
+    """Find the records that follow the chain only if they are read differently.
 
-    Where this is so of most of a kind, it is of those of the kind that tell it less clearly.
+    If this holds for most of a kind, it holds for those of the kind that show it less clearly.
     """
     if chain is None:
         return OtherReadings()
@@ -50,7 +51,7 @@ def find_other_readings(
             }
         found |= sure
     legal = {name for name, misread in found.items() if misread.legal}
-    if 2 * len(legal) > len(fits):  # then the bench counts so
+    if 2 * len(legal) > len(fits):  # then the bench counts that way
         found = {name: misread for name, misread in found.items() if name not in legal}
     agreeing = sum(fit.belongs for name, fit in fits.items() if name not in found) + len(found)
     if agreeing < WITNESSES:
@@ -65,11 +66,11 @@ def find_other_readings(
 def without_lone_factors(
     found: Mapping[str, Misread], records: Sequence[Record], *, fits: Mapping[str, Followed]
 ) -> dict[str, Misread]:
-    """Return the readings without those by a factor that not every record of their kind shares.
+    """Return the readings without factors that not every record of their kind shares.
 
     Parameters
     ----------
-    records : all that are held against the chain; `fits` is how each follows it as it is.
+    records : all that are compared with the chain; `fits` is how each follows it unchanged.
     """
     kept = {name: m for name, m in found.items() if m.scale is None and m.clock is None}
     for alike in _by_kind(records):
@@ -103,8 +104,8 @@ def _may_be_a_limit(
 ) -> bool:
     """Whether no input so large moves the carts as far as it should, and all are of one size.
 
-    Then an amplifier at its limit makes one and the same factor of all. Of inputs of several
-    sizes it makes several.
+    Then an amplifier at its limit gives one factor for all. For inputs of several sizes it gives
+    several.
     """
     sizes = [_size(record) for record in sharing]
     follows = [_size(r) for r in records if r not in sharing and fits[r.id].belongs]
@@ -117,7 +118,7 @@ def _size(record: Record) -> float:
 
 
 def _is_sampled_so(record: Record, records: Sequence[Record], *, factor: float) -> bool:
-    """Whether a record's samples lie so many times further apart than those of the others."""
+    """Whether a record's sample interval is this many times that of the others."""
     others = [other.sample_time for other in records if other is not record]
     usual = factor * float(np.median(others)) if others else 0.0
     return abs(record.sample_time - usual) <= SAME * usual

@@ -1,8 +1,8 @@
-"""Numbers measured more than once: whether the runs agree, which stand off, and what they did.
+"""Numbers measured more than once: whether the runs agree, which are odd, and why.
 
-A frequency or a gain that two runs give 10 % apart, and beyond their errors, is no number with a
-wide error: one of the runs is wrong. The fit tells which, else the majority; else nothing does.
-Runs that agree with each other may share a mistake: dwells that one chain explains tell it.
+If two runs give a frequency or a gain 10 % apart, beyond their errors, that is not a number with a
+wide error: one of the runs is wrong. The fit tells which, else the majority, else nobody. Runs that
+agree may share a mistake: dwells that one chain explains reveal it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,20 +16,20 @@ from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LogDecrement, StepGain
 from pipeline.soundness.fault import SAME_SIZE, SIGMAS, RecordingFault
 
-_LIKE_THE_FIT = 0.15  # relative: as far as initial and final estimates may lie apart (Throne 2005)
-# Factors by which friction, play or a soft hold may move a gain or a frequency.
+_LIKE_THE_FIT = 0.15  # relative: the usual distance of initial and final estimates (Throne 2005)
+# Factors by which friction, play or a soft hold may change a gain or a frequency.
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repeats:
-    """Repeated measurements held against one another.
+    """Repeated measurements compared with each other.
 
     Attributes
     ----------
     checks : one for each number that was measured more than once.
-    odd : the runs that stand off, by id, each with what is wrong.
-    undecided : the numbers whose runs contradict one another, nobody knows which is right.
+    odd : the runs that differ, by id, each with its fault.
+    undecided : the numbers whose runs contradict each other without a decision.
     """
 
     checks: tuple[Check, ...] = ()
@@ -39,10 +39,9 @@ class Repeats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reading:
-    """One run's value, between where it lies, and the size of the step it was read from.
+    """One run's value, its interval, and the size of the step it was read from.
 
-    `tolerance` : percent that runs may differ by: the same run made twice differs by some percent
-    with dry friction.
+    `tolerance` : percent that runs may differ by: repeats differ by some percent with dry friction.
     """
 
     run: str
@@ -61,15 +60,15 @@ def compare_repeats(
     fitted: Mapping[str, Estimate],
     dwells: Mapping[str, Estimate],
 ) -> Repeats:
-    """Hold the runs that give one frequency, damping or static gain against one another.
+    """Compare the runs that give one frequency, damping or static gain.
 
     Parameters
     ----------
     fitted : the parameters of a fit that explains most records; else none.
-    dwells : … of one that rests on dwells alone, and explains them; else none.
+    dwells : … of one from dwells alone that explains them; else none.
     """
     readings = _readings(decays, steps, carts=carts)
-    # A fit's damping rests on the decays' own where its points do not tell it.
+    # A fit's damping uses the decays if its points do not determine it.
     told = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
     right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
@@ -127,7 +126,7 @@ def _readings(
             )
         )
         slack = SIGMAS * decay.zeta_std
-        # Dry friction adds the more damping the less the cart swings.
+        # The smaller the swing, the more damping dry friction adds.
         sticks = decay.friction is not None and decay.friction.present
         ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
         found.setdefault(own_zeta(decay.cart, n=carts), []).append(
@@ -142,7 +141,7 @@ def _readings(
         )
     for step in steps:
         name, slack = gain_name(step.cart, n=carts), SIGMAS * step.gain_std
-        low, high = step.interval or (step.gain, step.gain)  # where the cart sticks
+        low, high = step.interval or (step.gain, step.gain)  # if the cart sticks
         found.setdefault(name, []).append(
             _Reading(
                 run=step.experiment,
@@ -164,20 +163,23 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
 
 
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
-    """Whether steps of one size agree, those of another only among themselves: dry friction."""
+    """Whether steps of one size agree, and those of another only among themselves: dry friction."""
     size = np.array([reading.size for reading in readings])
     alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)
 
 
 def _differ_in_size(readings: Sequence[_Reading]) -> bool:
-    """Whether steps are of several sizes, of which a limit or friction makes several gains."""
+    """Whether steps have several sizes, for which a limit or friction gives several gains."""
     size = np.array([reading.size for reading in readings])
     return bool(size.min() < (1 - SAME_SIZE) * size.max())
 
 
 def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
-    """Return the readings that belong together: all, those like the fit, or most; none: open."""
+    """Return the readings that belong together:
+
+    all, those like the fit, or most; none: undecided.
+    """
     apart = _contradictions(readings)
     if not np.any(apart):
         return list(readings)
@@ -194,7 +196,7 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
 
 
 def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
-    """Whether a reading and its errors are of another number than one that is well known."""
+    """Whether a reading with its errors differs from a well-known number."""
     if told.std is None or told.value <= 0 or SIGMAS * told.std > _LIKE_THE_FIT * told.value:
         return False
     factor = _BY_THE_BENCH[read_name(name).symbol]
@@ -202,7 +204,7 @@ def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
 
 
 def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
-    """Return how a decay's clock makes its own frequencies of the usual ones, or ""."""
+    """Return which clock error would turn a decay's frequencies into the usual ones, or ""."""
     ratios = [
         usual[name] / value
         for name, value in values.items()
@@ -217,13 +219,13 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
-    """Whether all carts went the other way: a log may count its input so by right."""
+    """Whether all carts went the other way: a log may rightly count its input so."""
     known = [name for name in values if read_name(name).is_gain and usual.get(name)]
     return bool(known) and all(_near(values[name], -usual[name]) for name in known)
 
 
 def _near(value: float, other: float) -> bool:
-    # What a known mistake leaves of the difference between two runs.
+    # The difference between two runs that a known mistake leaves.
     return abs(value - other) <= 0.05 * abs(other)
 
 

@@ -1,4 +1,4 @@
-"""Repeats of one experiment, and which of them stands off the others."""
+"""Repeats of one experiment, and the one that differs from the others."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -9,13 +9,13 @@ from pipeline.arrays import Array
 from pipeline.results import Record
 from pipeline.soundness.fault import RecordingFault
 
-_MATERIAL = 0.05  # of the response; a smaller difference changes nothing anybody would act on
-# How many spreads of the others a repeat must stand off. Where all repeats differ by chance
-# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer where they
-# differ in several ways; three repeats leave one difference to judge by, hence the caution.
+_MATERIAL = 0.05  # of the response; a smaller difference has no consequence
+# The number of spreads of the others by which a repeat must differ. If all repeats differ by chance
+# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer if they differ
+# in several ways. Three repeats leave one difference to judge by, hence the caution.
 _SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
 _AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
-_START_SAMPLES = 3  # their median is the start: too few to move, enough to outvote a spike
+_START_SAMPLES = 3  # their median is the start: too few to move it, enough to outvote a spike
 
 
 def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, RecordingFault]:
@@ -64,7 +64,7 @@ def _excitation(record: Record) -> Array:
 
 
 def _is_repeat(first: Record, other: Record) -> bool:
-    """Tell whether two records are repeats of one experiment."""
+    """Return whether two records are repeats of one experiment."""
     spans = np.ptp(first.t), np.ptp(other.t)
     if (first.kind, first.free, first.carts) != (other.kind, other.free, other.carts):
         return False
@@ -92,10 +92,10 @@ def _rms(signal: Array) -> float:
 
 
 def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
-    """Return how far the responses differ pair by pair, (n, n), and how far they may.
+    """Return the difference of the responses pair by pair, (n, n), and the allowed one.
 
-    Root-mean-squares over carts and time. Positions count from where the record starts, as the
-    encoders need not start at zero; where a cart comes to rest is part of its response.
+    Root-mean-squares over carts and time. Positions count from the start of the record, as encoders
+    need not start at zero; the final rest is part of the response.
     """
     t = _common_times(*group)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
@@ -109,7 +109,7 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
 def _farthest(
     differences: Array, left: Sequence[int], *, expected: Array
 ) -> tuple[int, float, float] | None:
-    """Return index, distance and spread of the others of the repeat that stands off, if any."""
+    """Return index, distance and spread of the others of the odd repeat, if any."""
     threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
     candidates = []
     for index in left:

@@ -1,4 +1,4 @@
-"""Recordings that contradict what is stated of them: free carts, units, frequencies."""
+"""Recordings that contradict their description: free carts, units, frequencies."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,18 +10,18 @@ from pipeline.results import Record
 from pipeline.set_up import Bench
 from pipeline.soundness.fault import RecordingFault, say
 
-OTHER_DWELL = 0.1  # relative: a dwell stated so far off is another one
-LEAST_SHARE = 0.2  # of a held cart's swing: a free one that moves less is not the free one
-_HELD_FIRMLY = 0.05  # of the free carts' swing: what a firm hold yields at most
-_LONGEST = 3.0  # m from end to end: no bench has so long a track
+OTHER_DWELL = 0.1  # relative: a dwell this far off its stated frequency is another one
+LEAST_SHARE = 0.2  # of a held cart's swing: a cart that moves less is not the free one
+_HELD_FIRMLY = 0.05  # of the free carts' swing: the most that a firm hold yields
+_LONGEST = 3.0  # m from end to end: no bench has such a long track
 _LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
 _LARGEST = 100.0  # V: no amplifier at a bench gives as much
 
 
 def swings(record: Record) -> tuple[float, dict[int, float]]:
-    """Return how far the free carts move at most, and by cart how far the held ones do.
+    """Return the largest swing of the free carts, and by cart that of the held ones.
 
-    Where no free cart was measured nothing is said of those that were held.
+    If no free cart was measured, nothing is returned for the held ones.
     """
     swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
     free = [swing.pop(cart) for cart in record.carts if cart in record.free]
@@ -48,7 +48,7 @@ def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
-    """Find the carts that should be held and move much beside the free ones."""
+    """Find carts that should be held and move much compared with the free ones."""
     found = []
     for record in records:
         free, held = swings(record)
@@ -68,10 +68,10 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[RecordingFault]:
-    """Find where positions or inputs reach further than any bench: they are in another unit.
+    """Find positions or inputs beyond any bench: they are in another unit.
 
-    Counts for a length, millivolts for volts: the carts that such records give explain them as
-    well as the right ones, and only every gain is off.
+    Counts for a length, millivolts for volts: the carts from such records explain them as well as
+    the right ones, and only the gains are off.
     """
     found = []
     unit, metres = bench.units.position, conversion(bench.units.position, "m")
@@ -97,7 +97,7 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
 
 
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
-    """Return how far two kinds of experiment reach, and where: one alone may be a slip."""
+    """Return the range of two kinds of experiments, and its place: one alone may be a slip."""
     by_kind: dict[str, tuple[float, str]] = {}
     for record, reach in reaches:
         by_kind[record.kind] = max(by_kind.get(record.kind, (0.0, "")), (reach, record.id))
@@ -105,7 +105,7 @@ def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
 
 
 def why_other_frequency(ratio: float) -> str:
-    """Return what a dwell stated at so many times its frequency looks to be, or ""."""
+    """Return a likely reason for a dwell stated at this multiple of its frequency, or ""."""
     turns = {2 * np.pi: "frequency_in_radians", 1 / (2 * np.pi): "frequency_divided"}
     for factor, key in turns.items():
         if abs(ratio / factor - 1) < OTHER_DWELL:

@@ -1,1 +1,1 @@
-"""One file a stage; stages never import each other."""
+"""One file for each stage; stages never import each other."""

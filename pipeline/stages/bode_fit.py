@@ -27,12 +27,12 @@ from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 from pipeline.set_up import Bench
 
-_START_SPREAD = 0.5  # of ln m and ln k of a random start: half to double, mostly
+_START_SPREAD = 0.5  # of ln m and ln k of a random start: mostly half to double
 _START_ZETAS = (0.02, 0.3)
-_SEED = 2005  # of the random starts; any, but the same every time
-_NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost to stop at: on the way there, and at the end
-_EVALUATIONS = 100  # a fit that gets there takes about ten
-_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # where a missing relative error may lie; ratio
+_SEED = 2005  # of the random starts; any number, but always the same
+_NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost at which it stops: on the way, and at the end
+_EVALUATIONS = 100  # a successful fit takes about ten
+_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds of a missing relative error; ratio
 
 
 def fit_bode(
@@ -45,23 +45,23 @@ def fit_bode(
 ) -> ChainFit:
     """Fit the chain of n carts to measured frequency responses; carts may be missing.
 
-    Phases are used where they are given and agree with the magnitudes, else magnitudes alone;
-    they are used unasked where the magnitudes are no more than the parameters.
-    A parameter that the data put at or below zero is held there and the others fitted again. A few
-    dwells beside a sharp peak leave its damping open down to zero: the damping ratios of decays
-    that do not contradict are then further points to fit.
+    Phases are used if they are given and agree with the magnitudes, else magnitudes alone; they are
+    used without this check if there are no more magnitudes than parameters. A parameter that the
+    data put at or below zero is held there and the others are fitted again. A few dwells beside a
+    sharp peak leave its damping open down to zero. Then the damping ratios of decays that do not
+    contradict are further points of the fit.
 
-    Where the misfit is larger than the points' errors allow, the chain does not describe the bench
-    to that precision: a relative error, the same for all points, is added until it does, and
-    the chain fitted once more. `chi_square_per_dof` and `standardised` keep the stated errors.
-    For a table, which states none, standard errors follow the misfit either way.
+    If the misfit is larger than the points' errors allow, the chain does not describe the bench to
+    that precision. Then a relative error, the same for all points, is added until it does, and the
+    chain is fitted once more. `chi_square_per_dof` and `standardised` keep the stated errors. For a
+    table without errors, standard errors follow the misfit in any case.
 
     Parameters
     ----------
-    bench : which carts and springs there are.
-    initial : named parameters to start from, as far as known.
-    decays : by cart, the damping ratio it has alone; used only where the responses put it at zero.
-    near : carts like these, fitted before: the one start, in place of all others.
+    bench : its carts and springs.
+    initial : named parameters to start from, if known.
+    decays : by cart, its damping ratio alone; used only if the responses put it at zero.
+    near : similar carts, fitted before: the only start, in place of all others.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def fit_bode(
     Raises
     ------
     DataError : too few amplitudes and phases for the parameters, responses that do not determine
-        them, or none of the starts leads anywhere.
+        them, or no successful start.
     """
     P, n = Parametrisation(bench=bench), bench.n
     data = Points.collect(responses, n=n)
@@ -101,7 +101,7 @@ def fit_bode(
 
 
 def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chain:
-    """Return a chain of even carts with the right gain and mean frequency."""
+    """Return a chain of equal carts with the right gain and mean frequency."""
     first = np.flatnonzero(data.cart == np.min(data.cart))
     lowest = first[np.argmin(data.omega[data.at[first]])]
     highest = first[np.argmax(data.omega[data.at[first]])]
@@ -121,7 +121,7 @@ def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chai
 def _staged_start(
     data: Points, known: Mapping[str, float], *, bench: Bench, like: Chain
 ) -> tuple[StagedFit | None, Chain]:
-    """Fit stage by stage and return the chain it implies, made possible where it is not."""
+    """Fit stage by stage and return the implied chain, made possible if it is not."""
     if not any(bench.springs):
         return None, like
     measured = {}
@@ -141,7 +141,7 @@ def _staged_start(
 
 def _random_starts(like: Chain, *, bench: Bench) -> Iterator[Chain]:
     rng = np.random.default_rng(_SEED)
-    # Random starts, tried where the first does not explain the data.
+    # Random starts, tried if the first does not explain the data.
     for _ in range(8):
         m = like.m * np.exp(_START_SPREAD * rng.standard_normal(like.m.shape))
         k = like.k * np.exp(_START_SPREAD * rng.standard_normal(like.k.shape))
@@ -175,11 +175,11 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
     def evaluate(theta: Array) -> tuple[Array, Array]:
         r, J = weighted_residuals(P, data, scale, P.physical(P.unpack(theta)))
         J = J * P.dp_dtheta(theta)
-        if not np.isfinite(np.sum(J**2)):  # without a Jacobian no step could go on from here
+        if not np.isfinite(np.sum(J**2)):  # without a Jacobian no step could follow
             r = np.full_like(r, np.nan)
         return r, J
 
-    # A step that goes astray may overflow; least_squares then takes a shorter one.
+    # A bad step may overflow; least_squares then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         if not np.isfinite(np.sum(evaluate(theta)[0] ** 2)):
             raise DataError("Bode fit: no chain comes near responses as far apart as these")
@@ -203,7 +203,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
 def _fit_from_starts(
     P: Parametrisation, data: Points, starts: Iterable[Chain]
 ) -> tuple[_Fitted, int]:
-    """Fit from one start after the other while the data are not explained."""
+    """Fit from one start after the other until the data are explained."""
     fits: list[_Fitted] = []
     failed: list[DataError] = []
     for start in starts:
@@ -221,11 +221,12 @@ def _fit_from_starts(
 
 
 def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
-    """Fit again with the phases, where there are any that agree with the magnitudes."""
+    """Fit again with the phases, if there are any that agree with the magnitudes."""
     if not data.n_phases:
         return fitted, ""
-    # As few magnitudes as parameters say nothing about what the phases should be.
-    # Phases count unless so many times as far off as the magnitudes: a delay or a wrong sign is.
+    # If there are only as many magnitudes as parameters, they do not predict the phases. Phases are
+    # used unless they are this many times as far off as the magnitudes, as with a delay or a wrong
+    # sign.
     limit = 3.0 * max(1.0, fitted.chi_square_per_dof**0.5)
     if fitted.dof > 0 and _phase_misfit(fitted, data) > limit:
         return fitted, "magnitudes alone: the phases do not agree with them"
@@ -233,13 +234,13 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
 
 
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
-    """Fit again with the relative error that makes the misfit what the errors allow; 0 if it is."""
+    """Fit again with the relative error that explains the misfit; 0 if none is needed."""
     excess = fitted.chi_square_per_dof - 1
     # Standard deviations of χ² above its mean: by chance once in a thousand.
     if data.from_table or excess <= 3.1 * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
-    # Fits in turn with the error they call for: it settles to a per cent.
+    # Fits alternating with the required error: it converges to a percent.
     for _ in range(3):
         share = _missing_share(fitted, data)
         widened = data.widened(share)
@@ -248,7 +249,7 @@ def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
 
 
 def _missing_share(fitted: _Fitted, data: Points) -> float:
-    """Return the relative error that brings chi² down to its degrees of freedom, by bisection."""
+    """Return the relative error that lowers chi² to its degrees of freedom, by bisection."""
     low, high = -np.log(_SHARES[1]), -np.log(_SHARES[0])
     while high - low > _SHARE_PRECISION:
         middle = (low + high) / 2
@@ -270,8 +271,8 @@ def _hold_vanished(
 ) -> tuple[_Fitted, Points]:
     """Fit again with every parameter at zero that the data put there or below.
 
-    But where a damping is among them that a decay tells, all decays are fitted along: points that
-    leave one damping open know little of the others. Return also the points, with those decays.
+    If a decay gives one of these dampings, all decays join the fit: points that leave one damping
+    open say little about the others. Return also the points, with those decays.
     """
     P, chain = fitted.parametrisation, fitted.chain
     sizes = _natural_sizes(P, chain, data)
@@ -284,7 +285,7 @@ def _hold_vanished(
     if not vanished:
         return fitted, data
     needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
-    k = chain.k[:-1] + chain.k[1:]  # below zero where k_1 is: a cart that no decay is of
+    k = chain.k[:-1] + chain.k[1:]  # below zero for k_1: a cart without a decay
     for told in (decays, needed) if needed and np.all(k > 0) else ():
         c = chain.c.copy()
         for cart, zeta in told.items():
@@ -301,7 +302,7 @@ def _hold_vanished(
 
 
 def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
-    """Return of what order each parameter (n_p,) is: damping m ω, the stiffest spring."""
+    """Return the natural size of each parameter (n_p,): damping m ω, the stiffest spring."""
     middle = float(np.median(data.omega[data.omega > 0]))
     sizes = {"m": chain.m, "c": chain.m * middle, "k": np.full(chain.n + 1, np.max(chain.k))}
     return np.array([sizes[symbol][place] for symbol, place in P.places])
@@ -379,8 +380,8 @@ def _covariance(
 ) -> tuple[tuple[str, ...], Array]:
     """Return the covariance (n_p, n_p) of the physical parameters, and their names.
 
-    A damping that is held at zero is one of them where the data tell its error: no cart is without
-    damping, and what rests on it is known no better. A far spring may well not be there.
+    A damping that is held at zero is included if the data give its error: no cart is without
+    damping, and numbers that depend on it are known no better. A far spring may truly be missing.
     """
     springs = tuple(name for name in P.zero if read_name(name).symbol == "k")
     for Q in (replace(P, zero=springs), P):

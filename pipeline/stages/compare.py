@@ -12,10 +12,10 @@ from pipeline.names import read_name
 from pipeline.results import Estimate, ParameterRow
 from pipeline.set_up import Bench
 
-# The paper's own tables: gains and frequencies change by up to 14 % between the two estimates (one
-# null, read off by eye, by 29 %), damping ratios by half and more.
+# The paper's own tables: gains and frequencies differ by up to 14 % between the two estimates (one
+# null, read by eye, by 29 %), damping ratios by half and more.
 GAIN_AND_FREQUENCY_LIMIT, DAMPING_LIMIT = 15.0, 50.0  # percent
-SIGMA_LIMIT = 3.0  # combined standard errors: below, a difference may be chance
+SIGMA_LIMIT = 3.0  # combined standard errors: a smaller difference may be chance
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 AT_BOUND = (
     "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"
@@ -39,7 +39,7 @@ def compare(
 
     Parameters
     ----------
-    fitted_to : the recordings that the final estimates come from.
+    fitted_to : the recordings behind the final estimates.
     """
     rows = []
     for name in names:
@@ -78,7 +78,7 @@ def compare(
 
 
 def why_open(name: str, final: Estimate) -> str:
-    """Return why what a fit gives for a parameter is no number to go by, or ""."""
+    """Return why a fitted value cannot be relied on, or ""."""
     if final.at_bound:
         return AT_BOUND
     percent = 100 * (final.std or 0.0) / abs(final.value) if final.value else np.inf

@@ -23,16 +23,16 @@ from pipeline.names import (
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
 _LARGEST_RELATIVE_STD = 0.2  # a record's frequency is kept where the response stands five sigma out
-# Two dwells are repeats where their frequencies differ by less than this: a fitted frequency is
-# good to some 1e-4, and no response changes by more than its error within it.
+# Two dwells are repeats if their frequencies differ by less than this: a fitted frequency is
+# accurate to some 1e-4, and no response changes by more than its error within it.
 _SAME_FREQUENCY = 1e-3
-# No bench measures better; exact data would weigh infinitely.
+# No bench measures better; exact data would have infinite weight.
 _SMALLEST_RELATIVE_STD = 1e-6
 
 
 # Peaks and nulls
 _CLEAR_FALL = 3.0  # below the low-frequency level: a mode has been passed, twice its frequency
-_LOW_SHARE = 0.7  # of the first resonance: below, a gain can be told from the magnitude
+_LOW_SHARE = 0.7  # of the first resonance: below it, the magnitude gives the gain
 
 
 # ---------------------------------------------------------------------- dwells
@@ -53,8 +53,8 @@ def dwell_fault(point: SinePoint) -> str:
 def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]:
     """Collect dwells to one frequency response per cart; repeats of a frequency become one point.
 
-    Repeats combine to their weighted mean; its standard error grows where they scatter more than
-    theirs allow. A dwell that did not settle stays, with an error of 5 % added; one with a
+    Repeats combine to their weighted mean; its standard error grows if they scatter more than
+    theirs allow. A dwell that did not settle stays, with an added error of 5 %; one with a
     `dwell_fault` does not count.
 
     Raises
@@ -111,7 +111,7 @@ def _wrapped(phase: Array) -> Array:
 
 
 def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
-    """Return the weighted mean and its standard error, scatter beyond `std` included (Birge)."""
+    """Return the weighted mean and its standard error, including scatter beyond `std` (Birge)."""
     floor = _SMALLEST_RELATIVE_STD * max(float(np.max(np.abs(values))), _SMALLEST_RELATIVE_STD)
     weight = 1.0 / np.maximum(std, floor) ** 2
     mean = float(np.sum(weight * values) / np.sum(weight))
@@ -129,7 +129,7 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
     """Take the frequency response of each cart from step and sweep records with all carts free.
 
     Each record gives its ratio of transforms (`record_transforms`); records combine by weight,
-    their scatter included. Only frequencies at which the input moves the cart are returned.
+    including their scatter. Only frequencies at which the input moves the cart are returned.
 
     Raises
     ------
@@ -208,11 +208,11 @@ class _Extremum(NamedTuple):
 def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[str, Estimate]:
     """Estimate resonances, nulls and gains from the measured magnitudes, as the paper does.
 
-    The resonances are the peaks that the carts share; a first mode too damped to peak is found
-    from how far the last cart's response has fallen above the others. Where fewer than n are
-    found none is named, as it is not known which is missing. Nulls of cart 1 give omega_x and
-    omega_y (three carts), those of the last but one the last cart's own frequency. Gains are the
-    lowest-frequency magnitudes. Dampings of modes and nulls are assumed.
+    The resonances are the peaks shared by the carts. A first mode too damped to peak is found from
+    the fall of the last cart's response above the others. If fewer than n are found, none is named,
+    as it is unknown which one is missing. Nulls of cart 1 give omega_x and omega_y (three carts),
+    those of the last but one the last cart's own frequency. Gains are the lowest-frequency
+    magnitudes. Dampings of modes and nulls are assumed.
     """
     by_cart = {response.cart: response for response in responses}
     names = set(parameter_names(n))
@@ -233,7 +233,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     if n == 3 and 1 in by_cart:
         found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
     assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
-    # Peaks are those that the carts share, and gains are corrected by them.
+    # Peaks are shared by the carts, and gains are corrected by them.
     runs = tuple(dict.fromkeys(run for response in responses for run in response.experiments))
     measured = {name: replace(one, experiments=runs) for name, one in found.items()}
     return measured | {
@@ -244,7 +244,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
 
 
 def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
-    """Name extrema in ascending order; none where their number is not that of the names."""
+    """Name extrema in ascending order; none if their number differs from that of the names."""
     if len(names) != len(extrema):
         return {}
     return {
@@ -254,7 +254,7 @@ def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[st
 
 
 def _between(extrema: Sequence[_Extremum], modes: Sequence[_Extremum]) -> list[_Extremum]:
-    """Return those below the highest mode: there the nulls of a chain are."""
+    """Return those below the highest mode, where the nulls of a chain are."""
     top = max((mode.omega for mode in modes), default=np.inf)
     return [e for e in extrema if e.omega < top]
 
@@ -265,7 +265,7 @@ def _strongest(extrema: Sequence[_Extremum], count: int) -> list[_Extremum]:
 
 
 def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
-    """Find the maxima (sign 1) or minima (sign -1) of ln|G| that stand out of its errors."""
+    """Find the maxima (sign 1) or minima (sign -1) of ln|G| beyond its errors."""
     seen = (response.omega > 0) & (response.magnitude > 0)
     omegas, magnitude = response.omega[seen], response.magnitude[seen]
     error = response.magnitude_std[seen] / magnitude
@@ -318,8 +318,8 @@ def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Ex
 def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -> list[_Extremum]:
     """Add the mode that does not peak, from the roll-off above all others of the last cart.
 
-    |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²| there; what the known modes
-    leave is 1/((omega/omega_0)² - 1).
+    |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²| there; the known modes leave
+    1/((omega/omega_0)² - 1).
     """
     top = max((mode.omega for mode in modes), default=0.0)
     above = (response.omega > 1.5 * top) & (response.magnitude > 0)

@@ -1,4 +1,4 @@
-"""Hold the identified chain against a run it was not fitted to: Figures 15-17.
+"""Compare the identified chain with a run it was not fitted to: Figures 15-17.
 
 Two simulations per cart. "closed": the controller that ran, with its delay and saturation, closes
 the loop around the chain. "open": the measured input drives the chain, and the logged input's
@@ -21,11 +21,11 @@ from pipeline.plant.loop.sampled_loop import Controller, LoopRun, Pid, StateFeed
 from pipeline.results import HardwareCheck, Record
 
 # A factor on the input within this is the model's error, not the log's; another sign or scale is
-# believed where it leaves at most this of the difference, and explains half the power.
+# accepted if it leaves at most this share of the difference, and explains half the power.
 _TRUSTED, _WORTH_IT, _HALF = 1.5, 0.6, 0.7
-_WRONG = 0.1  # of the motion: a model further off is of something else
+_WRONG = 0.1  # of the motion: a larger error means that the model does not belong to the run
 _SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
-_SETTLED_SHARE = 0.2  # of the time after a step, its end, whose mean is the steady state
+_SETTLED_SHARE = 0.2  # of the time after a step: its end, whose mean is the steady state
 
 
 def check_hardware(
@@ -38,13 +38,13 @@ def check_hardware(
 ) -> tuple[HardwareCheck, ...]:
     """Compare the chain with one run, cart by cart: the closed loop first, then the open.
 
-    Any kind of run will do whose input was logged. `controller` is what ran on the hardware;
-    without one, or without its gains, the loop is not closed.
+    Any kind of run with a logged input will do. `controller` is what ran on the hardware; without
+    one, or without its gains, the loop is not closed.
 
     Parameters
     ----------
     controlled_cart : whose position a PID controller fed back, unless the controller says it.
-    input_limit : where the input saturates; a lower limit that shows in the log comes first.
+    input_limit : where the input saturates; a lower limit in the log comes first.
 
     Raises
     ------
@@ -98,7 +98,7 @@ class _Simulated:
 
 
 def _open(run: MeasuredRun) -> _Simulated:
-    """Drive the chain with the logged input, times a factor where the log cannot be right."""
+    """Drive the chain with the logged input, times a factor if the log cannot be right."""
     forced, unforced, scale = run.forced(), run.unforced(), run.input_scale()
     as_logged, scaled = run.misfit(unforced + forced), run.misfit(unforced + scale * forced)
     if _plausible(scale) or scaled > min(_WORTH_IT * as_logged, _HALF):
@@ -127,9 +127,9 @@ def _plausible(factor: float) -> bool:
 def _plant_law(
     controller: submission.Controller | None, cart: int | None, *, position_scale: float
 ) -> Controller | None:
-    """Return the controller as the simulation knows it; None where there is nothing to simulate.
+    """Return the controller for the simulation; None if there is nothing to simulate.
 
-    A PID acts on the error in the file's own counts, which `position_scale` made positions of.
+    A PID acts on the error in the file's own counts, which `position_scale` converted to positions.
     """
     if isinstance(controller, submission.PidController):
         return Pid(
@@ -145,7 +145,7 @@ def _plant_law(
 
 
 def _steered_cart(controller: submission.Controller | None, stated: int | None) -> int | None:
-    """Return the cart that the loop brings to the set point; None where nothing says which."""
+    """Return the cart that the loop brings to the set point; None if nothing says which."""
     if isinstance(controller, submission.PidController) and (
         stated is None or "cart" in controller.model_fields_set
     ):
@@ -163,8 +163,8 @@ def _close(
 ) -> _Simulated:
     """Close the loop around the chain.
 
-    Where the logged input is a multiple of what the stated law asks for, the law is taken so many
-    times if that explains the run far better; else as stated.
+    If the logged input is a multiple of the stated law's, the law is scaled by it, provided that
+    explains the run far better; else it is used as stated.
 
     Raises
     ------
@@ -185,7 +185,7 @@ def _close(
             note = f"the logged input {note} what the stated controller asks for"
     if loop is None:
         raise DataError("the stated controller makes it unstable")
-    # A bench may count its input the other way under feedback, by right.
+    # Under feedback a bench may rightly count its input the other way.
     wrong = abs(times_stated) != 1.0 and misfit <= _WRONG
     return _Simulated(y=loop.x, u=loop.u, note=note, contradicted=wrong)
 
@@ -193,13 +193,13 @@ def _close(
 def _run_loop(
     run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float
 ) -> tuple[LoopRun | None, float]:
-    """Return the run and its misfit; None and the largest where it is unstable.
+    """Return the run and its misfit; None and the largest misfit if it is unstable.
 
-    How fast the bench's controller samples and acts, and whether it predicts, is not logged: of
-    the usual ways the one that comes nearest to the measurement is taken.
+    The controller's sample time, delay and prediction are not logged: of the usual combinations the
+    one nearest to the measurement is taken.
     """
     joined = sampled_loop.LoopSetup(input_limit=limit, drive=drive, rest=run.rest, free=run.free)
-    best, least = None, 10.0  # times the measured motion: further off, it is unstable
+    best, least = None, 10.0  # times the measured motion: above this, it is unstable
     for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
         with np.errstate(over="ignore", invalid="ignore"):
             how = replace(joined, sample_time=sample_time, delay=delay)
@@ -232,11 +232,11 @@ def _ways(
 def _logged_per_stated(
     run: MeasuredRun, law: Controller, *, reference: Array, opened: _Simulated | None
 ) -> list[float]:
-    """Return factors, other than 1, that the logged input may be of what the law asks for.
+    """Return factors, other than 1, between the logged input and that of the law.
 
-    The law is asked at the readings, and at the positions that the logged input gives the chain:
-    at a fast sample the velocity from readings is mostly noise, and an integral of the error
-    wants the readings.
+    The law is evaluated at the readings, and at the positions that the logged input gives the
+    chain. With fast sampling the velocity from readings is mostly noise, and an integral of the
+    error needs the readings.
     """
     record = run.record
     if record.u is None or opened is None:
@@ -254,7 +254,7 @@ def _logged_per_stated(
 def _median_ratio(logged: Array, stated: Array) -> float:
     """Return the factor with the least sum of absolute differences, a weighted median; or 1.
 
-    Samples where the input saturates, or a velocity is mostly rounding, do not sway it.
+    Samples with a saturated input, or a velocity that is mostly rounding, do not affect it.
     """
     asked = np.flatnonzero(stated)
     if asked.size == 0:
@@ -266,10 +266,10 @@ def _median_ratio(logged: Array, stated: Array) -> float:
 
 
 def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
-    """Say that the stated controller is not what ran, where the plant follows what it was given."""
+    """Say that the stated controller did not run, if the plant follows its actual input."""
     loop, plant = run.misfit(closed.y), run.misfit(opened.y)
-    # A plant right to 2 % under its very input, but off by a tenth, and so many times further, in
-    # the loop: it is not the loop that ran. A stable loop makes a plant's error some times larger.
+    # A plant accurate to 2 % under its actual input, but off by a tenth, and this many times more,
+    # in the loop: another loop ran. A stable loop increases a plant's error a few times.
     if opened.factor != 1.0 or not (plant <= 0.02 and loop > max(_WRONG, 5.0 * plant)):
         return ""
     return (
@@ -282,7 +282,7 @@ def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> 
 def _another_cart(
     run: MeasuredRun, controller: submission.Controller | None, cart: int | None
 ) -> str:
-    """Say that another cart than the one said to be controlled comes to rest at the reference."""
+    """Say that another cart than the stated one comes to rest at the reference."""
     reference = run.record.reference
     if not isinstance(controller, submission.StateFeedbackController) or reference is None:
         return ""
@@ -367,7 +367,7 @@ def _compare(
 
 
 class _Step(NamedTuple):
-    """Overshoot in percent, settling time in s, level as read; None where there is none."""
+    """Overshoot in percent, settling time in s, level as read; None if it does not exist."""
 
     overshoot: float | None = None
     settling: float | None = None
@@ -381,7 +381,7 @@ def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise:
     t, after = run.record.t[window], y[window]
     before = y[: window.start].mean() if window.start > 0 else run.rest[row]
     level = after[-max(1, round(_SETTLED_SHARE * after.size)) :].mean()
-    # Of the cart's largest motion; a smaller step has no overshoot to speak of.
+    # Of the cart's largest motion; a smaller step has no meaningful overshoot.
     if abs(level - before) <= max(noise, 0.05 * np.max(np.abs(y - before))):
         return _Step(level=float(level))
     settling = float(step_response.settling_time(t, after, before=before, level=level, noise=noise))

@@ -1,4 +1,4 @@
-"""Initial estimates, as the paper makes them: steps, decays of single carts, peaks and nulls."""
+"""Initial estimates, as in the paper: steps, decays of single carts, peaks and nulls."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ def combine_repeats(
 ) -> Estimate:
     """Combine repeats of one number to their mean.
 
-    The standard error is the larger of what the spread and what the single errors imply.
+    The standard error is the larger of those implied by the spread and by the single errors.
     """
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)

@@ -15,7 +15,7 @@ _PEAKS_FOR_REGRESSION = 4  # two amplitudes
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Peaks:
-    """Turning points and what they give: delta and the damped frequency, with errors."""
+    """Turning points and the results from them: delta and the damped frequency, with errors."""
 
     t: Array
     y: Array
@@ -44,14 +44,14 @@ class _Peaks:
 def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     """Estimate damping ratio and natural frequency of one cart from its free decay.
 
-    The decay is found: a hold, a hand or a driven part may come before it. Two estimates: the
-    classical one from the peaks, and an exponential sinusoid with a drifting rest point fitted
-    to every sample. Dry friction is tested for. Valid for one free cart on at least one spring
-    and damping ratios up to about 0.6.
+    The decay is found: a hold, a hand or a driven part may come before it. There are two estimates:
+    the classical one from the peaks, and an exponential sinusoid with a drifting rest point fitted
+    to every sample. Dry friction is tested for. Valid for one free cart on at least one spring and
+    damping ratios up to about 0.6.
 
     Raises
     ------
-    DataError : no two turning points of one decay, or the motion is no decaying oscillation.
+    DataError : no two turning points of one decay, or the motion is not a decaying oscillation.
     """
     t, y = record.t, record.position(cart)
     size = grain(t, y, step=record.encoder_step(cart))
@@ -61,8 +61,8 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     fit, pole = decay.fit, complex(decay.fit.poles[0])
     omega_n, zeta = abs(pole), -pole.real / abs(pole)
     unexplained = fit.rms / float(np.ptp(y[decay.first : decay.stop]))
-    # A fit that leaves more of the motion is of something else: of real carts, which dry friction
-    # brakes, it leaves 1.3 to 2.1 % (ten runs).
+    # A fit with a larger residual belongs to another motion; for real carts with dry friction it is
+    # 1.3 to 2.1 % (ten runs).
     if not (0 < zeta < 1 and pole.imag > 0 and unexplained < 0.08):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
@@ -120,7 +120,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     With fewer than four the numbers are those of the exponential fit.
     """
     pole = complex(decay.fit.poles[0])
-    # In rad: so near a turning point a cosine is nearly a parabola.
+    # In rad: this near a turning point a cosine is nearly a parabola.
     located = [_vertex(t, y, i, half_width=0.5 / pole.imag) for i in decay.turning]
     peak_t, peak_y = np.array(located).reshape(-1, 2).T
     n = peak_t.size
@@ -138,8 +138,8 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
             omega_d=pole.imag,
             omega_d_std=float(omega_d_std),
         )
-    # The noise is constant in A, so ln A is weighted by A²; the errors follow from those of the
-    # turning points, which neighbouring A share.
+    # The noise is constant in A, so ln A has the weight A²; the errors follow from those of the
+    # turning points, shared by neighbouring A.
     per_log = _slope(amplitude)
     loss = -float(per_log @ np.log(amplitude))  # per half cycle
     sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
@@ -149,7 +149,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     count = np.arange(n) - (n - 1) / 2
     late = peak_t - peak_t.mean() - interval * count
     interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
-    # Of the decrement: what is left of the difference, with samples anywhere.
+    # Of the decrement: the remaining difference, with samples at any phase.
     return _Peaks(
         t=peak_t,
         y=peak_y,
@@ -216,7 +216,7 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
             f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
             f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
         )
-    # A mean is worth a word where the damping of large amplitudes is so much above it.
+    # A mean is noted if the damping of large amplitudes exceeds it by this much.
     elif test and test.f_statistic > test.threshold and test.zeta > 1.05 * zeta:
         notes.append(
             "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"

@@ -11,8 +11,8 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
 
-FEW_COUNTS = 20  # encoder steps: an amplitude below is known to a few percent only
-_MIN_SAMPLES = 12  # five unknowns, and something left to judge the fit by
+FEW_COUNTS = 20  # encoder steps: a smaller amplitude is known only to a few percent
+_MIN_SAMPLES = 12  # five unknowns, and a residual to judge the fit by
 _WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
@@ -26,7 +26,7 @@ class _Part:
 
     Attributes
     ----------
-    columns : (n, p) what `_columns` returns; inverse (p, n), its pseudo-inverse.
+    columns : (n, p) from `_columns`; inverse (p, n), its pseudo-inverse.
     angle : of the sine, rad per sample.
     """
 
@@ -47,7 +47,7 @@ class _Part:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sine:
-    """A sine, an offset and a straight drift (the coefficients), and what they leave."""
+    """A sine, an offset and a straight drift (the coefficients), and the residual."""
 
     part: _Part
     coefficients: Array
@@ -69,7 +69,7 @@ class _Sine:
         return float(np.hypot(self.error(0), self.error(1)) / np.sqrt(2))
 
     def error(self, which: int) -> float:
-        """Return the standard error of a coefficient, for a residual that need not be white."""
+        """Return the standard error of a coefficient, for a residual that may be correlated."""
         return self._sigma * float(np.linalg.norm(self.part.inverse[which]))
 
     @cached_property
@@ -81,7 +81,7 @@ class _Sine:
 
 @dataclass(frozen=True, kw_only=True)
 class _Steady:
-    """The first sample of the steady part; `left`: what of the transient may still be in it."""
+    """The first sample of the steady part; `left`: the possible rest of the transient in it."""
 
     start: int
     settled: bool
@@ -91,10 +91,10 @@ class _Steady:
 def fit_sine(record: Record, *, cart: int) -> SinePoint:
     """Fit the sinusoidal steady state of one cart to a dwell.
 
-    The steady part is found: the last windows tell whether there is one, and it reaches back as
-    far as its own sine explains the record. The input is fitted over the same part; where it is
-    held from sample to sample, its amplitude is that of the held staircase. Valid for one
-    frequency, from one cycle on. Several carts of one dwell share much work: see `Dwell`.
+    The last windows show whether there is a steady part, and it reaches back as far as its own sine
+    explains the record. The input is fitted over the same part; if it is held between samples, its
+    amplitude is that of the held staircase. Valid for one frequency, from one cycle on. Several
+    carts of one dwell share much work: see `Dwell`.
 
     Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
 
@@ -133,7 +133,7 @@ class Dwell:
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
-        # Of the amplitude of the input: a residual above this is another signal.
+        # Of the amplitude of the input: a larger residual means another signal.
         if drive.rms >= 0.5 * abs(drive.z):
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
@@ -201,7 +201,7 @@ class Dwell:
     def _steady_part(self, y: Array, *, floor: float) -> _Steady:
         """Find where the steady part starts, and whether there is one.
 
-        Settled: the complex amplitudes of the last windows agree. Their sine is then carried back
+        Settled: the complex amplitudes of the last windows agree. Their sine is then extended back
         over the record as far as it leaves no more than its own residual.
         """
         windows = _windows(self._t, omega=self._frequency[0])
@@ -216,21 +216,21 @@ class Dwell:
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
         if start > 0:
-            # The share of the steady part given up to what is left of the transient.
+            # The share of the steady part given up to the rest of the transient.
             start = min(start + (y.size - start) // 3, latest)
         start, left = self._drop_drifting(y, start, latest=latest, floor=floor)
         return _Steady(start=start, settled=True, left=left)
 
     def _carry_back(self, y: Array, start: int, *, floor: float, stretches: int) -> int:
         """Return how far back the sine from `start` on explains the record."""
-        # Of carrying the sine back; each doubles or so what it stands on.
+        # Of extending the sine back; each roughly doubles its basis.
         for _ in range(3):
             steady = self._fit(y, start)
             square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
             hop = max((y.size - start) // stretches, _MIN_SAMPLES)
             edges = np.arange(start, -1, -hop)
             mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
-            # A stretch whose mean square residual is further up is not steady.
+            # A stretch whose mean square residual is larger by this factor is not steady.
             limit = max(steady.rms, floor) ** 2 * (1 + 4.0 * np.sqrt(2 / hop))
             worse = np.flatnonzero(mean > limit)
             reached = int(edges[worse[0]]) if worse.size else 0
@@ -242,10 +242,10 @@ class Dwell:
     def _drop_drifting(
         self, y: Array, start: int, *, latest: int, floor: float
     ) -> tuple[int, float]:
-        """Return a start, not after `latest`, from which the two halves agree; and what is left.
+        """Return a start, not after `latest`, from which the two halves agree; and the rest.
 
         At a resonance the transient has the dwell's own frequency and hides in its amplitude. Half
-        of the difference between the halves, where it is more than noise, is still in the mean.
+        of the difference between the halves, if it exceeds the noise, is still in the mean.
         """
         while True:
             middle = (start + y.size) // 2
@@ -258,7 +258,7 @@ class Dwell:
             # The steady part's two halves differ by no more.
             if start == latest or difference <= 3.0 * noise:
                 return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
-            # The share of it that goes at once where they do.
+            # The share of it that is dropped at once if they do.
             start = min(start + (y.size - start) // 6, latest)
 
 
@@ -299,7 +299,7 @@ def _rounding_std(fit: _Sine, *, step: float) -> float:
     """Return the amplitude error that rounding leaves however many samples are averaged.
 
     Rounding offset + A sin adds sum_k (q / pi k) 2 J1(2 pi k A/q) cos(2 pi k offset/q) to the
-    amplitude, 0.111 q sqrt(q/A) root-mean-square over A and offset; noise takes it away.
+    amplitude, 0.111 q sqrt(q/A) root-mean-square over A and offset; noise removes it.
     """
     if step == 0:
         return 0.0
@@ -312,7 +312,7 @@ def _held(t: Array, *, omega: float) -> complex:
     """Return the factor from a sampled sine to the first harmonic of its held staircase."""
     dt = np.diff(t)
     # Sample intervals; longer ones are gaps in the log.
-    dt = dt[dt < 3.0 * np.median(dt)]  # what the input did in a gap is not known
+    dt = dt[dt < 3.0 * np.median(dt)]  # the input during a gap is unknown
     return complex(np.sum(-np.expm1(-1j * omega * dt)) / (1j * omega * np.sum(dt)))
 
 
@@ -352,11 +352,12 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
     line = 2 * np.pi / (n * (grid[1] - grid[0]))
     peak = line * (1 + int(np.argmax(spectrum[1:])))
     fitted, std = _refined(t, u, omega=peak)
-    if abs(fitted - peak) > _PEAK_LINES * line:  # no sine, which the caller will see
+    if abs(fitted - peak) > _PEAK_LINES * line:  # not a sine, which the caller will notice
         fitted = peak
     if stated is None:
         return fitted, ""
-    # A stated frequency as far off by standard errors, and by more than any clock, is not believed.
+    # A stated frequency is rejected if it is this far off in standard errors, and by more than any
+    # clock error.
     if abs(fitted - stated) <= max(5.0 * std, 2e-4 * stated):
         return stated, ""
     return fitted, (

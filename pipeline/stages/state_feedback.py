@@ -1,13 +1,13 @@
 """Design state feedback with a prefilter, so that one cart follows a step.
 
 The design is sampled and its model holds the computer's one-sample delay: the gains multiply the
-state predicted for the moment the effort begins to act (`plant.loop.sampled_loop`), so the loop has
-the poles of Phi - Gamma G and one at z = 0 for the delay, with 2n gains.
+state predicted for the moment the effort acts (`plant.loop.sampled_loop`). So the loop has the
+poles of Phi - Gamma G and one at z = 0 for the delay, with 2n gains.
 
-"lqr" weighs energy against the input, alpha times the potential and beta times the kinetic, and
-searches both. "poles" does what is done by hand: a dominant pair in the place of the plant's
-slowest, the further pairs at the plant's own frequencies but better damped, and moves them. Both
-take the gentlest candidates whose simulated step meets the goal, and of these the fastest.
+"lqr" weights energy against the input, alpha times the potential and beta times the kinetic, and
+searches both. "poles" is the design by hand: a dominant pair replaces the plant's slowest, and the
+further pairs, at the plant's own frequencies but better damped, are varied. Both take the gentlest
+candidates whose simulated step meets the goal, and of these the fastest.
 """
 
 from dataclasses import dataclass, replace
@@ -39,12 +39,12 @@ Method = Literal["poles", "lqr"]
 
 _POINTS = 512  # of a candidate's step; a power of two, as it is made by doubling
 
-# Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to
-# a few percent only and should still meet the goal.
+# Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to a
+# few percent only and should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
-_UNSEEN = 0.05  # percent of overshoot that nobody sees
+_UNSEEN = 0.05  # percent of overshoot that nobody notices
 
-_WEIGHTS = np.logspace(-3, 4, 25)  # of energies: from no feedback to be seen to a stiff loop
+_WEIGHTS = np.logspace(-3, 4, 25)  # of energies: from invisible feedback to a stiff loop
 _HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # to all but deadbeat
 _DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
 _FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its own if better
@@ -60,8 +60,8 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
 
     Raises
     ------
-    DataError : there is no such cart or no step, a missing spring leaves a cart out of reach, the
-        chain is none that a computer can design for, or the run takes too many ticks to simulate.
+    DataError : there is no such cart or no step, a missing spring leaves a cart out of reach, no
+        computer can design for the chain, or the run takes too many ticks to simulate.
     """
     if not 1 <= task.cart <= chain.n:
         raise DataError(f"state feedback needs a cart from 1 to {chain.n}, found {task.cart}")
@@ -80,7 +80,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
         reference=task.reference,
     )
     try:
-        # A candidate may well be unstable and run away; it is judged by the numbers it ends in.
+        # A candidate may be unstable and diverge; it is judged by its final numbers.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plant = SampledPlant.of(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
@@ -153,7 +153,7 @@ def _pole_candidates(plant: SampledPlant, goal: _Goal) -> ComplexArray:
         )
     )
     # exp(-4) is the 2 % of the settling time. No pair is made slower than the plant's own: that
-    # takes its stiffness away, and what is left is the small difference of large numbers.
+    # would cancel stiffness and leave a small difference of large numbers.
     dominant = np.maximum(4 / (z * settling), omega[0])
     pairs = [_pair(dominant, z)]
     for own_omega, own_zeta in zip(omega[1:], zeta[1:], strict=True):
@@ -174,24 +174,24 @@ def _pair(omega: Array, zeta: Array) -> ComplexArray:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Candidates:
-    """What each set of gains (n_candidates, 2n) does with the step of the goal."""
+    """The response of each set of gains (n_candidates, 2n) to the goal's step."""
 
     gains: Array
     overshoot: Array  # percent
-    settling: Array  # s; estimated from the slowest pole where the step is not followed so far
+    settling: Array  # s; estimated from the slowest pole if the step is not followed that far
     peak: Array  # input units
     level_error: Array  # percent of the step, from errors in the model
 
 
 def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
-    """Follow the step of every candidate at once; exact at the points looked at.
+    """Follow the step of every candidate at once; exact at the sampled points.
 
-    They lie close enough to miss no peak, even if that ends the view before the goal's time:
+    They are close enough to show every peak, even if the view then ends before the goal's time:
     settling is then estimated.
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
-    # Settling times of the goal that a candidate's step is followed for.
+    # Settling times of the goal for which a candidate's step is followed.
     apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
     stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
@@ -223,9 +223,9 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
 def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
     """Return the index of the best candidate and whether it meets the goal, or comes nearest."""
     within = candidates.peak <= goal.limit
-    if not within.any():  # a step of this size is out of reach: design for a smaller one
+    if not within.any():  # a step of this size cannot be reached: design for a smaller one
         within = np.full_like(within, True)
-    # Percent of the step that errors in the springs may move the level, if it can be had.
+    # Percent of the step by which errors in the springs may move the level, if possible.
     for level_error, (settling, overshoot) in product((10.0, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
@@ -235,7 +235,7 @@ def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[
         # Times the gentlest candidate's peak input that a faster one may take.
         good &= candidates.peak <= 1.25 * candidates.peak[good].min()
         order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
-        # Candidates, in order, tried for a loop that is stable whatever the model's errors.
+        # Candidates, in order, tried for a loop that is stable for all errors of the model.
         for index in order[:8]:
             if plant.stays_stable(plant.to_units(candidates.gains[index])):
                 return int(index), True
@@ -258,7 +258,7 @@ def _finish(
     settling: float,
     method: Method,
 ) -> FeedbackDesign:
-    """Simulate the chosen design, the delay and the input limit included, and say how it does."""
+    """Simulate the chosen design with delay and input limit, and describe the result."""
     chain, T = plant.chain, plant.sample_time
     phi, gamma = discretise(chain, T)
     loop = phi - np.outer(gamma, gains)
@@ -307,7 +307,7 @@ def _finish(
 
 
 def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
-    """Say what is reachable where the goal is not, and what model error does; often nothing."""
+    """Describe what can be reached if the goal cannot, and the effect of model errors; often ""."""
     said = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
     held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf

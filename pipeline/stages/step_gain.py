@@ -1,4 +1,4 @@
-"""Step: static gain from the levels a cart settles at before and after each edge."""
+"""Step: static gain from the levels at which a cart settles before and after each edge."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,9 @@ _MOVED = 6.0  # grains (encoder steps, or noise as coarse): a cart that moved le
 _EXTRAPOLATES = 0.02  # of the motion: what a fit that foretells the level may leave, and be off by
 _STICKS_SIGMAS = 4.0  # standard errors: by chance one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
-# Motion is counted in grains: encoder steps, or as much noise as would round as coarsely.
-_FLAT = 3.0  # a window that spans no more is level
+# Motion is counted in grains: the encoder step, or the step that would round as coarsely as the
+# noise.
+_FLAT = 3.0  # a window with a smaller range is level
 _PROMINENCE = 6.0
 _ARITHMETIC = 1e-3  # the scatter of a level without noise or rounding
 _DRIFT_PASSES = 4
@@ -28,7 +29,7 @@ _SAME_INPUT = 0.02  # of the input's range
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """Where the cart came to rest at one input: value, error, and over which samples."""
+    """The rest of a cart at one input: value, error, and samples."""
 
     first: int
     stop: int
@@ -39,7 +40,10 @@ class _Level:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plateau:
-    """Samples [first, stop) at one input, and the level the cart settled at (None: it did not)."""
+    """Samples [first, stop) at one input, and the level at which the cart settled (None:
+
+    it did not).
+    """
 
     first: int
     stop: int
@@ -50,9 +54,9 @@ class _Plateau:
 def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     """Estimate the static gain of one cart from every edge of a stepped input.
 
-    A level is the mean of the samples after which nothing moves any more. Where a record (or the
-    next edge) cuts the ringing short, the level is that of damped sinusoids fitted to it, one per
-    free cart. Valid for any number of carts on at least one spring, steps of any size and sign.
+    A level is the mean of the samples after the last motion. If a record (or the next edge) cuts
+    the ringing short, the level is that of damped sinusoids fitted to it, one for each free cart.
+    Valid for any number of carts on at least one spring, steps of any size and sign.
 
     Raises
     ------
@@ -118,7 +122,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
             f"{record.id}: step gain needs the input beside the positions, found no input column: "
             "export it too, or name it under `columns`"
         )
-    # Of the input's range: two halves of a constant stretch differ by no more.
+    # Of the input's range: two halves of a constant stretch differ by less.
     creep = 0.005 * float(np.ptp(u))
     long = [
         (a, b)
@@ -127,7 +131,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
-    # With less of the record at constant input this is no step run.
+    # With a smaller share of the record at constant input this is not a step run.
     if share < 0.6 or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
@@ -170,7 +174,7 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
 
 
 def _pace(t: Array, y: Array, *, size: float) -> float:
-    """Return how long a window must be to show that nothing moves: a period, or a rise, s."""
+    """Return the length of window that proves rest: a period, or a rise, s."""
     turning = extrema(y, prominence=_PROMINENCE * size)
     if len(turning) > 3:  # the ends are no turning points
         return 2 * float(np.max(np.diff(t[turning[1:-1]])))
@@ -179,14 +183,17 @@ def _pace(t: Array, y: Array, *, size: float) -> float:
 
 
 def _flat_from(y: Array, *, span: float) -> int:
-    """Return the first sample from which on y spans no more than `span`."""
+    """Return the first sample from which the range of y is at most `span`."""
     backwards = y[::-1]
     spans = np.maximum.accumulate(backwards) - np.minimum.accumulate(backwards)
     return y.size - int(np.searchsorted(spans, span, side="right"))
 
 
 def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Level:
-    """Return the mean from `first` on; rounding a still cart errs by up to half an encoder step."""
+    """Return the mean from `first` on;
+
+    the rounding of a still cart errs by up to half an encoder step.
+    """
     window = y[first:]
     residual = window - window.mean()
     rms = float(np.sqrt(np.mean(residual**2)))
@@ -202,9 +209,9 @@ def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Lev
 
 
 def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level | None:
-    """Return the level about which y still rings, where damped sinusoids fit it well.
+    """Return the level about which y still rings, if damped sinusoids fit it well.
 
-    One for each free cart, or fewer where noise hides the smallest.
+    One for each free cart, or fewer if noise hides the smallest.
     """
     motion = float(np.ptp(y))
     for n in range(n_modes, 0, -1):
@@ -230,7 +237,7 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
 def _with_unseen_start(
     t: Array, y: Array, found: list[_Plateau], *, size: float, step: float
 ) -> tuple[list[_Plateau], list[str]]:
-    """Put a rest before a record that starts with the input on and the cart just setting off."""
+    """Put a rest before a record that starts with the input on and the cart starting to move."""
     head = found[0]
     if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
@@ -247,7 +254,7 @@ def _with_unseen_start(
 
 
 def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> float:
-    """Return the slope that every settled window shows alike, per second; 0 where they do not."""
+    """Return the slope that every settled window shares, per second; 0 if they do not."""
     slopes, errors = [], []
     for level in levels:
         if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
@@ -263,7 +270,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    # A drift is seen, and alike in every settled window.
+    # A drift must show, equally, in every settled window.
     seen = abs(drift) > 5.0 / np.sqrt(weight.sum())
     alike = np.abs(np.array(slopes) - drift) <= 0.3 * abs(drift) + 3 * np.array(errors)
     return drift if seen and bool(np.all(alike)) else 0.0
@@ -297,8 +304,8 @@ def _edges(t: Array, found: Sequence[_Plateau]) -> list[StepEdge]:
 def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
     """Return the weighted mean gain and its error.
 
-    Edges share their levels, and a cart at rest is rounded alike each time, so that the error
-    does not shrink with the number of edges; it is the spread's where that is larger.
+    Edges share their levels, and a cart at rest is rounded the same way each time, so the error
+    does not shrink with the number of edges; the spread's error is used if it is larger.
     """
     gains = np.array([edge.gain for edge in edges])
     std = np.array([edge.gain_std for edge in edges])
@@ -308,7 +315,7 @@ def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
 
 
 def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
-    """Return how far the cart rests from where it first did at the same input, and the error."""
+    """Return how far the cart rests from its first rest at the same input, and the error."""
     span = max(p.u for p in found) - min(p.u for p in found)
     settled = [p for p in found if p.level]
     for last in reversed(settled[1:]):
@@ -319,7 +326,7 @@ def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
 
 
 def _interval(edges: Sequence[StepEdge], *, shift: float) -> tuple[float, float]:
-    """Return the gains that friction allows at least: a rest point is off by half the shift."""
+    """Return the gains that friction makes possible: a rest point is off by half the shift."""
     gains = [edge.gain for edge in edges]
     slack = abs(shift) / (2 * min(abs(edge.u_after - edge.u_before) for edge in edges))
     slack = max(slack, max(edge.gain_std for edge in edges))

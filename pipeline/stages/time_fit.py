@@ -1,9 +1,9 @@
 """Joint fit of one chain to time records: steps, sweeps, decays and closed loops at once.
 
 Output-error fit: the chain is simulated exactly from the measured input, and the simulated
-positions are held against the measured ones. Start and encoder zeros of each record enter
-linearly and are eliminated, so the search moves the physical parameters alone. It starts from a
-linear regression and needs no guess.
+positions are compared with the measured ones. Start and encoder zeros of each record enter linearly
+and are eliminated, so the search moves only the physical parameters. It starts from a linear
+regression and needs no guess.
 
 Reference: L. Ljung, System Identification, 2nd ed., sections 7.5 and 10.2; for residuals that
 are not white section 9.5.
@@ -35,18 +35,18 @@ _TOLERANCE = 1e-9  # of the cost, relative; far below one standard error for any
 def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None = None) -> ChainFit:
     """Fit one chain to all records at once.
 
-    Records may differ in length, rate, free and measured carts; held carts drop out of the
-    chain. Decays are used from their release on, a closed loop with its measured input. A
-    record that cannot be used is left out, and the fit's message says so.
+    Records may differ in length, rate, free and measured carts; held carts are removed from the
+    chain. Decays are used from their release, a closed loop with its measured input. A record that
+    cannot be used is left out, and the fit's message says so.
 
     Parameters
     ----------
-    bench : which carts and springs there are.
-    start : tried besides what the records themselves suggest.
+    bench : its carts and springs.
+    start : tried in addition to the starts from the records.
 
     Returns
     -------
-    The fit. Its covariance allows for residuals that are not white, such as dry friction leaves;
+    The fit. Its covariance allows for correlated residuals, as caused by dry friction;
     `chi_square_per_dof` counts them against the encoder step and the local noise.
 
     Raises
@@ -77,7 +77,7 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
 
 
 def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
-    """Return the windows of all usable records, and what was left out."""
+    """Return the windows of all usable records, and notes on those left out."""
     windows, left_out = [], []
     for record in records:
         try:
@@ -101,10 +101,10 @@ def _informed(attempt: Attempt, index: int) -> FitWindow:
 
 
 def _starts_at_rest(attempt: Attempt, index: int) -> bool:
-    """Tell whether a window starts at rest: freeing its start gains no more than chance would.
+    """Return whether a window starts at rest: freeing its start gains no more than chance.
 
     The gain is that of the whole fit, to first order, with all parameters following. Residuals
-    beyond the stated noise are the chain's own error, of which a record holds few values.
+    beyond the stated noise are the chain's own error, of which a record has few independent values.
     """
     resting = replace(attempt.windows[index], at_rest=True)
     (held,) = look([resting], attempt.parametrisation, attempt.theta).misfits
@@ -115,15 +115,15 @@ def _starts_at_rest(attempt: Attempt, index: int) -> bool:
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / 20
     chance = max(long_run_variance(misfit.residual), structure)
     freed = misfit.n_nuisance - held.n_nuisance
-    # Beyond chance, by which a free start must improve the fit to be kept.
+    # Beyond chance, the improvement that a free start must bring to be kept.
     return bool(gain <= chance * (freed + 5.0 * np.sqrt(2 * freed)))
 
 
 def _covariance(attempt: Attempt) -> Array:
     """Return the covariance (n_p, n_p) of the free physical parameters.
 
-    Sandwich of the Gauss-Newton Hessian and the scores' long-run covariance, nowhere below what
-    white residuals of the same size would give.
+    Sandwich of the Gauss-Newton Hessian and the scores' long-run covariance, never below that of
+    white residuals of the same size.
 
     Raises
     ------
@@ -160,7 +160,7 @@ def _undetermined(name: str) -> DataError:
 def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
     """Return the wall springs, or else the dampings, that the fit has driven to zero.
 
-    Carts that no spring holds keep their dampings: a body on which nothing acts has no modes.
+    Carts without springs keep their dampings: a body without forces has no modes.
     """
     parametrisation, chain = attempt.parametrisation, attempt.chain
     share = parametrisation.physical(chain) / np.sqrt(np.diag(covariance))
@@ -174,15 +174,15 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
 def _released(attempt: Attempt) -> Attempt:
     """Return the same with the dampings free that were held at zero.
 
-    No cart is without damping, and what rests on one is known no better than it. A spring may
-    well not be there.
+    No cart is without damping, and numbers that depend on it are known no better. A spring may
+    truly be missing.
     """
     held, chain = attempt.parametrisation, attempt.chain
     springs = tuple(name for name in held.zero if read_name(name).symbol == "k")
     if springs == held.zero:
         return attempt
     free = replace(held, zero=springs)
-    # Of the critical one: as good as none, and its logarithm has derivatives.
+    # Of the critical one: practically zero, but its logarithm has derivatives.
     c = np.where(chain.c > 0, chain.c, 1e-6 * critical_damping(chain))
     return look(attempt.windows, free, free.pack(replace(chain, c=c)))
 
@@ -193,13 +193,13 @@ def _released(attempt: Attempt) -> Attempt:
 def _result(
     attempt: Attempt, *, explained: bool, n_starts: int, remarks: Sequence[str]
 ) -> ChainFit:
-    """Collect the fit's outcome, its residuals counted in the stated errors."""
+    """Collect the fit's result, with residuals counted in the stated errors."""
     parametrisation, chain = attempt.parametrisation, attempt.chain
     released = _released(attempt)
     names, covariance = released.parametrisation.names, _covariance(released)
     try:
         parameters = named_estimates(chain, names=names, covariance=covariance, source="time_fit")
-    except DataError:  # several carts and no wall: they have no gains to name
+    except DataError:  # several carts without a wall: they have no gains to name
         parameters: dict[str, Estimate] = {}
     chi_square = 0.0
     standardised = {}
@@ -227,7 +227,7 @@ def _result(
 
 
 def _message(attempt: Attempt, remarks: Sequence[str]) -> str:
-    """Say how the fit went."""
+    """Describe how the fit went."""
     count = len(attempt.windows)
     said = [
         f"{count} time record{'s' * (count > 1)}, "

@@ -1,4 +1,4 @@
-"""What is wrong with a submission, in one line a student can act on."""
+"""Faults of a submission, one line each, on which a student can act."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,9 +15,9 @@ from pipeline.words.numbers import first_few
 
 Location = Sequence[int | str]
 
-_LONGEST_QUOTE = 60  # characters of a found value worth showing
-MOST_TOLD = 20  # problems of a file; to find what a misspelt key may mean takes a while
-_MOST_KNOWN = 40  # of what would do
+_LONGEST_QUOTE = 60  # characters shown of a found value
+MOST_TOLD = 20  # faults listed for a file; finding the nearest valid key takes a while
+_MOST_KNOWN = 40  # valid values listed
 
 # What a value should have been, by pydantic's name for the error.
 _EXPECTED = {
@@ -59,7 +59,7 @@ def _summary(value: dict | tuple | list) -> str:
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
-    """Return "; did you mean …?", or all that would do where nothing is near and few are."""
+    """Return "; did you mean …?", or all valid values if none is near and there are few."""
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
@@ -68,7 +68,7 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
 
 @cache
 def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
-    """Return the tables of a format by their dotted path, what selects one of several included."""
+    """Return the tables of a format by their dotted path, including those that select a variant."""
     found: dict[str, type[BaseModel]] = {}
     for name, field in root.model_fields.items():
         kinds = [kind for kind in _kinds(field.annotation) if isinstance(kind, type)]
@@ -88,12 +88,12 @@ def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
 
 
 def list_keys(model: type[BaseModel]) -> tuple[str, ...]:
-    """Return the keys that may stand in a table."""
+    """Return the keys allowed in a table."""
     return tuple(name for name, field in model.model_fields.items() if not field.exclude)
 
 
 def takes_numbers(key: str, root: type[BaseModel]) -> bool:
-    """Tell whether a key of a format holds numbers and no text, in whatever table it stands."""
+    """Return whether a key of a format holds numbers and no text, in any table."""
     kinds = [
         kind
         for model in list_tables(root).values()
@@ -113,7 +113,7 @@ def _kinds(annotation: object) -> Iterator[object]:
 
 
 def dotted(location: Location, document: object) -> str:
-    """Return `experiments[2].kind (step-a)`: lists count from 1, the experiment by its id too."""
+    """Return `experiments[2].kind (step-a)`: lists count from 1, experiments also have their id."""
     path, here, name = "", document, ""
     for part in location:
         if isinstance(part, int):
@@ -157,7 +157,7 @@ def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Subm
 
 
 def first_refusal(error: ValidationError) -> str:
-    """Say what is wrong first with a file that another program wrote, and where."""
+    """Return the first fault of a file written by another program, and its place."""
     first = error.errors()[0]
     where = ".".join(map(str, first["loc"]))
     return f"{where}: {refusal(first)}" if where else refusal(first)
@@ -168,7 +168,7 @@ def refusal(error: ErrorDetails) -> str:
     kind, found = error["type"], quote(error["input"])
     if kind == "json_invalid":
         return "no JSON, or cut short"
-    if kind == "value_error":  # it says what was found itself
+    if kind == "value_error":  # its message includes what was found
         return error["msg"].removeprefix("Value error, ").rstrip(".")
     if kind not in _EXPECTED:
         return f"{error['msg']}, found {found}"
@@ -189,14 +189,17 @@ def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
 
 
 def all_told(where: str, problems: Sequence[str], *, more: int = 0) -> str:
-    """Return what is wrong with a file, a line for each problem, and how many more there are."""
+    """Return the faults of a file, one line each, and the number of further ones."""
     beyond = max(len(problems) - MOST_TOLD, 0) + more
     lines = [f"{where}: {what}" for what in problems[:MOST_TOLD]]
     return "\n".join([*lines, *([f"{where}: and {beyond} more"] if beyond else [])])
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:
-    """Drop what pydantic adds for the model a table's own key selects: it is no key of the file."""
+    """Drop what pydantic adds for the variant that a table's own key selects:
+
+    it is no key of the file.
+    """
     kept: list[int | str] = []
     here = document
     for i, part in enumerate(location):

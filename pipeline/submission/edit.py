@@ -1,4 +1,4 @@
-"""Change `submission.toml` in place: comments, order and digits that nobody touched stay."""
+"""Change `submission.toml` in place, keeping all other comments, order and digits."""
 
 import hashlib
 import re
@@ -19,7 +19,7 @@ from pipeline.submission.toml_file import Value, read_text
 
 
 class Outdated(SubmissionError):
-    """The file is another than the one that the change was made for; `text` is what it is now."""
+    """The file has changed since the change was prepared; `text` is its present content."""
 
     def __init__(self, text: str) -> None:
         super().__init__(f"{NAME}: was changed meanwhile, by another program or in another window")
@@ -40,23 +40,23 @@ def submission_text(folder: Path) -> str:
 
 
 def text_digest(text: str) -> str:
-    """Return what tells one state of the file from another."""
+    """Return a digest that identifies the state of the file."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def edit_submission(
     folder: Path, change: Callable[[tomlkit.TOMLDocument], None], *, seen: str = ""
 ) -> Submission:
-    """Change the document of a submission; written is what is valid, whole or not at all.
+    """Change the document of a submission; only a valid result is written, whole.
 
     Parameters
     ----------
-    seen : digest of the text that the change was made for; "": whatever stands there.
+    seen : digest of the text for which the change was prepared; "": any text.
 
     Raises
     ------
-    SubmissionError : what comes of it would not be valid (`InvalidSubmission`), or the file
-        cannot be changed so.
+    SubmissionError : the result would be invalid (`InvalidSubmission`), or the file cannot be
+        changed in this way.
     Outdated : the file is not the one `seen`.
     """
     with turn_in(folder):
@@ -115,7 +115,7 @@ def append_experiment(
 
 
 def comment_text(remark: str) -> str:
-    """Return a remark fit to stand behind a #, whatever a file's name brought into it."""
+    """Return a remark that is safe behind a #, whatever a file's name contains."""
     plain = "".join(c if c.isprintable() else " " for c in remark)
     return plain if len(plain) <= 90 else plain[:89] + "…"
 

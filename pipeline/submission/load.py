@@ -1,4 +1,4 @@
-"""Read `submission.toml` into a validated `Submission`; whatever is wrong is one line."""
+"""Read `submission.toml` into a validated `Submission`; every fault is one line."""
 
 import errno
 import re
@@ -41,13 +41,13 @@ NAME = "submission.toml"
 MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # one left open runs to the end
+COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # an open one runs to the end
 
 
 def load_submission(path: Path) -> Submission:
     """Read and check a submission: the folder, or its `submission.toml`.
 
-    `carts` left out of an experiment are filled in with all of them, and `file` is normalised to
+    Missing `carts` of an experiment are filled in with all of them, and `file` is normalised to
     forward slashes. Numbers under `[reported]` keep their digits as typed.
 
     Raises
@@ -73,11 +73,11 @@ def load_submission(path: Path) -> Submission:
 
 
 class InvalidSubmission(SubmissionError):
-    """What stands in `submission.toml` is not what may stand there.
+    """The content of `submission.toml` is invalid.
 
     Attributes
     ----------
-    problems : the first that were found, each with its place; the text has a line for each.
+    problems : the first ones found, each with its place; the text has a line for each.
     """
 
     def __init__(
@@ -88,17 +88,17 @@ class InvalidSubmission(SubmissionError):
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
-    """Check the text of a `submission.toml` that lies, or is to lie, in a folder.
+    """Check the text of a `submission.toml` for a folder.
 
     Parameters
     ----------
-    where : what to call the file.
+    where : the name of the file in messages.
 
     Raises
     ------
     SubmissionError : no TOML; InvalidSubmission, with every problem, where it is.
     """
-    # Decimals stay so: no typed digit is lost.
+    # Decimals are kept, so no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
     submission = _validate(document, where=where)
     if found := list(_problems(submission, folder)):
@@ -120,7 +120,7 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
 
 def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submission:
-    """Return the submission with other numbers under `[reported]`, checked as those of a file.
+    """Return the submission with other numbers under `[reported]`, checked like those of a file.
 
     Parameters
     ----------
@@ -200,7 +200,7 @@ def _plain(value: object, at: tuple[int | str, ...]) -> object:
 
 
 def _notes(folder: Path) -> str | None:
-    """Return `notes.md` without its comments, or None where there is nothing else in it."""
+    """Return `notes.md` without its comments, or None if nothing else is in it."""
     path, where = folder / "notes.md", f"{folder.resolve().name}/notes.md"
     if not path.exists() and not path.is_symlink():
         return None
@@ -216,11 +216,11 @@ def _notes(folder: Path) -> str | None:
     return text if text.strip() else None
 
 
-# ------------------------------------------------- what the tables say about one another
+# --------------------------------------------------------- consistency of tables
 
 
 def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, str]]:
-    """Yield (location, what is wrong) for what no single value shows."""
+    """Yield (location, problem) for problems that no single value shows."""
     n, springs = submission.system.carts, submission.system.springs
     yield from _another_count(submission)
     if len(springs) != n + 1:

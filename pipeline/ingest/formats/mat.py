@@ -1,4 +1,4 @@
-"""A recording out of a `.mat` file: which of its variables it is, and the columns they make."""
+"""The recording in a `.mat` file: which variables form it, and their columns."""
 
 import math
 from collections.abc import Sequence
@@ -71,7 +71,7 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
 
 
 def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariable]:
-    """Return the variables that are the recording: those with as many samples as the longest.
+    """Return the variables that form the recording: those with as many samples as the longest.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
         raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
     signals = [v for v in signals if min(v.size) <= _MAX_COLUMNS] or signals
     longest = max(v.samples for v in signals)
-    # Of the longest: what is shorter is gains or a list of poles, no signal cut short.
+    # Of the longest: a shorter variable holds gains or poles, not a truncated signal.
     signals = [v for v in signals if v.samples > 0.1 * longest]
     sizes = first_few([str(v) for v in signals], _MOST_NAMED)
     vectors = [v for v in signals if v.is_vector]
@@ -103,14 +103,14 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
             raise SubmissionError(f"{source}: {matrices[0]} has more than {_MAX_COLUMNS} columns")
         return matrices
     if any(bench <= {v.name for v in vectors} for bench in _BENCH):
-        return vectors  # a bench log is complete; what lies beside it was made of it
+        return vectors  # a bench log is complete; other variables were derived from it
     matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
     columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
     return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors
 
 
 def _not_read(variables: Sequence[Variable]) -> list[str]:
-    """Return a note on each variable that is not read, the largest first."""
+    """Return a note on each unread variable, the largest first."""
     large = [v for v in variables if v.advice]
     large.sort(key=lambda v: -math.prod(v.size))
     notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
@@ -122,16 +122,16 @@ def _not_read(variables: Sequence[Variable]) -> list[str]:
 
 
 def _advice(variable: MatVariable, *, longest: int) -> str:
-    """Return what to do for a variable that may hold a recording to be read; "" of others.
+    """Return advice for a variable that may hold a recording; "" for others.
 
-    `longest` is how many samples the recording has that was found beside it.
+    `longest` is the number of samples of the recording found beside it.
     """
     name = variable.name
     if variable.values is not None:
         if variable.samples <= _MAX_COLUMNS:
             return ""
         return f"if it is a recording, save it in a file of its own: save('new.mat', '{name}')"
-    if variable.bytes < 8 * longest:  # too few for the times alone
+    if variable.bytes < 8 * longest:  # too few to hold even the times
         return ""
     match variable.kind:
         case "struct":

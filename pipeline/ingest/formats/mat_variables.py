@@ -40,9 +40,9 @@ _NUMBERS = frozenset(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MatVariable:
-    """A variable: its numbers (rows, columns), or None and what it is instead.
+    """A variable: its numbers (rows, columns), or None and a description.
 
-    `bytes` is how many it takes in the file, where it has no numbers that are read.
+    `bytes` is its size in the file, if it has no numbers that are read.
     """
 
     name: str
@@ -53,22 +53,22 @@ class MatVariable:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Its numbers, where it has any."""
+        """Its numbers, if there are any."""
         assert self.values is not None
         return self.values
 
     @property
     def samples(self) -> int:
-        """How many samples it has, if it is a signal or a matrix of them."""
+        """Its number of samples, if it is a signal or a matrix of signals."""
         return max(self.numbers.shape)
 
     @property
     def is_vector(self) -> bool:
-        """Whether its numbers are those of one signal."""
+        """Whether it is one signal."""
         return self.numbers.size > 1 and min(self.numbers.shape) == 1
 
     def told(self, *, read: bool, advice: str = "") -> Variable:
-        """Return what an inspection says of it."""
+        """Return its entry in an inspection."""
         return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
 
     def __str__(self) -> str:
@@ -85,7 +85,7 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
 
     Raises
     ------
-    SubmissionError : it is broken, or no workspace of a bench has so many.
+    SubmissionError : it is broken, or has more variables than any bench's workspace.
     """
     if raw[:10] == b"MATLAB 7.3" or raw[512:516] == b"\x89HDF":
         read = _version_7_3
@@ -93,7 +93,7 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
         read = _version_5 if raw.startswith(b"MATLAB") else _version_4
     try:
         variables = list(islice(read(raw), _MOST_VARIABLES + 1))
-    # h5py raises what it stumbles on.
+    # h5py raises many kinds of error.
     except (ArithmeticError, LookupError, NotImplementedError, OSError, RuntimeError, TypeError,
             ValueError, struct.error, zlib.error):  # fmt: skip
         raise SubmissionError(f"{source}: the .mat file is broken or cut short") from None
@@ -105,7 +105,7 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
 
 
 def _matrix(name: str, values: np.ndarray, *, bytes: int) -> MatVariable:
-    """Return what a variable of MATLAB's numbers is."""
+    """Return the description of a variable of MATLAB's numbers."""
     if np.iscomplexobj(values):  # in version 7.3
         return _nothing(name, "complex", size=values.shape, bytes=bytes)
     dtype = np.dtype("u1") if values.dtype == bool else values.dtype.newbyteorder("=")
@@ -117,7 +117,7 @@ def _nothing(name: str, kind: str, *, size: tuple[int, ...] = (), bytes: int) ->
 
 
 def _no_matrix(size: tuple[int, ...]) -> str:
-    """Return why numbers of a size are no matrix; "" where they are."""
+    """Return why numbers of this size are not a matrix; "" if they are."""
     if len(size) != 2 or min(size) < 0:
         return "array of more than two dimensions"
     return "empty" if 0 in size else ""
@@ -140,14 +140,14 @@ def _version_5(raw: bytes) -> Iterator[MatVariable]:
             kind, content = _content(inflated, 0, order)
         if kind == _MATRIX and content:
             one = _read_matrix(content, order)
-            if one.name:  # MATLAB keeps what its objects share without a name
+            if one.name:  # MATLAB stores data shared by its objects without a name
                 yield one
     if raw[at:].strip(b"\0"):
         raise ValueError(at)
 
 
 def _content(raw: bytes, at: int, order: str) -> tuple[int, bytes]:
-    """Return (type, bytes) of the long element at `at`, which must be whole."""
+    """Return (type, bytes) of the long element at `at`, which must be complete."""
     kind, size = struct.unpack_from(order + "II", raw, at)
     content = raw[at + 8 : at + 8 + size]
     if len(content) < size:
@@ -222,7 +222,7 @@ def _version_4(raw: bytes) -> Iterator[MatVariable]:
 
 
 def _v4_heading(raw: bytes, at: int) -> tuple[np.dtype, tuple[int, int], int, bool] | None:
-    """Return (type, size, length of the name, whether real), None where no variable begins."""
+    """Return (type, size, length of the name, whether real), None if no variable begins here."""
     for order in "<>" if len(raw) >= at + 20 else "":
         code, rows, columns, imaginary, length = struct.unpack_from(order + "5i", raw, at)
         machine, zero, precision, kind = (code // 10**power % 10 for power in (3, 2, 1, 0))
@@ -243,13 +243,13 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
     left = _MOST_BYTES
     with h5py.File(BytesIO(raw), "r") as file:
         for name in map(str, file):
-            if name.startswith("#"):  # what MATLAB's cells and objects refer to
+            if name.startswith("#"):  # targets of references in MATLAB's cells and objects
                 continue
             is_link = not isinstance(file.get(name, getlink=True), h5py.HardLink)
             if is_link or not name.isprintable() or len(name) > _LONGEST_NAME:
                 raise ValueError(name)
             item: Any = file[name]
-            if isinstance(item, h5py.Datatype):  # a type that somebody named: no numbers
+            if isinstance(item, h5py.Datatype):  # a named type: no numbers
                 continue
             if isinstance(item, h5py.Group):
                 kind = "sparse" if "MATLAB_sparse" in item.attrs else "struct"
@@ -284,7 +284,7 @@ def _holds_numbers(dtype: np.dtype) -> bool:
 
 
 def _class_of(item: Any) -> str:
-    """Return MATLAB's class of a data set; of one that another program wrote, by its numbers."""
+    """Return MATLAB's class of a data set; for one from another program, by its numbers."""
     if "MATLAB_empty" in item.attrs:
         return "empty"
     of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")

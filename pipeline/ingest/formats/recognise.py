@@ -1,4 +1,4 @@
-"""The forms of data files: recognise one by what is in it and read its columns."""
+"""The forms of data files: recognise one by its content and read its columns."""
 
 import hashlib
 from collections.abc import Collection
@@ -22,7 +22,7 @@ FORM_TITLES = {
 }
 _READERS = ((is_mat, read_mat),)  # what recognises a file, and reads it; all others are text
 
-# Files that end up in a submission by mistake, by their first bytes, and what to do instead.
+# Files that end up in a submission by mistake, by their first bytes, and the advice.
 _STRANGERS = (
     (b"PK\x03\x04", "an Excel workbook or a zip archive; save the sheet as CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook; save the sheet as CSV"),
@@ -39,13 +39,13 @@ def read_table(
 ) -> tuple[FileTable, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
 
-    Messages call the file `shown`, by default its name; where it is missing, the files `taken`
-    are not proposed.
+    Messages call the file `shown`, by default its name; if it is missing, the files `taken` are not
+    proposed.
 
     Raises
     ------
     SubmissionError : outside the folder, missing, of no known form or broken; names the line.
-    OSError : this computer cannot read it now, whatever is in it.
+    OSError : this computer cannot read it now, whatever its content.
     """
     if (problem := outside(folder, name, taken=taken)) is not None:
         raise SubmissionError(problem if shown is None else f"{shown}: {problem}")

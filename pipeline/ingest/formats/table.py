@@ -1,4 +1,4 @@
-"""A data file as it stands: named columns of numbers, before any meaning or unit."""
+"""A data file as written: named columns of numbers, without meaning or unit."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 
-# What a bench measures, in any unit: times, positions, inputs, ratios. Powers and products of some
-# of them, as the stages form them, neither overflow nor vanish.
+# The range of values a bench can measure, in any unit: times, positions, inputs, ratios. Powers and
+# products of some of them, as in the stages, neither overflow nor vanish.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variable:
-    """A variable of a binary file, and what was made of it.
+    """A variable of a binary file, and its use.
 
     Attributes
     ----------
-    size : rows and columns, as far as they could be read; () where not.
-    kind : the type of its numbers, or what it is instead.
+    size : rows and columns, if they could be read; else ().
+    kind : the type of its numbers, or its description.
     read : its numbers are among the columns.
-    advice : what to do for it to be read, where it may hold a recording; else "".
+    advice : how to get it read, if it may hold a recording; else "".
     """
 
     name: str
@@ -47,12 +47,12 @@ class FileTable:
     ----------
     source : the file's name, for messages.
     form : how the file is laid out, a key of `FORM_TITLES`.
-    names : (n_columns,) headings as written; numbers "1", "2", … where there are none.
+    names : (n_columns,) headings as written; numbers "1", "2", … without headings.
     values : (n_columns, n), all finite.
-    whole : (n_columns,) the column holds nothing but whole numbers, written as such.
-    lines : (n,) line of the file each row stands in; None in a binary file.
+    whole : (n_columns,) the column holds only whole numbers, written as such.
+    lines : (n,) line of the file for each row; None for a binary file.
     cut : the broken last line of a file that was cut short, or None.
-    notes : what reading repaired or left out.
+    notes : repairs and omissions of reading.
     variables : of a binary file, in its order.
     """
 
@@ -68,7 +68,7 @@ class FileTable:
 
     @property
     def cut_short(self) -> str:
-        """What is wrong with a file that was cut short, and what to do; "" for a whole one."""
+        """The fault of a truncated file, and what to do; "" for a complete one."""
         if self.cut is None:
             return ""
         return f"{self.cut}; the file was cut short: export it again, or delete its last line"
@@ -117,7 +117,7 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
     ------
     SubmissionError : names the column and, by `place`, the row.
     """
-    # Of anything in a file, times and what is not used included.
+    # Of anything in a file, also times and unused columns.
     usable = np.abs(values) < 1e50  # NaN compares as false
     if not usable.all():
         column, row = np.argwhere(~usable)[0]
@@ -126,11 +126,11 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
 
 
 def refuse_extreme(values: Array, *, what: str) -> None:
-    """Refuse numbers, zeros aside, of which the largest is beyond what any bench measures.
+    """Refuse numbers, except zeros, whose largest exceeds everything a bench measures.
 
     Raises
     ------
-    SubmissionError : says `what`, with its file.
+    SubmissionError : with `what` and its file.
     """
     largest = float(np.abs(values).max(initial=0.0))
     if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:

@@ -57,7 +57,7 @@ def _decode(raw: bytes, *, source: str) -> str:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Parsed rows of a file: (n, width) numbers, their lines, what shows that it was cut."""
+    """Parsed rows of a file: (n, width) numbers, their lines, and signs of truncation."""
 
     source: str
     names: Sequence[str]
@@ -74,12 +74,12 @@ def _parse(
     names: Sequence[str],
     source: str,
 ) -> _Rows:
-    """Parse rows into numbers; a bad last row is a file cut short, any other an error.
+    """Parse rows into numbers; a bad last row means a truncated file, any other is an error.
 
     Parameters
     ----------
-    lines : of the file, in which the rows stand.
-    split : what returns the fields of a row.
+    lines : of the file, for the rows.
+    split : function that returns the fields of a row.
     """
     values, cut = _numbers(map(split, rows), width=len(names)), None
     if values is None:
@@ -96,7 +96,10 @@ def _parse(
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
-    """Return rows of numbers (n, width), None where one is none; none is looked at by itself."""
+    """Return rows of numbers (n, width), or None if any is not a number;
+
+    rows are not checked singly.
+    """
     fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
     try:
         return np.fromiter(map(float, fields), np.float64).reshape(-1, width)
@@ -178,7 +181,7 @@ def _checked_names(names: Sequence[str], *, source: str, line: int) -> list[str]
 
 
 def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
-    """Read `heading [ row; row; … ]`, as the ECP program and MATLAB scripts of it write."""
+    """Read `heading [ row; row; … ]`, as written by the ECP program and MATLAB scripts."""
     first_line = text.count("\n", 0, opening.end()) + 1
     end = text.find("]", opening.end())
     body = text[opening.end() : end if end >= 0 else len(text)]
@@ -237,7 +240,7 @@ def _ecp_heading(head: str) -> tuple[list[str], int]:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the lines of a table are to be split: `delimiter` None is any run of white space."""
+    """How the lines of a table are split: `delimiter` None is any run of white space."""
 
     delimiter: str | None
     decimal_comma: bool
@@ -254,7 +257,7 @@ class _Layout:
 
     @property
     def split(self) -> Callable[[str], list[str]]:
-        """What returns the fields of a row of numbers, with a decimal point."""
+        """The function that returns the fields of a row of numbers, with a decimal point."""
         if self.decimal_comma:
             return lambda row: [field.replace(",", ".") for field in self.fields(row)]
         if self.delimiter is None or self.trailing:
@@ -327,7 +330,10 @@ def _heading(
 
 
 def _is_bench_log(names: Sequence[str]) -> bool:
-    """Tell the bench's own log: an ECP's headings, but no commanded position and no brackets."""
+    """Return whether it is the bench's own log:
+
+    ECP headings, but no commanded position and no brackets.
+    """
     words = {name.casefold() for name in names}
     return (
         {"sample", "time", "control effort"} <= words
@@ -337,10 +343,10 @@ def _is_bench_log(names: Sequence[str]) -> bool:
 
 
 def _sniff(sample: Sequence[str]) -> _Layout | None:
-    """Return the layout that makes the most lines into rows of numbers of one width, or None.
+    """Return the layout that makes most lines into rows of numbers of one width, or None.
 
-    Of equals the first wins, so that "0,5;1,2" is two numbers with decimal commas and "0,5" two
-    whole ones.
+    Of equal layouts the first wins, so that "0,5;1,2" is two numbers with decimal commas and "0,5"
+    two integers.
     """
     best, best_score = None, 0.0
     for delimiter in ("\t", ";", ",", None):
@@ -353,11 +359,11 @@ def _sniff(sample: Sequence[str]) -> _Layout | None:
             has_heading = not all(map(_is_number, split[0]))
             width = len(split[0])
             numeric = [len(row) for row in split[has_heading:] if all(map(_is_number, row))]
-            # One column only where nothing else fits; numbers under a heading of another width
-            # only to say so.
+            # One column only if nothing else fits; numbers under a heading of another width only to
+            # report it.
             score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
             if score > best_score:
                 best, best_score = replace(layout, has_heading=has_heading), score
             if width > 1 and numeric.count(width) == len(split) - has_heading > 0:
-                return best  # every line has the delimiter in it, which is in no number
+                return best  # every line contains the delimiter, which is in no number
     return best

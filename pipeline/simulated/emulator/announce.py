@@ -1,4 +1,4 @@
-"""The virtual benches that run on this computer: each writes a file while it does."""
+"""The virtual benches running on this computer, each with a file."""
 
 import json
 import os
@@ -15,7 +15,7 @@ from pipeline.output import OWNERS_FOLDER
 
 @dataclass(frozen=True, kw_only=True)
 class RunningBench:
-    """A virtual bench of the same person.
+    """A virtual bench of the same user.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class RunningBench:
 
 @contextmanager
 def announced(bench: RunningBench) -> Iterator[None]:
-    """Tell the desks of this person that a bench runs; the file goes with the context."""
+    """Announce a running bench to this user's desks; the file is removed at the end."""
     folder, pid = _find_folder(), os.getpid()
     path = folder / f"{pid}.json"
     told = {"name": bench.name, "address": bench.address, "began": _began(pid)}
@@ -54,14 +54,14 @@ def running_benches() -> list[RunningBench]:
 
 
 def _find_folder() -> Path:
-    """Return the folder of the files, which no other person can write to where systems tell."""
+    """Return the folder of the files, which no other user can write to if systems tell."""
     own = str(os.getuid()) if hasattr(os, "getuid") else "user"
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     return Path(root) / f"cartlab-benches-{own}"
 
 
 def _is_own(folder: Path) -> bool:
-    """Whether the folder is there and belongs to this person alone."""
+    """Whether the folder exists and belongs to this user alone."""
     if folder.is_symlink() or not folder.is_dir():
         return False
     info = folder.stat()
@@ -82,7 +82,7 @@ def _read(path: Path) -> RunningBench | None:
 def _began(pid: int) -> float:
     """Return when a process began, s; 0 if there is no such process.
 
-    The number of a process is used again, not together with its time.
+    A process number is used again, but not with the same time.
     """
     try:
         return psutil.Process(pid).create_time()

@@ -1,4 +1,4 @@
-"""The carts of a virtual bench: a preset with what is hidden in it, its hands and its encoders."""
+"""The carts of a virtual bench: a preset with hidden effects, its hands and its encoders."""
 
 import math
 from collections.abc import Generator
@@ -11,11 +11,11 @@ from pipeline.plant.nonlinear.augmented import SteppedBench
 from pipeline.plant.nonlinear.effects import AugmentedChain
 from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
 
-TRUE_PERIOD = 1.0024e-3  # s from tick to tick, where the controller believes in 1 ms
-REACH = 12.0  # times the travel that full duty moves the carts, about: 1 cm is some 300 counts
+TRUE_PERIOD = 1.0024e-3  # s between ticks, while the controller assumes 1 ms
+REACH = 12.0  # times the travel that full duty moves the carts, roughly: 1 cm is some 300 counts
 FEWEST_ENCODERS = 2  # a line has two counts even where there is one cart
 
-_NOISE = 0.2  # counts that shake a free cart's encoder: it flickers between two counts
+_NOISE = 0.2  # counts of noise on a free cart's encoder: it flickers between two counts
 
 
 class VirtualCarts:
@@ -23,12 +23,12 @@ class VirtualCarts:
 
     Parameters
     ----------
-    seed : of the encoders' noise, the hands' tremor and when they let go.
-    period : s from tick to tick.
+    seed : of the encoders' noise, the hands' tremor and the times of release.
+    period : s between ticks.
 
     Attributes
     ----------
-    encoders : how many counts there are, never under two; those without a cart stay at zero.
+    encoders : number of counts, at least two; those without a cart stay at zero.
     """
 
     def __init__(self, bench: SimulatedBench, *, seed: int, period: float = TRUE_PERIOD) -> None:
@@ -38,12 +38,12 @@ class VirtualCarts:
         n = bench.chain.n
         self.encoders = max(FEWEST_ENCODERS, n)
         self.input_per_count = input_per_count(bench)
-        # Where between two counts an encoder gets its power is chance.
+        # An encoder's position between two counts at power-on is random.
         self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
         self.take_in_hand(Hands())
 
     def counts(self) -> tuple[int, ...]:
-        """Return what the encoders count since they had power."""
+        """Return the encoder counts since power-on."""
         noise = next(self._noise, None)
         if noise is None:
             block = self._noise_rng.standard_normal((1024, self._shaken.size))
@@ -54,11 +54,11 @@ class VirtualCarts:
         return (*np.rint(exact).astype(int).tolist(), *(0,) * spare)
 
     def move(self, duty: int) -> None:
-        """Move on by one tick under a duty.
+        """Advance by one tick under a duty.
 
         Raises
         ------
-        DataError : what is hidden makes the carts run away.
+        DataError : the hidden effects make the carts diverge.
         """
         if self._hand is not None:
             try:
@@ -70,7 +70,7 @@ class VirtualCarts:
         self._plant.step(u, following=u, interval=self._period)
 
     def take_in_hand(self, hands: Hands) -> None:
-        """Bring all carts to rest; hold some, and pull one out to let it go in the next run."""
+        """Bring all carts to rest; hold some, and pull one out for release in the next run."""
         self._started = False
         n = self._bench.chain.n
         free = [cart for cart in range(1, n + 1) if cart not in hands.held]
@@ -80,7 +80,7 @@ class VirtualCarts:
         self._hand = self._lead(hands.released) if hands.released in free else None
 
     def start(self) -> None:
-        """Tell the hands that a run starts."""
+        """Let the hands know that a run starts."""
         self._started = True
 
     def _lead(self, cart: int) -> Generator[None]:
@@ -92,7 +92,7 @@ class VirtualCarts:
                 cart=cart,
                 position=rng.choice([-1.0, 1.0]) * rng.uniform(1.2, 1.8) * self._bench.travel,
                 release=float(rng.uniform(0.3, 0.6)),  # s after the start of a run
-                fade=float(rng.uniform(0.01, 0.03)),  # s that its force takes to fall
+                fade=float(rng.uniform(0.01, 0.03)),  # s in which its force falls
                 tremor=(float(tremor[0]), float(tremor[1]), float(tremor[2])),
             ),
             self._model,
@@ -121,8 +121,8 @@ class VirtualCarts:
 def input_per_count(bench: SimulatedBench) -> float:
     """Return input units per duty count: five over a power of ten, over full scale.
 
-    So a full-scale input holds the carts some ten travels out, and one travel takes hundreds of
-    counts; 5 V for all of it would be 28.
+    A full-scale input holds the carts some ten travels out, so one travel takes hundreds of counts;
+    with 5 V for all of it there would be 28.
     """
     hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
     return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE

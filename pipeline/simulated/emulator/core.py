@@ -1,6 +1,6 @@
-"""What a bench's controller does between its line and its motor: a state machine, once a period.
+"""A bench's controller between its line and its motor: a state machine, stepped once a period.
 
-docs/protocol.md says in words and formulas what is written here.
+docs/protocol.md specifies it in words and formulas.
 """
 
 from collections.abc import Sequence
@@ -32,12 +32,12 @@ from pipeline.plant.loop.sampled_loop import VELOCITY_CORRECTION
 class Core(Protocol):
     """A bench's controller without its hardware.
 
-    Whatever carries it calls `receive` when bytes arrive, `tick` once a period while the bench
-    has power, and `take` to send on what it has to say. The firmware and `ReferenceCore` are such.
+    The owner calls `receive` when bytes arrive, `tick` once a period while the bench has power, and
+    `take` for bytes to send. The firmware and `ReferenceCore` have this interface.
     """
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; what they ask for happens at the next tick."""
+        """Take bytes from the line; they act at the next tick."""
         ...
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
@@ -45,14 +45,14 @@ class Core(Protocol):
 
         Parameters
         ----------
-        counts : of the encoders since they had power; a reset makes the next ones zero.
-        stamp : whole ms of the bench's clock, which lines, waves and run times go by.
+        counts : of the encoders since power-on; a reset makes the next ones zero.
+        stamp : whole ms of the bench's clock, used for lines, waves and run times.
         now : whole ms of wall time, for the watchdog alone: an emulation may run faster.
         """
         ...
 
     def take(self) -> bytes:
-        """Return what is to be sent since the last call: lines of readings, answers."""
+        """Return the bytes to send since the last call: lines of readings, answers."""
         ...
 
 
@@ -61,8 +61,8 @@ class ReferenceCore:
 
     Parameters
     ----------
-    description : what a query is answered with. Its period is the one the control laws count
-        with; without `commands` it is the stock bench, which answers nothing.
+    description : the answer to a query. Its period is the one used in the control laws; without
+        `commands` it is the stock bench, which gives no answer.
     """
 
     def __init__(self, description: Description) -> None:
@@ -73,11 +73,11 @@ class ReferenceCore:
         self._reset()
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; what they ask for happens at the next tick."""
+        """Take bytes from the line; they act at the next tick."""
         self._commands += self._reader.feed(data)
 
     def take(self) -> bytes:
-        """Return what is to be sent since the last call."""
+        """Return the bytes to send since the last call."""
         sent = bytes(self._sent)
         self._sent.clear()
         return sent

@@ -1,7 +1,7 @@
-"""What goes wrong on a serial line, on purpose: faults put into the lines a bench sends.
+"""Deliberate faults on a serial line, inserted into the lines that a bench sends.
 
-Each is written `KIND=RATE`, `KIND@SECONDS` or, of an encoder, `stuck=ENCODER@SECONDS`: at random
-in so many of the lines, or once, when the bench has streamed for so long in all its runs.
+Each is written `KIND=RATE`, `KIND@SECONDS` or, for an encoder, `stuck=ENCODER@SECONDS`: at random
+in this share of the lines, or once, when the bench has streamed for this long in all its runs.
 """
 
 import re
@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.errors import ConfigError
 from pipeline.submission.complaints import nearest
 
-HOLD = 0.05  # s of the bench's clock that a late lump is held back
+HOLD = 0.05  # s of the bench's clock for which a late chunk is held back
 
 KINDS = {
     "drop": "the line never comes",
@@ -35,8 +35,8 @@ class LineFault:
 
     Attributes
     ----------
-    rate : share of the lines it strikes.
-    at : s of streaming after which it strikes once; None: at random.
+    rate : share of the lines affected.
+    at : s of streaming after which it occurs once; None: at random.
     encoder : that is stuck; 0: none.
     """
 
@@ -51,7 +51,7 @@ def read_fault(text: str) -> LineFault:
 
     Raises
     ------
-    ConfigError : it is none.
+    ConfigError : it is not a fault.
     """
     where = f"--fault {text}"
     match = _SYNTAX.fullmatch(text.strip())
@@ -77,15 +77,15 @@ def read_fault(text: str) -> LineFault:
 
 
 class Faults:
-    """Strikes the lines that go by, each at most once.
+    """Applies faults to passing lines, at most one to each.
 
     Parameters
     ----------
-    period : s from line to line.
+    period : s between lines.
 
     Attributes
     ----------
-    injected : how often each kind struck; `late` are the lines that a delay held back.
+    injected : number of faults of each kind; `late` counts the lines held back by a delay.
     """
 
     def __init__(self, faults: Sequence[LineFault] = (), *, seed: int, period: float) -> None:
@@ -95,7 +95,7 @@ class Faults:
         self._rng = np.random.default_rng(seed)
         self.injected: Counter[str] = Counter()
         self._period, self._streamed = period, 0.0  # s
-        self._stuck: dict[int, bytes | None] = {}  # what the encoder shows; None: from now on
+        self._stuck: dict[int, bytes | None] = {}  # the frozen encoder reading; None: freeze now
         self._ms = -1  # of the last line
         self._clock_began = 0  # ms of the run, at the last reset
         self._open = False  # the last line has lost its end
@@ -103,7 +103,7 @@ class Faults:
         self._until = 0.0  # s of the bench's clock, the end of the hold
 
     def strike(self, line: bytes, *, clock: float) -> tuple[bytes, str]:
-        """Return what goes out instead of a line of the stream, and what struck it ("": nothing).
+        """Return what is sent in place of a line, and the kind of fault ("": none).
 
         Parameters
         ----------
@@ -126,16 +126,16 @@ class Faults:
         return self._hold(line, clock=clock), kind
 
     def idle(self, *, clock: float) -> bytes:
-        """Return what is still due where the bench sends no line: a late lump, a lost line end."""
+        """Return data still due when the bench sends no line: a late chunk, a lost line end."""
         end, self._open = b"\n" * self._open, False
         return self._hold(end, clock=clock)
 
     def behind(self, data: bytes, *, clock: float) -> bytes:
-        """Return what goes out of what is no line of the stream: it overtakes none of them."""
+        """Return what is sent for text outside the stream: it overtakes no line."""
         return self._hold(data, clock=clock)
 
     def _hold(self, data: bytes, *, clock: float) -> bytes:
-        """Return what goes out now: this and what was held back, or nothing yet."""
+        """Return what is sent now: this and the held data, or nothing yet."""
         self._held += data
         if not self._held or clock < self._until:
             return b""
@@ -144,7 +144,7 @@ class Faults:
         return out
 
     def _choose(self) -> str:
-        """Return the kind that strikes the next line; "": none."""
+        """Return the kind of fault for the next line; "": none."""
         self._streamed += self._period
         while self._timed and self._timed[0][0] <= self._streamed:
             _, fault = self._timed.pop(0)
@@ -152,7 +152,7 @@ class Faults:
             if not fault.encoder:
                 return fault.kind
             self._stuck[fault.encoder] = None
-        if self._open or not self._random:  # what follows a merger is lost with it already
+        if self._open or not self._random:  # the line behind a merger is lost with it already
             return ""
         draw = self._rng.random()
         for fault in self._random:
@@ -165,7 +165,7 @@ class Faults:
         return ""
 
     def _rewritten(self, line: bytes, *, reset: bool) -> bytes:
-        """Return the line as encoders that are stuck and a clock that began again make it."""
+        """Return the line after stuck encoders and a restarted clock."""
         *counts, target, duty, stamp = line.rstrip().split(b":")
         ms = int(stamp)
         if reset or ms < self._ms:  # or another run

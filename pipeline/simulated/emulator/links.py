@@ -17,7 +17,7 @@ _CHUNK = 65_536  # bytes
 
 
 class Link(Protocol):
-    """What a bench has of its line. Hosts come one after the other; the next one waits.
+    """A bench's end of its line. Hosts come one after the other; the next one waits.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Link(Protocol):
         ...
 
     def wait(self, seconds: float) -> None:
-        """Sleep until something arrives, or so long."""
+        """Sleep until something arrives, or for this time."""
         ...
 
     def receive(self) -> bytes:
@@ -45,7 +45,7 @@ class Link(Protocol):
         ...
 
     def send(self, data: bytes) -> None:
-        """Send, or keep for later what the host does not take yet; nothing where none is there."""
+        """Send, or keep what the host does not take yet; drop everything without a host."""
         ...
 
     def hang_up(self) -> None:
@@ -62,7 +62,8 @@ def open_link(port: str, *, remote: bool = False) -> Link:
 
     Raises
     ------
-    ConfigError : it is neither; the port is taken; or others could reach it, and `remote` is False.
+    ConfigError : it is neither; the port is taken; or others could reach it while `remote` is
+        False.
     """
     if port == "pty":
         return _open_pty()
@@ -102,7 +103,7 @@ class _SocketLink:
     def __init__(self, listener: socket.socket, *, address: str) -> None:
         self.address, self._listener = address, listener
         self._client: socket.socket | None = None
-        self._ready = False  # something arrived, or a host is at the door
+        self._ready = False  # something arrived, or a host is waiting
         self._unsent = bytearray()
 
     @property
@@ -180,7 +181,7 @@ class _PtyLink:
         self._master, slave = os.openpty()
         tty.setraw(slave)
         self.address = os.ttyname(slave)
-        os.close(slave)  # so that the master tells when no host has it open
+        os.close(slave)  # so that the master notices when no host has it open
         os.set_blocking(self._master, False)
         self.connected = False
         self._unsent = bytearray()
@@ -219,7 +220,7 @@ class _PtyLink:
                 del self._unsent[: os.write(self._master, self._unsent[:_CHUNK])]
 
     def hang_up(self) -> None:
-        """Do nothing but forget: a pseudo-terminal cannot be pulled out of a host's hands."""
+        """Only forget its data: a pseudo-terminal cannot be taken away from a host."""
         self._unsent.clear()
 
     def close(self) -> None:

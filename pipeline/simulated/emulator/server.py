@@ -1,4 +1,4 @@
-"""A virtual bench: a controller, carts and a line, kept going at the pace of the clock."""
+"""A virtual bench: a controller, carts and a line, run in step with the clock."""
 
 import gc
 import re
@@ -34,9 +34,9 @@ class EmulatorOptions:
     Attributes
     ----------
     port, remote : as `open_link` takes them.
-    speed : how many times faster than real time it runs, as far as the computer can.
-    period : true s from tick to tick; the controller believes in whole ms.
-    stock : it knows no extension of the protocol, nor does it answer a query.
+    speed : factor over real time, as far as the computer can.
+    period : true s between ticks; the controller assumes whole ms.
+    stock : it knows no extension of the protocol and answers no query.
     faults : each as `read_fault` takes it.
     seed : of noise, hands and faults.
     """
@@ -51,23 +51,23 @@ class EmulatorOptions:
 
 
 class Server:
-    """A simulated bench on a line that is open, whoever comes to it; `serve` keeps it going.
+    """A simulated bench on an open line; `serve` keeps it running for all its hosts.
 
     Parameters
     ----------
-    core : makes the controller of a bench so described.
+    core : makes the controller for a description.
     tell : called with each event as it happens.
 
     Attributes
     ----------
-    description : of the bench, as it answers a query.
-    events : what happened; each has `event`: "client" (connected), "run" (lines, ended and the
-        faults injected), "motor off" (ms_after_heartbeat).
+    description : of the bench, its answer to a query.
+    events : each has `event`: "client" (connected), "run" (lines, ended and the faults injected),
+        "motor off" (ms_after_heartbeat).
 
     Raises
     ------
-    ConfigError : the port or a fault will not do, or the simulation would never end.
-    DataError : no spring ties the carts to a wall, or what is hidden makes them run away.
+    ConfigError : port or fault are invalid, or the simulation would never end.
+    DataError : no spring connects the carts to a wall, or hidden effects make them diverge.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Server:
                 "--fault disconnect: a pty cannot be pulled out; take --port socket://…"
             )
         self._carts = VirtualCarts(bench, seed=options.seed, period=options.period)
-        self._carts.move(0)  # compiles what moves them, before anybody waits for it
+        self._carts.move(0)  # compiles the simulation before a host waits for it
         self.description = Description(
             name=re.sub(r"[^\w.-]", "_", bench.name, flags=re.ASCII),
             encoders=self._carts.encoders,
@@ -113,20 +113,20 @@ class Server:
         self._heard: float | None = None  # s of wall time, of the last heartbeat
         self._injected_before: Counter[str] = Counter()  # by the end of the last run
         self._connected = False
-        self._pulled = False  # a fault wants the cable pulled
+        self._pulled = False  # a fault asks to pull the cable
 
     def serve(self, *, until: Callable[[], bool]) -> None:
-        """Keep the bench going until told otherwise."""
-        gc.freeze()  # a look for garbage among all that is loaded would hold it up for 0.1 s
+        """Keep the bench running until told otherwise."""
+        gc.freeze()  # garbage collection over everything loaded would delay it by 0.1 s
         owed, last = 0.0, time.monotonic()
         while not until():
             asleep = self._is_asleep()
             late = owed >= self._period and self._link.unsent < _MOST_UNSENT
-            # What is due between two looks at the line goes out together.
+            # Data due between two looks at the line are sent together.
             self._link.wait(0.1 if asleep else 0.0 if late else 2e-3)
             self._listen()
             now = time.monotonic()
-            # What the computer was too busy for beyond 1 s of the bench's clock is left out.
+            # A delay of the computer beyond 1 s of the bench's clock is skipped.
             owed = 0.0 if asleep else min(owed + (now - last) * self._speed, 1.0)
             last = now
             out = bytearray()
@@ -142,7 +142,7 @@ class Server:
 
     @property
     def address(self) -> str:
-        """What a host opens."""
+        """The address for hosts."""
         return self._link.address
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ class Server:
                 self._overhear(command)
 
     def _overhear(self, command: Command) -> None:
-        """Note what the hands and the log need to know of what the controller is told."""
+        """Note what the hands and the log need from the controller's commands."""
         match command:
             case Start():
                 self._end_run("restarted")
@@ -187,7 +187,7 @@ class Server:
                 self._ending, self._heard = "reset", None
 
     def _tick(self) -> bytes:
-        """Move the bench on by one tick; returns what goes over the line."""
+        """Advance the bench by one tick; return the bytes to send."""
         now = int(1e3 * time.monotonic())
         duty = self._core.tick(self._carts.counts(), stamp=int(1e3 * self._clock), now=now)
         said = self._core.take().splitlines(keepends=True)
