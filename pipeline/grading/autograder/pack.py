@@ -57,7 +57,10 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
 def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
     """Yield (name in the zip, content)."""
     for script in _SCRIPTS.iterdir():
-        yield script.name, script.read_bytes()
+        yield (
+            script.name,
+            script.read_bytes().replace(b"\r\n", b"\n"),
+        )  # for bash, also from Windows
     yield "python-version", f"{sys.version_info.major}.{sys.version_info.minor}\n".encode()
     head = f"# cartlab {pipeline.__version__} was installed with:"
     yield "requirements.txt", "\n".join([head, *pin_requirements(), ""]).encode()
