@@ -1,5 +1,6 @@
 """Write the catalogue of effects as a page of these documents: `effects.md`, a picture for each."""
 
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -35,7 +36,7 @@ def effects_page() -> str:
     head = [
         "# The effects",
         "<!-- written by python -m docs.codegen -->",
-        phrases("effects").text("effects"),
+        _wrapped(phrases("effects").text("effects")),
         "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
     ]
     return "\n\n".join([*head, *(part for e in CATALOGUE for part in _entry(e))]) + "\n"
@@ -44,20 +45,26 @@ def effects_page() -> str:
 def _entry(effect: Effect) -> Iterator[str]:
     term = usual_term(effect, PRESETS[BENCH])
     yield f"## {effect.title}"
-    yield f"`{effect.key}`: {effect.sentence}"
+    yield _wrapped(f"`{effect.key}`: {effect.sentence}")
     yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
     yield f"![{effect.title}: its fingerprint, and a run with and without it]({picture})"
     facts = {
-        "Where": effect.place,
-        "Parameters": ", ".join(parameter_text(p) for p in effect.parameters if p.reported),
+        f"Parameters ({effect.place})": ", ".join(
+            parameter_text(p) for p in effect.parameters if p.reported
+        ),
         "Fingerprint": effect.fingerprint,
-        "The run that decides": effect.deciding_run,
+        "Deciding run": effect.deciding_run,
         "Easily taken for": effect.equivalent,
         "Read": effect.reference,
-        "Try it": f"`{hiding_command(term)}`",
     }
-    yield "\n".join(f"- **{name}**: {fact}" for name, fact in facts.items() if fact)
+    lines = [_wrapped(f"- **{name}**: {fact}") for name, fact in facts.items() if fact]
+    yield "\n".join([*lines, f"- **Try it**: `{hiding_command(term)}`"])
+
+
+def _wrapped(text: str) -> str:
+    indent = "  " if text.startswith("- ") else ""
+    return textwrap.fill(text, 118, subsequent_indent=indent, break_on_hyphens=False)
 
 
 if __name__ == "__main__":

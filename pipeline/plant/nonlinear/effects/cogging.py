@@ -27,7 +27,7 @@ EFFECT = Effect(
         EffectParameter("phase", "φ", "rad", scale="1", typical=3.142, signed=True),
     ),
     fingerprint="The cart rests at some positions rather than at others, evenly apart; the "
-    "residual force is a wave over the position, alike in both directions.",
+    "residual force is the same wave over position in both directions.",
     deciding_run="A slow ramp of the input, up and down: the cart moves in even steps, at the same "
     "positions both ways, where dry friction shifts them.",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
