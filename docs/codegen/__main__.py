@@ -15,7 +15,6 @@ MADE = {
     "simulator/laws.py": laws_source,
     "simulator/terms.py": terms_source,
 }
-STORED = ("plant/nonlinear/simulator", "gap/follow")  # whose compiled functions call the laws
 
 
 def main() -> None:
@@ -24,9 +23,6 @@ def main() -> None:
         write_file(ROOM / name, source(CATALOGUE))
     files = [str(ROOM / name) for name in MADE]
     subprocess.run([sys.executable, "-m", "ruff", "format", "--quiet", *files], check=True)
-    for room in STORED:
-        for stored in (ROOM.parents[1] / room / "__pycache__").glob("*.nb[ic]"):
-            stored.unlink()
     subprocess.run([sys.executable, "-m", "docs.effects_page"], check=True)
 
 

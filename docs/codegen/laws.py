@@ -168,7 +168,7 @@ def laws_source(catalogue: Sequence[Effect]) -> str:
         _HEAD.format("The laws of the effects: what the compiled simulators know of them."),
         "from math import cos, exp, inf, pi, sin\n",
         "from pipeline.plant.nonlinear.columns import Cart, Drive, Spring",
-        "from pipeline.plant.nonlinear.simulator.state import inlined, jit\n",
+        "from pipeline.plant.nonlinear.simulator.compiler import inlined, jit\n",
     ]
     for place, on_motor, arguments, where in _SIMULATED:
         out += _forces(catalogue, place, on_motor, arguments, where)
@@ -187,7 +187,7 @@ def terms_source(catalogue: Sequence[Effect]) -> str:
     out = [
         _HEAD.format("The laws of the effects in the coordinates of a fit, with derivatives."),
         "from enum import IntEnum\nfrom math import cos, exp, pi, sin\n",
-        "from pipeline.plant.nonlinear.simulator.state import jit\n",
+        "from pipeline.plant.nonlinear.simulator.compiler import jit\n",
         *_followed(catalogue),
     ]
     return "\n".join(out) + "\n"

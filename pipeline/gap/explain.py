@@ -51,7 +51,7 @@ def investigate(analysis: Analysis, *, progress: Progress, budget: float | None 
     DataError : no usable record.
     """
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
-    progress("preparing the simulator; once on each machine it is compiled, which takes a while")
+    progress("preparing the simulator")
     compile_simulator()
     compile_follower()
     gap = explain_gap(

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
-from pipeline.plant.nonlinear.simulator.state import inlined, tie
+from pipeline.plant.nonlinear.simulator.compiler import inlined
+from pipeline.plant.nonlinear.simulator.state import tie
 from pipeline.plant.nonlinear.simulator.terms import (
     FRICTION,
     HYSTERESIS,

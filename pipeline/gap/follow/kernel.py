@@ -26,7 +26,8 @@ from pipeline.gap.follow.forces import (
     reach,
     settle_friction,
 )
-from pipeline.plant.nonlinear.simulator.state import jit, tie
+from pipeline.plant.nonlinear.simulator.compiler import jit
+from pipeline.plant.nonlinear.simulator.state import tie
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
 _LEAST_SHARE = 0.02  # of cart 1's mass: the least that is left of it without the motor's

@@ -77,7 +77,7 @@ def compare_runs(
     if gap is not None:
         from pipeline.plant.nonlinear.augmented import compile_simulator
 
-        progress("preparing the simulator; once on each machine it is compiled")
+        progress("preparing the simulator")
         compile_simulator()
     left_out = {one.experiment: one.reason for one in analysis.left_out}
     found = []

@@ -4,8 +4,9 @@ from pipeline.plant.nonlinear.columns import Drive
 from pipeline.plant.nonlinear.simulator.laws import slack_of, stop_of
 
 # isort: off
+from pipeline.plant.nonlinear.simulator.compiler import jit
 from pipeline.plant.nonlinear.simulator.state import (
-    D2, D3, D4, D5, D6, FIX, PAST, V, X, jit, pair, tie,
+    D2, D3, D4, D5, D6, FIX, PAST, V, X, pair, tie,
 )  # fmt: skip
 
 

@@ -33,8 +33,9 @@ from pipeline.plant.nonlinear.tables import Tables
 from pipeline.plant.nonlinear.simulator.laws import (
     arriving, cart_matrix, reach_of, settling, slack_of, spring_matrix, stop_of,
 )  # fmt: skip
+from pipeline.plant.nonlinear.simulator.compiler import inlined, jit
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, inlined, jit, pair, tie,
+    ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, pair, tie,
 )  # fmt: skip
 
 _SERIES_REACH = 0.2  # omega h: the series of sixth order then leaves 1e-8 after seconds

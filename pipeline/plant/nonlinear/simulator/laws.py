@@ -6,7 +6,7 @@ Made by `python -m docs.codegen` from the laws of the effects.
 from math import cos, exp, inf, pi, sin
 
 from pipeline.plant.nonlinear.columns import Cart, Drive, Spring
-from pipeline.plant.nonlinear.simulator.state import inlined, jit
+from pipeline.plant.nonlinear.simulator.compiler import inlined, jit
 
 
 @inlined

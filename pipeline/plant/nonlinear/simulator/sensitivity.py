@@ -25,9 +25,10 @@ from pipeline.plant.nonlinear.simulator.laws import (
     ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_slopes, drive_slopes, drop_slope, motor_slopes,
     settling, settling_slopes, slack_of, spring_slopes,
 )  # fmt: skip
+from pipeline.plant.nonlinear.simulator.compiler import jit
 from pipeline.plant.nonlinear.simulator.state import (
     ACC, BEFORE, D2, D3, DECAY, GRIP, HALF_A, HALF_V, HALF_X, MID_V, MID_X, PAST, RUB, SIDE,
-    TURNED, V, X, Z, jit, stretch,
+    TURNED, V, X, Z, stretch,
 )  # fmt: skip
 
 # What a lane is the derivative with respect to: the table's own number, of a cart or a spring; the

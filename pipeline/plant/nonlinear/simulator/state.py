@@ -1,16 +1,14 @@
-"""What the compiled functions share: the structures they take, and the compiler.
+"""What the compiled functions share: the structures they take.
 
-Structures are tuples with names, which numba compiles to what their fields alone would be. It
-looks only at a function's own file to see whether what it has stored is out of date: who changes a
-file of this folder removes its `__pycache__`.
+Structures are tuples with names, which numba compiles to what their fields alone would be.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from numba import njit
 from numpy.typing import NDArray
 
 from pipeline.arrays import Array
+from pipeline.plant.nonlinear.simulator.compiler import jit
 
 # Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
 # state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
@@ -59,19 +57,6 @@ class Push(NamedTuple):
     dry: bool
     smooth: int
     contact_step: float
-
-
-_OPTIONS: dict[str, Any] = {
-    "cache": True,
-    # Nothing here makes an array, so none needs counting, which took a quarter of a search's time.
-    "_nrt": False,
-    "nogil": True,
-    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
-    "error_model": "numpy",
-}
-jit = njit(**_OPTIONS)
-# In the machine's code, where it is fast; in that of Python it would be typed at every call anew.
-inlined = njit(**_OPTIONS, forceinline=True)
 
 
 @jit

@@ -12,8 +12,9 @@ from pipeline.plant.nonlinear.simulator.laws import (
     ON_CARTS, ON_DRIVE, ON_SPRINGS, cart_force, drive_force, dropping, motor_force, settling,
     sliding, spring_force,
 )  # fmt: skip
+from pipeline.plant.nonlinear.simulator.compiler import inlined
 from pipeline.plant.nonlinear.simulator.state import (
-    ACC, D2, D3, D4, DECAY, FIX, FORCE, GRIP, INV, MID_V, MID_X, RUB, SIDE, V, X, Z, inlined,
+    ACC, D2, D3, D4, DECAY, FIX, FORCE, GRIP, INV, MID_V, MID_X, RUB, SIDE, V, X, Z,
     stretch,
 )  # fmt: skip
 

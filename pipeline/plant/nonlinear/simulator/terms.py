@@ -6,7 +6,7 @@ Made by `python -m docs.codegen` from the laws of the effects.
 from enum import IntEnum
 from math import cos, exp, pi, sin
 
-from pipeline.plant.nonlinear.simulator.state import jit
+from pipeline.plant.nonlinear.simulator.compiler import jit
 
 
 class Kind(IntEnum):

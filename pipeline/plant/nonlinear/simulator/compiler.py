@@ -1,0 +1,124 @@
+"""The compiler, and where the functions that it compiled are kept.
+
+numba looks only at a function's own file to see whether what it kept is out of date, but a function
+holds the code and constants of other files too. So the folder is named after the content of all
+files that may be in it: any change leads to another folder, and the old one is removed.
+"""
+
+import hashlib
+import os
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core import config, event
+
+_ROOM = Path(__file__).parent
+_PACKAGE = _ROOM.parents[2]
+_settings: Any = config  # whose attributes are made when it is loaded
+_OPTIONS: dict[str, Any] = {
+    # Nothing here makes an array, so none needs counting, which took a quarter of a search's time.
+    "_nrt": False,
+    "nogil": True,
+    "fastmath": {"contract", "reassoc", "arcp", "nsz"},
+    "error_model": "numpy",
+}
+
+
+def jit(function: Callable[..., Any]) -> Any:
+    """Compile a function when it is first called; later processes load the result."""
+    return _compiled(function)
+
+
+def inlined(function: Callable[..., Any]) -> Any:
+    """Compile a function into those that call it.
+
+    In the machine's code, where it is fast; in that of Python it would be typed at every call anew.
+    """
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: Callable[..., Any], **more: Any) -> Any:
+    folder = kept_in(Path(function.__code__.co_filename).parent)
+    users, _settings.CACHE_DIR = _settings.CACHE_DIR, str(folder or "")
+    try:
+        return numba.njit(**_OPTIONS, **more, cache=folder is not None)(function)
+    finally:
+        _settings.CACHE_DIR = users
+
+
+@cache
+def kept_in(room: Path) -> Path | None:
+    """Return the folder for the compiled functions of a room; None, if no folder can be written.
+
+    It is in the package's own `__pycache__` or, where that cannot be written, in the user's cache.
+    `NUMBA_CACHE_DIR` comes first.
+    """
+    name = f"{room.name}-{content_of(room)}"
+    for root in _roots():
+        with suppress(OSError, RuntimeError):  # RuntimeError: there is no home folder
+            folder = root().expanduser() / name
+            new = not folder.exists()
+            folder.mkdir(parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK):
+                if new:
+                    _remove_others(folder, room)
+                return folder
+    return None
+
+
+def content_of(room: Path) -> str:
+    """Return a name for the content of all files that the compiled functions of a room may hold."""
+    digest = hashlib.sha256()
+    for path in sorted({*shared_files(), *room.glob("*.py")}):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def shared_files() -> list[Path]:
+    """Return the files that any compiled function may hold: this room, and the tables' columns."""
+    return [*_ROOM.glob("*.py"), _ROOM.parent / "columns.py", _ROOM.parent / "tables.py"]
+
+
+def _roots() -> Iterator[Callable[[], Path]]:
+    mine = hashlib.sha256(os.fsencode(_PACKAGE)).hexdigest()[:16]  # of several installations
+    if _settings.CACHE_DIR:
+        yield lambda: Path(_settings.CACHE_DIR) / f"cartlab-{mine}"
+    yield lambda: _PACKAGE / "__pycache__" / "compiled"
+    yield lambda: _users_cache() / "cartlab" / f"compiled-{mine}"
+
+
+def _users_cache() -> Path:
+    defaults = {"win32": "~/AppData/Local", "darwin": "~/Library/Caches"}
+    return Path(os.environ.get("XDG_CACHE_HOME") or defaults.get(sys.platform, "~/.cache"))
+
+
+def _remove_others(folder: Path, room: Path) -> None:
+    for old in folder.parent.glob(f"{room.name}-*"):
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+class _Word(event.Listener):
+    """Says once, on stderr, why the first simulation takes long."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def on_start(self, event: Any) -> None:
+        function = event.data["dispatcher"].py_func
+        if not self._said and function.__module__.startswith("pipeline."):
+            self._said = True
+            once = "once on this computer" if kept_in(_ROOM) else "as no folder can keep it"
+            sys.stderr.write(f"compiling the simulator, {once}: this takes about 20 s\n")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+event.register("numba:compile", _Word())

@@ -1,0 +1,104 @@
+"""Where compiled functions are kept, and that a change in another file is noticed."""
+
+import ast
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pipeline.plant.nonlinear.simulator import compiler
+from tests.helpers.places import ROOT
+
+SIMULATOR = Path("pipeline/plant/nonlinear/simulator")
+CALLER = """
+from pipeline.plant.nonlinear.simulator.compiler import jit
+from pipeline.plant.nonlinear.simulator.called import inner
+
+@jit
+def outer(x):
+    return inner(x) + 1
+"""
+CALLED = """
+from pipeline.plant.nonlinear.simulator.compiler import inlined
+
+@inlined
+def inner(x):
+    return {factor} * x
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A copy of the package with two compiled functions more, one of which calls the other."""
+    shutil.copytree(
+        ROOT / "pipeline", tmp_path / "pipeline", ignore=shutil.ignore_patterns("__pycache__")
+    )
+    (tmp_path / SIMULATOR / "caller.py").write_text(CALLER)
+    (tmp_path / SIMULATOR / "called.py").write_text(CALLED.format(factor=2))
+    return tmp_path
+
+
+def _outer(package: Path, **environment: str) -> tuple[str, str]:
+    """Return `outer(10)` as a new process finds it, and what that said on stderr."""
+    script = "from pipeline.plant.nonlinear.simulator.caller import outer; print(outer(10))"
+    environment = {**os.environ, "PYTHONPATH": str(package), **environment}
+    environment.pop("NUMBA_CACHE_DIR", None)
+    command = [sys.executable, "-B", "-c", script]
+    done = subprocess.run(
+        command, cwd=package, env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip(), done.stderr
+
+
+def test_a_change_in_another_file_is_noticed_and_the_old_folder_removed(package):
+    """The caller's own file is as it was, yet it calls the new function."""
+    first = _outer(package)
+    again = _outer(package)
+    (package / SIMULATOR / "called.py").write_text(CALLED.format(factor=3))
+    changed = _outer(package)
+
+    assert (first[0], again[0], changed[0]) == ("21", "21", "31")
+    word = "compiling the simulator, once on this computer: this takes about 20 s\n"
+    assert (first[1], again[1], changed[1]) == (word, "", word)
+    assert len(list((package / "pipeline/__pycache__/compiled").iterdir())) == 1
+
+
+def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
+    """Without any such folder it still computes, and says that it compiles each time."""
+    (package / "pipeline" / "__pycache__").write_text("a file where the folder would be")
+    home = package / "home"
+
+    first = _outer(package, XDG_CACHE_HOME=str(home))
+    again = _outer(package, XDG_CACHE_HOME=str(home))
+    nowhere = [_outer(package, XDG_CACHE_HOME="/dev/null") for _ in range(2)]
+
+    assert first[0] == again[0] == "21"
+    assert "once on this computer" in first[1]
+    assert again[1] == ""
+    assert list(home.glob("cartlab/compiled-*/simulator-*/*/caller.outer*.nbc"))
+    assert [(value, "no folder can keep it" in said) for value, said in nowhere] == [
+        ("21", True)
+    ] * 2
+
+
+def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
+    """What a file with compiled functions imports is in its own room or among the shared files."""
+    types_only = ROOT / "pipeline/arrays.py"
+    rooms = set()
+    for path in (ROOT / "pipeline").rglob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        if "simulator.compiler import" not in text:
+            continue
+        rooms.add(path.parent.name)
+        covered = {*compiler.shared_files(), *path.parent.glob("*.py"), types_only}
+        for node in ast.walk(ast.parse(text)):
+            name = str(node.module) if isinstance(node, ast.ImportFrom) else ""
+            if name.startswith("pipeline."):
+                assert (ROOT / f"{name.replace('.', '/')}.py") in covered, (
+                    path,
+                    node.module,
+                )
+    assert {"simulator", "follow"} <= rooms
