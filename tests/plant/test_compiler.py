@@ -94,11 +94,8 @@ def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
             continue
         rooms.add(path.parent.name)
         covered = {*compiler.shared_files(), *path.parent.glob("*.py"), types_only}
-        for node in ast.walk(ast.parse(text)):
-            name = str(node.module) if isinstance(node, ast.ImportFrom) else ""
+        nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.ImportFrom)]
+        for name in (f"{node.module}" for node in nodes):
             if name.startswith("pipeline."):
-                assert (ROOT / f"{name.replace('.', '/')}.py") in covered, (
-                    path,
-                    node.module,
-                )
+                assert (ROOT / f"{name.replace('.', '/')}.py") in covered, (path, name)
     assert {"simulator", "follow"} <= rooms
