@@ -2,7 +2,7 @@
 
 Constants that only save time, or set the start of a fit, are beside the code that uses them.
 `benchmarks/gap_confusion.py --report` measures the success rates of these limits, listed in
-`docs/gap.md`.
+`benchmarks/gap.md`.
 """
 
 # Neighbouring residuals are not independent: of a motion of some 5 Hz, read at 100 to 250 Hz, about
