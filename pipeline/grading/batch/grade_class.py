@@ -120,7 +120,7 @@ def grade_class(
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        # The rubric's file says which assignment it is: its title may be mended on the way.
+        # The rubric's file says which assignment it is: its title may be corrected later.
         with Gradebook(place, assignment=rubric_file.stem, create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
