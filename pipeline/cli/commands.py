@@ -3,9 +3,20 @@
 # isort: off
 # In this order `cartlab --help` lists the commands: as a lab needs them.
 from pipeline.cli.common import app, run
-from pipeline.cli import reports, models, plan, acquire, explore, emulate, grading, desk, demo
+from pipeline.cli import (
+    reports,
+    models,
+    plan,
+    acquire,
+    explore,
+    emulate,
+    grading,
+    desk,
+    demo,
+    doctor,
+)
 
 __all__ = [
-    "acquire", "app", "demo", "desk", "emulate", "explore", "grading", "models", "plan", "reports",
-    "run",
+    "acquire", "app", "demo", "desk", "doctor", "emulate", "explore", "grading", "models", "plan",
+    "reports", "run",
 ]  # fmt: skip

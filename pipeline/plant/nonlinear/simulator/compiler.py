@@ -18,8 +18,8 @@ from typing import Any
 import numba
 from numba.core import config, event
 
-_ROOM = Path(__file__).parent
-_PACKAGE = _ROOM.parents[2]
+ROOM = Path(__file__).parent
+_PACKAGE = ROOM.parents[2]
 _settings: Any = config  # whose attributes are made when it is loaded
 _OPTIONS: dict[str, Any] = {
     # Nothing here makes an array, so none needs counting, which took a quarter of a search's time.
@@ -72,6 +72,12 @@ def kept_in(room: Path) -> Path | None:
     return None
 
 
+def is_compiled() -> bool:
+    """Return whether this Python's simulator is kept already."""
+    folder, python = kept_in(ROOM), f"py{sys.version_info.major}{sys.version_info.minor}"
+    return folder is not None and any(folder.rglob(f"kernel._simulate*.{python}*.nbc"))
+
+
 def content_of(room: Path) -> str:
     """Return a name for the content of all files that the compiled functions of a room may hold."""
     digest = hashlib.sha256()
@@ -82,7 +88,7 @@ def content_of(room: Path) -> str:
 
 def shared_files() -> list[Path]:
     """Return the files that any compiled function may hold: this room, and the tables' columns."""
-    return [*_ROOM.glob("*.py"), _ROOM.parent / "columns.py", _ROOM.parent / "tables.py"]
+    return [*ROOM.glob("*.py"), ROOM.parent / "columns.py", ROOM.parent / "tables.py"]
 
 
 def _roots() -> Iterator[Callable[[], Path]]:
@@ -114,7 +120,7 @@ class _Word(event.Listener):
         function = event.data["dispatcher"].py_func
         if not self._said and function.__module__.startswith("pipeline."):
             self._said = True
-            once = "once on this computer" if kept_in(_ROOM) else "as no folder can keep it"
+            once = "once on this computer" if kept_in(ROOM) else "as no folder can keep it"
             sys.stderr.write(f"compiling the simulator, {once}: this takes about 20 s\n")
 
     def on_end(self, event: Any) -> None:

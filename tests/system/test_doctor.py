@@ -1,0 +1,35 @@
+"""`cartlab doctor` says what is true of this installation."""
+
+import json
+import os
+from importlib.metadata import version
+
+from tests.helpers.commandline import cartlab
+
+
+def test_all_that_is_needed_works_here():
+    """Each needed package has its installed version; the text and the JSON agree."""
+    told, text = cartlab("doctor", "--json"), cartlab("doctor")
+
+    assert (told.returncode, text.returncode) == (0, 0), told.stdout
+    health = json.loads(told.stdout)
+    assert len(health["needed"]) > 20
+    for package in health["needed"]:
+        assert package["found"] == version(package["name"])
+        assert package["problem"] == ""
+        assert f"{package['name']} {package['found']}" in text.stdout
+    assert set(health["programs"]) == {"C compiler", "browser"}
+    assert all(path == "" or os.access(path, os.X_OK) for path in health["programs"].values())
+    assert os.access(health["compiled"], os.W_OK)
+
+
+def test_a_package_that_does_not_load_is_named(tmp_path, monkeypatch):
+    """Exit status 1, the package, and what it raised."""
+    (tmp_path / "yaml.py").write_text("raise ImportError('its library is gone')")
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    monkeypatch.setenv("PYTHONPATH", path)
+
+    done = cartlab("doctor")
+
+    assert done.returncode == 1
+    assert "pyyaml: it does not load: ImportError: its library is gone" in done.stdout
