@@ -80,9 +80,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Run a file or two in this process;
+    """Run a file or two in this process.
 
-    else use several workers, as tests often wait for a bench.
+    Else use several workers, as tests often wait for a bench.
     """
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
     return 0 if few else (os.cpu_count() or 1) + 1

@@ -59,9 +59,9 @@ def _is_said(node: ast.expr, names: set[str]) -> bool:
 
 
 def _is_part(index: ast.expr) -> bool:
-    """Return whether an expression takes letters of a text:
+    """Return whether an expression takes letters of a text.
 
-    a slice, or one letter by its number.
+    A slice, or one letter by its number.
     """
     return isinstance(index, ast.Slice) or (
         isinstance(index, ast.Constant) and isinstance(index.value, int)

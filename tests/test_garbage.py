@@ -36,9 +36,9 @@ Cycle()
 
 
 def test_what_is_left_at_the_end_is_the_systems():
-    """At exit Python would search everything that was loaded, twice;
+    """At exit Python would search everything that was loaded, twice.
 
-    the system frees it instead.
+    The system frees it instead.
     """
     done = subprocess.run([sys.executable, "-c", ENDS], capture_output=True, text=True, check=True)
     assert done.stdout == ""

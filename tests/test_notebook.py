@@ -1,6 +1,6 @@
-"""The notebook:
+"""The notebook.
 
-one import, results that display themselves, and an example that runs to the end.
+One import, results that display themselves, and an example that runs to the end.
 """
 
 import ast

@@ -47,9 +47,9 @@ def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
 
 
 def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
-    """Only old files of ours are removed:
+    """Only old files of ours are removed.
 
-    others may be writing, or a student may use such a name.
+    Others may be writing, or a student may use such a name.
     """
     names = [f".{16 * '0'}.part", f".{16 * '1'}.part", ".mine.part", "left.part"]
     for name in names:

@@ -115,7 +115,7 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
                 found = f"{name} = {value:.2g} ± {std[name]:.1g} is zero within its error"
             measured, limit = sigmas, SIGMA_LIMIT
         elif 0 < share < NEGLIGIBLE:
-            found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, next to nothing"
+            found = f"{name} = {value:.2g} is {100 * share:.2g} % of {beside}, almost nothing"
             measured, limit = share, NEGLIGIBLE
         else:
             continue

@@ -1,6 +1,6 @@
-"""Checks of single estimates:
+"""Checks of single estimates.
 
-two estimates of one number; decays and steps against their models.
+Two estimates of one number; decays and steps against their models.
 """
 
 from collections.abc import Sequence
@@ -65,8 +65,8 @@ def _advice(row: ParameterRow) -> str:
             else "small swings see more of it"
         )
         return (
-            f" Damping ratios differ where dry friction is at work: {seen}, so ask which of the "
-            "two methods saw the larger amplitude."
+            f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "
+            "saw the larger amplitude."
         )
     looks = {
         "step": "the rest and settled levels of {runs}",
@@ -147,7 +147,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             "fail",
             (  # the rest points show the least friction that can hold
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
-                f"{bench.units.gain}, and it may be farther off."
+                f"{bench.units.gain}, and it may be further off."
             ),
         )
     elif shown:
@@ -156,15 +156,15 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             "skip",
             (
                 f"shows one gain, but dry friction shows on this cart in {runs}: it may hold "
-                "the cart off its level here, too, alike on both sides."
+                "the cart off its level here too, equally on both sides."
             ),
         )
     elif edges < 2:
         outcome, found = (
             "skip",
             (
-                "settles after one edge of the input only, so nothing tells whether friction holds "
-                "it off its level. A step on and off again would."
+                "settles after one edge of the input only, so it is unknown whether friction holds "
+                "it off its level. A step on and off again would show it."
             ),
         )
     else:

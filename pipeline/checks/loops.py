@@ -54,7 +54,7 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     if value > _SAME_LOOP:
         return _check("fail", value, f"{names} give another loop: do not run these gains")
     if np.abs(theirs - wanted).max() > _SAME_LOOP:
-        return _check("skip", value, f"{names} miss the poles asked for; these gains do not")
+        return _check("skip", value, f"{names} miss the poles asked for; these gains do")
     return _check("pass", value, f"{names} give the same loop")
 
 

@@ -110,7 +110,7 @@ def _record(
     terminal.remark(f"{len(whole)} recorded into {folder}{report}")
     if not outcomes:
         terminal.remark(
-            "what was asked for is there already; to record it anew, take its table out of "
+            "what was asked for exists already; to record it anew, take its table out of "
             "submission.toml"
         )
     if failed:

@@ -41,9 +41,9 @@ class MeasuredRun:
 
     @property
     def driven(self) -> bool:
-        """There is a logged input that moves the carts;
+        """There is a logged input that moves the carts.
 
-        its last sample acts only after the record.
+        Its last sample acts only after the record.
         """
         return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
 

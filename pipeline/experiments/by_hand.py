@@ -67,7 +67,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
     if not _SHORTEST <= seconds <= _LONGEST:
         expected = f"{_SHORTEST:g} to {_LONGEST:g} s"
         raise ConfigError(
-            f"how long: expected {expected}, found {seconds:g}; plan.toml takes longer ones"
+            f"seconds: expected {expected}, found {seconds:g}; for longer ones edit plan.toml"
         )
     named = {"frequency": wanted.frequency, "frequency_end": wanted.frequency_end or 0.0}
     for key in [key for key in named if key in NEEDED[kind]]:

@@ -43,7 +43,7 @@ def propose_candidates(
         raise DataError(
             "no next experiment: the limits of plan.toml allow none"
             if made
-            else "no next experiment: dwells of these carts do not settle in the time one waits"
+            else "no next experiment: dwells of these carts take too long to settle"
         )
     return candidates
 

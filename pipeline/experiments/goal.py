@@ -39,9 +39,9 @@ class Goal:
     mean: Literal["largest", "root mean square", "volume"] = "largest"
 
     def of(self, told: Array) -> Array:
-        """Return the error (…,) for information H and S (…, 2, n_p, n_p);
+        """Return the error (…,) for information H and S (…, 2, n_p, n_p).
 
-        inf if it is unbounded.
+        Inf if it is unbounded.
         """
         H, S = told[..., 0, :, :], told[..., 1, :, :]
         if self.mean == "volume":

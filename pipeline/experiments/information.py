@@ -281,7 +281,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
     ]
     if not records:
         raise DataError(
-            "what the next record tells needs the noise of earlier ones, and a table has none: "
+            "a prediction needs the noise of earlier records, and a table has no noise: "
             "record a sweep first"
         )
     return records

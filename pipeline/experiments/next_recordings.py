@@ -128,7 +128,7 @@ def plan_next(
     else:
         system = submission.system
         check_goal(goal, names=parameter_names(system.carts, rigid=not system.bench.tied))
-        progress("asking the data what they tell")
+        progress("evaluating the data")
         analysis = analyse(submission)
         progress("weighing the next experiments")
         found = choose_next(analysis, old, n=n, goal=goal, commands=commands)
@@ -148,8 +148,8 @@ def _doubt(analysis: Analysis, folder: Path) -> str:
         return ""
     return (
         f"the linear carts leave more than the noise (χ² per degree of freedom "
-        f"{fit.chi_square_per_dof:.3g}), so that parameters may be off by more than these errors: "
-        f"`cartlab gap {folder}` looks for what else acts"
+        f"{fit.chi_square_per_dof:.3g}), so parameters may be off by more than these errors; "
+        f"`cartlab gap {folder}` looks for the missing effect"
     )
 
 
@@ -180,7 +180,7 @@ def choose_next(
         if not any(one.resembles(other) for other in without)
     ]
     if not candidates:
-        raise DataError("everything that would tell more was refused before")
+        raise DataError("every useful recording was refused before")
     told = np.array([known.of_recording(candidate) for candidate in candidates])
     done = {record.id for record in analysis.records}
     still = {

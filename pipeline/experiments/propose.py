@@ -84,7 +84,7 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
     carts = submission.system.carts
     bench = Description(name="stock", encoders=2, carts=carts) if stock else None
     there, old = plan_path(submission).exists(), current_plan(submission, bench=bench)
-    progress("asking the data what else to record")
+    progress("choosing further recordings")
     try:
         new, trouble = extend_plan(old, submission, bench=bench), ""
     except DataError as error:  # if the data cannot help, a plan stays as it is
@@ -269,7 +269,7 @@ def identified_chain(analysis: Analysis) -> Chain:
     if fit is None or not fit.converged:
         why = fit.message if fit else _reason(analysis, Stage.FINAL_ESTIMATES, Stage.BODE_FIT)
         raise DataError(
-            f"the carts are not identified, and by them is chosen what to record next: {why}"
+            f"the next recordings need identified carts, and none are identified: {why}"
         )
     if not fit.chain.is_tied:
         raise DataError(

@@ -11,8 +11,8 @@ from pipeline.results import Analysis
 # The fit treats the error of each sample as independent; the rounding error of a cart that hardly
 # moves is the same in many samples.
 _WHY_WORSE = (
-    "the fit would know it worse, for where carts rest, or move by few counts, what their encoders "
-    "round off does not average out; try a larger motion, or a shorter run"
+    "the fit would be worse: while carts rest, or move by few counts, the rounding errors of their "
+    "encoders do not average out; try a larger motion, or a shorter run"
 )
 
 

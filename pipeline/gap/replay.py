@@ -85,7 +85,7 @@ def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ..
 
     Raises
     ------
-    DataError : the carts run away.
+    DataError : the carts diverge.
     """
     from pipeline.gap.fit.baseline import fit_nuisance
     from pipeline.gap.fit.levenberg_marquardt import evaluate
@@ -110,5 +110,5 @@ def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ..
     fit = fit_nuisance(known, [run])
     readings = simulate_run(fit, run, fit.nuisance[0])
     if not np.all(np.isfinite(readings)):
-        raise DataError(f"{run.id}: the carts run away")
+        raise DataError(f"{run.id}: the carts diverge")
     return readings

@@ -83,7 +83,7 @@ class FreeRun:
     """One simulation of a whole record, started from its first readings."""
 
     experiment: str = written()
-    error: float | None = written("root mean square, position unit; null: the carts run away")
+    error: float | None = written("root mean square, position unit; null: the carts diverge")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -1,6 +1,6 @@
-"""The assumptions behind all numbers:
+"""The assumptions behind all numbers.
 
-springs, units, scales, sign, held carts, with their support.
+Springs, units, scales, sign, held carts, with their support.
 """
 
 from collections.abc import Iterator, Sequence
@@ -55,7 +55,7 @@ def _springs(
             reason = f"the fit without it {explains}"
         elif name in vanishing:
             support = "contradicted"
-            reason = f"{_number(name, value, std, unit)}: it may as well not be there"
+            reason = f"{_number(name, value, std, unit)}: it may not exist"
         else:
             support, reason = "supported", _number(name, value, std, unit)
         yield Assumption(

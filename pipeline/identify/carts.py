@@ -122,9 +122,9 @@ def identify(
 
 
 def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
-    """Return the initial and final estimates side by side;
+    """Return the initial and final estimates side by side.
 
-    those that the fit leaves open are skipped.
+    Those that the fit leaves open are skipped.
     """
     fit, final = found.fit, found.fit.parameters if found.fit else {}
     if fit and not final:

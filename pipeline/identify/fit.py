@@ -166,9 +166,9 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
 
 
 def _votes(kinds: Set[str]) -> int:
-    """Return the number of ways of recording that follow:
+    """Return the number of ways of recording that follow.
 
-    steps and sweeps are logged in one way.
+    Steps and sweeps are logged in one way.
     """
     return len({"step" if kind == "sweep" else kind for kind in kinds})
 

@@ -55,7 +55,7 @@ class Log:
         )
 
     def warn(self, texts: Iterable[str]) -> None:
-        """Add a warning, unless it is there already."""
+        """Add a warning, unless it exists already."""
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
     def add(self, other: "Log") -> None:

@@ -257,9 +257,9 @@ def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
-    """Return which stamps (n,) are within the rounding of one line:
+    """Return which stamps (n,) are within the rounding of one line.
 
-    all but a few late ones, or none.
+    All but a few late ones, or none.
     """
     off = np.abs(_line(stamps) - stamps) / rounding
     near = off <= _ROUNDING_BAND

@@ -461,9 +461,9 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 
 
 def format_found(found: Sequence[Found]) -> str:
-    """Return a table with one line for each file, and faults and doubts below;
+    """Return a table with one line for each file, and faults and doubts below.
 
-    not for unread files.
+    Not for unread files.
     """
     found = [one for one in found if one.state != "not_read"]
     rows = [

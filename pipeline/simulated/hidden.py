@@ -261,7 +261,7 @@ def _read_model(path: Path) -> SimulatedBench:
             "as `cartlab gap` writes it, gap.json, whole"
         ) from None
     except (RecursionError, ValueError):
-        raise ConfigError(f"{where}: no JSON that a gap.json could hold") from None
+        raise ConfigError(f"{where}: not the JSON of a gap.json") from None
     document = _mapping(document, where=where)
     model = _mapping(document.get("model", document), where=f"{where}: model")
     chain = _chain(model.get("chain"), where=f"{where}: chain")

@@ -61,9 +61,9 @@ class SimulatedSession:
 
 
 def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[BenchRun]:
-    """Release each cart by hand, with the others held, several times;
+    """Release each cart by hand, with the others held, several times.
 
-    carts without a spring are skipped.
+    Carts without a spring are skipped.
     """
     chain, runs = session.chain, []
     for cart in range(1, chain.n + 1):

@@ -155,7 +155,7 @@ def _readings(
 
 
 def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
-    """Return which readings (n, n) contradict one another."""
+    """Return which readings (n, n) contradict each other."""
     value, low, high = np.array([(r.value, r.low, r.high) for r in readings]).T
     size = np.maximum(np.abs(value[:, None]), np.abs(value))
     far = np.abs(value[:, None] - value) > readings[0].tolerance / 100 * size
@@ -176,9 +176,9 @@ def _differ_in_size(readings: Sequence[_Reading]) -> bool:
 
 
 def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
-    """Return the readings that belong together:
+    """Return the readings that belong together.
 
-    all, those like the fit, or most; none: undecided.
+    All, those like the fit, or most; none: undecided.
     """
     apart = _contradictions(readings)
     if not np.any(apart):
@@ -248,15 +248,15 @@ def _check(
         outcome, said = (
             "fail",
             (
-                f"contradict one another, {apart}, and nothing else tells which is right: "
+                f"contradict each other, {apart}, and nothing shows which is right: "
                 "none of them is used"
             ),
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
-        outcome, said = "fail", f"contradict one another, {apart}. Left out is {runs}"
+        outcome, said = "fail", f"contradict each other, {apart}. {runs} is left out"
     elif np.any(_contradictions(readings)):
-        outcome, said = "fail", f"lie {apart}, by the size of the step, as where a cart sticks"
+        outcome, said = "fail", f"lie {apart}, by the size of the step, as if a cart sticks"
     elif spread > readings[0].tolerance:
         outcome, said = "skip", f"lie {apart}, no further apart than their errors"
     else:

@@ -17,14 +17,12 @@ from pipeline.set_up import Bench
 GAIN_AND_FREQUENCY_LIMIT, DAMPING_LIMIT = 15.0, 50.0  # percent
 SIGMA_LIMIT = 3.0  # combined standard errors: a smaller difference may be chance
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
-AT_BOUND = (
-    "the fit ends at its bound, zero: its data are too few to tell, so there is no final value"
-)
+AT_BOUND = "the fit ends at its bound, zero: its data are too few, so there is no final value"
 NOT_DETERMINED = (
     "not determined: the standard error is {percent:.0f} % of the value, more than the "
     "{limit:.0f} % that initial and final may differ by"
 )
-_ONE_SOURCE = "the fit's own points do not tell it: the final value rests on the decay as well"
+_ONE_SOURCE = "the fit's own points do not determine it, so the final value uses the decay too"
 
 
 def compare(

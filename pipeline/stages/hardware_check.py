@@ -104,9 +104,9 @@ def _open(run: MeasuredRun) -> _Simulated:
     if _plausible(scale) or scaled > min(_WORTH_IT * as_logged, _HALF):
         return _Simulated(y=unforced + forced, scale=scale, note="")
     note = (
-        f"the logged input explains the motion only if taken {scale:.3g} times, so it is: "
+        f"the logged input explains the motion only if multiplied by {scale:.3g}, as done here: "
         f"the difference over all carts falls from {100 * as_logged:.0f} % to {100 * scaled:.0f} % "
-        "(the input or the positions of this run are not in the unit, or of the sign, stated)"
+        "(input or positions of this run are in another unit, or of another sign, than stated)"
     )
     return _Simulated(
         y=unforced + scale * forced,

@@ -88,7 +88,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
             return _design(plant, goal, method=task.method)
     except np.linalg.LinAlgError:
         raise DataError(
-            "state feedback needs carts alike in mass, damping and springs to some ten orders of "
+            "state feedback needs masses, dampings and springs within some ten orders of "
             f"magnitude, found m {_range(chain.m)}, c {_range(chain.c)}, k {_range(chain.k)}"
         ) from None
 

@@ -40,9 +40,9 @@ class _Level:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plateau:
-    """Samples [first, stop) at one input, and the level at which the cart settled (None:
+    """Samples [first, stop) at one input, and the level at which the cart settled or None.
 
-    it did not).
+    It is None if the cart did not settle.
     """
 
     first: int
@@ -85,7 +85,7 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     if not edges:
         raise DataError(
             f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
-            f"{len(found) - 1} edges, none with both"
+            f"{len(found) - 1} edges, but none with both"
         )
     moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > _MOVED * size]
     if not moving:
@@ -190,9 +190,9 @@ def _flat_from(y: Array, *, span: float) -> int:
 
 
 def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Level:
-    """Return the mean from `first` on;
+    """Return the mean from `first` on.
 
-    the rounding of a still cart errs by up to half an encoder step.
+    The rounding of a still cart errs by up to half an encoder step.
     """
     window = y[first:]
     residual = window - window.mean()

@@ -66,7 +66,7 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
         attempt = descend(windows, parametrisation, theta, tolerance=_TOLERANCE)
         covariance = _covariance(attempt)
     if not explained:
-        remarks.insert(0, "no chain was found that follows the records")
+        remarks.insert(0, "no chain follows the records")
     elif found.cut_short:
         remarks.insert(
             0, f"the search was ended after {found.n_starts} starts: another may do better"

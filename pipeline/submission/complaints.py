@@ -196,9 +196,9 @@ def all_told(where: str, problems: Sequence[str], *, more: int = 0) -> str:
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:
-    """Drop what pydantic adds for the variant that a table's own key selects:
+    """Drop what pydantic adds for the variant that a table's own key selects.
 
-    it is no key of the file.
+    It is no key of the file.
     """
     kept: list[int | str] = []
     here = document

@@ -33,7 +33,7 @@ def new_submission(folder: Path, *, carts: int) -> None:
         raise ConfigError(f"carts: expected 1 to {MOST_CARTS}, found {carts}")
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder}: is there already and not empty; name a new folder")
+        raise ConfigError(f"{folder}: exists already and not empty; name a new folder")
     write_templates(folder, carts=carts)
 
 

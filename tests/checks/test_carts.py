@@ -60,9 +60,9 @@ def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
     ],
 )
 def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
-    """Zero within its error, or tiny beside its neighbour:
+    """Zero within its error, or tiny beside its neighbour.
 
-    the message asks, with the line to change.
+    The message asks, with the line to change.
     """
     plant = PRESETS["throne-2dof"]
     values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}

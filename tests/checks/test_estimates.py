@@ -30,7 +30,7 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
     ]
     checks = check_steps(steps, bench=Bench(springs=(True, True)))
     assert [check.outcome for check in checks] == ["fail", "fail"]
-    assert all("may be farther off" in check.message for check in checks)
+    assert all("may be further off" in check.message for check in checks)
 
 
 def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):

@@ -157,9 +157,9 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
 
 
 def test_exploring_has_a_form_of_its_own(tmp_path):
-    """Enter in its fields explores, at its own port;
+    """Enter in its fields explores, at its own port.
 
-    numbers work as elsewhere, errors name a field.
+    Numbers work as elsewhere, errors name a field.
     """
     work = a_recorded_cart(tmp_path / "team")
     with DeskServer(folder=work) as server:

@@ -41,9 +41,9 @@ def visitor(server):
 
 
 def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
-    """Then a cookie is used that no script reads and no other site sends;
+    """Then a cookie is used that no script reads and no other site sends.
 
-    the address is used up.
+    The address is used up.
     """
     assert visitor.get("/").status == 200
     assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403

@@ -41,9 +41,9 @@ main()
 
 @contextmanager
 def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
-    """Run a desk;
+    """Run a desk.
 
-    yield it, its address, and a function that returns its other lines and the log.
+    Yield it, its address, and a function that returns its other lines and the log.
     """
     log = tmp_path / "state" / "cartlab" / "desk.log"
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
@@ -84,9 +84,9 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
     ],
 )
 def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
-    """A watching process reports it;
+    """A watching process reports it.
 
-    after a crash in a library, with the lines that were running.
+    After a crash in a library, with the lines that were running.
     """
     with a_desk(tmp_path) as (desk, _, ended):
         desk.send_signal(number)

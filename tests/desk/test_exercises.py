@@ -80,9 +80,9 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
 
 
 def test_a_class_is_what_simulate_writes(visitor, tmp_path):
-    """Two folders, with seeds counting up, have the bytes of the command;
+    """Two folders, with seeds counting up, have the bytes of the command.
 
-    the hidden effect is in none.
+    The hidden effect is in none.
     """
     page = shown(visitor, preset="throne-1dof", effect="coulomb_friction")
     (told,) = re.findall(r"<li>(coulomb_friction on cart 1.*?)</li>", page)

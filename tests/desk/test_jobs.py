@@ -142,9 +142,9 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
 
 
 def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
-    """The process that reads it dies;
+    """The process that reads it dies.
 
-    the other files are shown, and the next task has a new process.
+    The other files are shown, and the next task has a new process.
     """
     with DeskServer(folder=tmp_path) as server:
         visitor = Visitor.of(server.url)

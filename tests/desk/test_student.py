@@ -151,9 +151,9 @@ def test_from_an_empty_folder_to_the_zip(room):
 
 
 def test_what_is_wrong_stands_beside_its_field(filled):
-    """In the words of the file's own check;
+    """In the words of the file's own check.
 
-    the form keeps what was typed, the file is unchanged.
+    The form keeps what was typed, the file is unchanged.
     """
     visitor, folder = filled
     before = (folder / NAME).read_bytes()

@@ -55,8 +55,8 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
             {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0},
             "to: a chirp needs another",
         ),
-        ("decay", {"cart": 1, "seconds": 1e-320}, "how long: expected 1 to 120 s"),
-        ("decay", {"cart": 1, "seconds": 121.0}, "how long: .* found 121"),
+        ("decay", {"cart": 1, "seconds": 1e-320}, "seconds: expected 1 to 120 s"),
+        ("decay", {"cart": 1, "seconds": 121.0}, "seconds: .* found 121"),
         ("sine", {"amplitude": 0.1, "frequency": 0.005}, "frequency: expected at least 0.0083 Hz"),
     ],
 )

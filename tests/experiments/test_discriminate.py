@@ -97,9 +97,9 @@ def proposed() -> Gap:
 
 
 def test_what_is_proposed_keeps_the_limits_and_sets_them_apart(proposed):
-    """In it the two laws of friction differ by many times the noise;
+    """In it the two laws of friction differ by many times the noise.
 
-    nothing passes the travel limit.
+    Nothing passes the travel limit.
     """
     found = proposed.proposal
     assert found is not None

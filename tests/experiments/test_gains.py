@@ -90,9 +90,9 @@ def state_gains_of(identified, loop) -> StateGains:
 
 
 def on_the_bench(chain: Chain | None, gains, *, encoder: int) -> tuple[Array, Array]:
-    """Drive the chain with the bench's own controller;
+    """Drive the chain with the bench's own controller.
 
-    return positions (n_carts, n), inputs (n,).
+    Return positions (n_carts, n), inputs (n,).
     """
     assert chain is not None
     core, period = ReferenceCore(BENCH), BENCH.period

@@ -13,9 +13,9 @@ from pipeline.submission import load_submission
 
 @pytest.mark.parametrize("name", ["one-cart", "two-cart", "three-cart"])
 def test_centimetres_said_to_be_metres_are_asked_about(name):
-    """Carts at 60 km/h must have another unit;
+    """Carts at 60 km/h must have another unit.
 
-    centimetres, millimetres and counts are not questioned.
+    Centimetres, millimetres and counts are not questioned.
     """
     data = read_data(load_submission(EXAMPLES / name))
     (said,) = [one for one in reading_remarks(data, unit="m") if "m/s" in one]

@@ -218,9 +218,9 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
 
 @pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
 def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
-    """It gets a table without `carts`;
+    """It gets a table without `carts`.
 
-    the message says which column moves against the statement.
+    The message says which column moves against the statement.
     """
     new_submission(tmp_path, carts=carts)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=0 * T, x2=0 * T, x3=RING)

@@ -282,9 +282,9 @@ def test_the_page_of_none_speaks_of_no_effects():
 
 
 def test_what_no_effect_explains_is_drawn_without_effects():
-    """Verdict unexplained:
+    """Verdict unexplained.
 
-    one model without suspects; else that of the suspects, marked as such.
+    One model without suspects; else that of the suspects, marked as such.
     """
     alone = make_gap("unexplained", ())
     assert "with the effects" not in html_of(alone)

@@ -613,9 +613,9 @@ def test_what_may_be_either_of_two_values_is_said_with_both():
 
 
 def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
-    """If steps contradict a fit with too few springs, springs are named;
+    """If steps contradict a fit with too few springs, springs are named.
 
-    dry friction comes apart.
+    Dry friction comes apart.
     """
     analysis = make_analysis(2)
     assert analysis.fit is not None

@@ -1,6 +1,6 @@
-"""Effects hidden in a synthetic bench:
+"""Effects hidden in a synthetic bench.
 
-in every kind of run, against limits and the other simulator.
+In every kind of run, against limits and the other simulator.
 """
 
 import json
@@ -271,9 +271,9 @@ def test_sample_by_sample_is_the_whole_run(key):
 
 
 def test_a_constant_force_shows_where_the_carts_rest():
-    """Carts rest where springs carry the force:
+    """Carts rest where springs carry the force.
 
-    elsewhere if other carts are held, not in a loop.
+    Elsewhere if other carts are held, not in a loop.
     """
     term = usual("force_offset")
     (force,) = term.values
@@ -322,7 +322,7 @@ def test_carts_that_run_away_are_refused():
     """A spring that softens without end is one clear error, in a run and in a loop."""
     soft = usual("cubic_spring", coefficient=-20.0)
     for run in (step(), control(), decay()):
-        with pytest.raises(DataError, match="the carts run away"):
+        with pytest.raises(DataError, match="the carts diverge"):
             bench(soft).move(run)
 
 
@@ -429,7 +429,7 @@ def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
     ("document", "message"),
     [
         ("{", r"no JSON from line 1, character 2 on: give a file as `cartlab gap` writes it"),
-        ("[" * 100_000, "no JSON"),
+        ("[" * 100_000, "not the JSON"),
         ("[]", "no JSON object"),
         ({"effects": []}, "chain: missing"),
         ({"chain": {"m": [1.0], "c": [0.1]}}, "chain: needs 'k'"),

@@ -1,6 +1,6 @@
-"""Bode fit over many benches:
+"""Bode fit over many benches.
 
-as accurate as theory allows, honest errors, also from poor starts.
+As accurate as theory allows, honest errors, also from poor starts.
 """
 
 import numpy as np

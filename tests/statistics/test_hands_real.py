@@ -58,9 +58,9 @@ def test_hands_are_where_a_person_sees_them(rig):
 
 
 def test_three_plucks_are_three_decays(rig):
-    """One natural frequency each, within 1 %;
+    """One natural frequency each, within 1 %.
 
-    the damping depends on the swing, as with friction.
+    The damping depends on the swing, as with friction.
     """
     decays = [d for d in rig.log_decrements if d.experiment == "14-Feb-2025_09_22_43"]
 

@@ -510,9 +510,9 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
 def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
-    """Each gets its own message:
+    """Each gets its own message.
 
-    a missing folder, one without submission.toml, a file of another kind.
+    A missing folder, one without submission.toml, a file of another kind.
     """
     write(tmp_path / "team-01")
     one_line_patterns = {

@@ -192,9 +192,9 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
 
 
 def test_one_broken_file_does_not_make_a_folder_unreadable(tmp_path):
-    """The other files get their table and the status is that of a failed check;
+    """The other files get their table and the status is that of a failed check.
 
-    without any, it is 2.
+    Without any, it is 2.
     """
     broken = tmp_path / "broken.csv"
     broken.write_text("time,x1\n0,oops\n1,2\n", encoding="utf-8")

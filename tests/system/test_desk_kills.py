@@ -60,9 +60,9 @@ class _Save:
 
 @dataclass(kw_only=True)
 class _Upload(_Save):
-    """Uploads of recordings of different lengths;
+    """Uploads of recordings of different lengths.
 
-    the answer comes when the table is written too.
+    The answer comes when the table is written too.
     """
 
     longest: float = 4.0

@@ -84,9 +84,9 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeyp
 
 
 def test_an_exploration_is_watched_and_steered(show, tmp_path):
-    """After a veto another is chosen, your own experiment comes next, Esc ends;
+    """After a veto another is chosen, your own experiment comes next, Esc ends.
 
-    the diary shows it.
+    The diary shows it.
     """
     work = a_recorded_cart(tmp_path / "team")
     with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:

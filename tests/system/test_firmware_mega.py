@@ -121,7 +121,7 @@ def test_a_run_lasts_and_ticks_as_told(mega):
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dqm"])
 def test_waves_are_those_of_the_reference(mega, wave):
-    """Numbers of 32 bits differ by at most one count:
+    """Numbers of 32 bits differ by at most one count.
 
     2000 counts are exact to a thousandth of one.
     """

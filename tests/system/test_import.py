@@ -179,8 +179,8 @@ def test_everything_else_in_the_folder_is_said_once(work, source):
 
     with pytest.raises(KeyboardInterrupt):
         list(Importer(work, source, observer=notes).watch(once=False, wait=wait))
-    said = sorted(remark for remark in notes.remarks if "not taken" in remark)
-    assert [remark.split(":")[0] for remark in said] == ["monday", "not taken", "photo.JPG"]
+    said = sorted(remark for remark in notes.remarks if "not imported" in remark)
+    assert [remark.split(":")[0] for remark in said] == ["monday", "not imported", "photo.JPG"]
     assert "plot.m" in said[1]
     assert load_submission(work).experiments == ()
 
@@ -214,7 +214,7 @@ class Tidy(Notes):
     def remark(self, sentence: str) -> None:
         """Keep the sentence; delete the file."""
         super().remark(sentence)
-        if "not taken" in sentence:
+        if "not imported" in sentence:
             self._path.unlink(missing_ok=True)
 
 
@@ -261,5 +261,5 @@ def test_the_command_takes_what_is_there(work, source):
 
 def test_a_folder_that_is_none_is_said(work, source):
     """A missing folder gives one line."""
-    with pytest.raises(ConfigError, match="nowhere: is no folder to watch"):
+    with pytest.raises(ConfigError, match="nowhere: not a folder"):
         Importer(work, source / "nowhere", observer=Notes())

@@ -133,7 +133,7 @@ class _Acquisition:
         for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
             self._observer.remark(sentence)
         for file in save_left_over(self._folder, carts=submission.system.carts):
-            self._observer.remark(f"{file} is what a session left that was cut off")
+            self._observer.remark(f"{file} is the data of an interrupted session")
         plan = self._plan(submission, line)
         session = Session(
             line,
@@ -171,8 +171,8 @@ class _Acquisition:
         if run.file:
             self._observer.remark(f"{run.file} is partial; it is not in {NAME}")
         self._observer.remark(
-            "the session ends here: a bench that does what nothing told it to is not started "
-            "again; switch its motor off and find out why"
+            "the session ends here, because the bench acted without an order; "
+            "switch its motor off and find out why"
         )
 
     def _heed_stop(self) -> None:
@@ -250,7 +250,9 @@ class _Acquisition:
         self._observer.remark(limit_words(plan.limits, submission, line.bench))
         known = {recording.id for recording in plan.recordings}
         if unknown := sorted(self._only - known):
-            raise ConfigError(f"--only {unknown[0]}: plan.toml has {', '.join(sorted(known))}")
+            raise ConfigError(
+                f"--only {unknown[0]}: no such recording; plan.toml has {', '.join(sorted(known))}"
+            )
         check_files(plan, submission)
         return plan
 

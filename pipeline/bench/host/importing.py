@@ -52,7 +52,7 @@ class Importer:
 
     def __init__(self, folder: Path, source: Path, *, observer: Observer) -> None:
         if not source.is_dir():
-            raise ConfigError(f"{source}: is no folder to watch")
+            raise ConfigError(f"{source}: not a folder")
         self._folder = folder
         self._source = source
         self._observer = observer
@@ -123,7 +123,7 @@ class Importer:
         else:
             return not path.is_file()
         self._over.add(path)
-        self._observer.remark(f"{path.name}: not taken, {why}")
+        self._observer.remark(f"{path.name}: not imported, {why}")
         return True
 
     def _opens(self, path: Path) -> bool:
@@ -155,33 +155,35 @@ class Importer:
         """
         self._over.add(path)
         if path.stat().st_size > MAX_DATA_BYTES:
-            self._observer.remark(f"{path.name}: larger than {MAX_DATA_BYTES:,} bytes, not taken")
+            self._observer.remark(
+                f"{path.name}: not imported, larger than {MAX_DATA_BYTES:,} bytes"
+            )
             return None
         if self._is_known(path):
             return None
         try:
             inspection = inspect_file(path)
         except SubmissionError as error:
-            self._observer.remark(f"not taken: {error}")
+            self._observer.remark(f"not imported: {error}")
             return None
         if any("cut short" in problem for problem in inspection.problems):
             if not final and self._looks[path] < 20:  # its last line may still come
                 self._over.discard(path)
             else:
-                self._observer.remark(f"{path.name}: not taken, {inspection.problems[0]}")
+                self._observer.remark(f"{path.name}: not imported, {inspection.problems[0]}")
             return None
         planned = self._match(inspection)
         kind = planned.kind if planned else inspection.kind
         if kind is None:
             why = "; ".join(inspection.problems)
-            self._observer.remark(f"{path.name}: not taken, nothing tells what it is: {why}")
+            self._observer.remark(f"{path.name}: not imported, its content is unclear: {why}")
             return None
         name = planned.id if planned else free_id(path.stem, self._done)
         data = own_folder(self._folder, "data")
         data.mkdir(exist_ok=True)
         target = data / f"{name}{path.suffix.casefold()}"
         if target.exists() or target.is_symlink():
-            self._observer.remark(f"{path.name}: not taken, {target} is there already")
+            self._observer.remark(f"{path.name}: not imported, {target} exists already")
             return None
         try:
             shutil.copyfile(path, target)

@@ -124,7 +124,7 @@ def read_raw(path: Path) -> RawRun:
     raw = path.read_bytes()
     head, newline, content = raw.partition(b"\n")
     if not newline or len(head) > 100_000:  # bytes
-        raise DataError(f"{path.name}: is no raw file of a bench, its first line is no header")
+        raise DataError(f"{path.name}: not a raw file of a bench: its first line is not a header")
     header = _header(head, name=path.name)
     times = path.with_suffix(".times")
     packed = times.read_bytes() if times.exists() else b""
@@ -137,7 +137,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
     try:
         found: dict[str, Any] = json.loads(line)
         if found["schema"] != _VERSION:
-            raise DataError(f"{name}: is of the form {found['schema']!r}, not {_VERSION!r}")
+            raise DataError(f"{name}: has the form {found['schema']!r}, expected {_VERSION!r}")
         bench = {**found["bench"], "commands": frozenset(found["bench"]["commands"])}
         return RawHeader(
             recording=Recording.model_validate(found["recording"]),
@@ -147,7 +147,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
             begun=found["begun"],
         )
     except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{name}: is no raw file of a bench: {error!r}") from None
+        raise DataError(f"{name}: not a raw file of a bench: {error!r}") from None
 
 
 def free_raw_path(folder: Path, recording: Recording) -> Path:

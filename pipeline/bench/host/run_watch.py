@@ -56,14 +56,14 @@ class LineWatch:
             strays = order.strays(reading, period=self._period)
             if self._strays.lasts(strays, ms=reading.ms):
                 return (
-                    f"the bench follows another wave than it was sent, {reading.target} counts "
-                    f"at {1e-3 * reading.ms:.3f} s: the line changed a digit"
+                    f"the bench follows another wave than ordered, {reading.target} counts "
+                    f"at {1e-3 * reading.ms:.3f} s: a digit changed on the line"
                 )
         if self._drives_off.lasts(off, ms=reading.ms):
             self.is_astray = True
             return self.stop(
-                f"the bench drives its motor with {reading.duty} duty counts where it "
-                f"was told {reading.target}, at {1e-3 * reading.ms:.3f} s"
+                f"the bench drives its motor with {reading.duty} duty counts instead "
+                f"of {reading.target}, at {1e-3 * reading.ms:.3f} s"
             )
         return ""
 

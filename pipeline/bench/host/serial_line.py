@@ -236,7 +236,7 @@ class SerialLine:
                 self.drain()
             elif all(self._answer(self._described) is None for _ in range(queries)):
                 raise HardwareError(
-                    f"{self._name}: the bench answers no more; is it still switched on?"
+                    f"{self._name}: the bench no longer answers; is it still switched on?"
                 )
             self._is_cleared = True
 
@@ -261,8 +261,8 @@ class SerialLine:
             before = answer
         if before is not None:
             raise HardwareError(
-                f"{self._name}: the bench never describes itself twice alike, last as "
-                f"{before[:200]!r}; the line changes what it carries: check cable and baud rate"
+                f"{self._name}: the bench describes itself differently each time, last as "
+                f"{before[:200]!r}; the line is unreliable: check cable and baud rate"
             )
         self._try_stock()
 
@@ -312,7 +312,7 @@ class SerialLine:
         readings = [parse_reading(line) for line in heard.split(b"\n")]
         encoders = [len(reading.counts) for reading in readings if reading is not None]
         if not encoders:
-            what = "nothing" if not heard else f"{heard[:40]!r}, which is no line of a bench"
+            what = "nothing" if not heard else f"{heard[:40]!r}, which is not a line of a bench"
             raise HardwareError(
                 f"{self._name}: answers {what}; is this the bench's port, is the bench switched "
                 "on, is the baud rate of plan.toml its own, is another program connected to it?"
@@ -391,7 +391,7 @@ def _why(failure: str) -> str:
     if any(word in small for word in ("no such file", "filenotfound", "cannot find", "not exist")):
         return "there is no such port; is the bench plugged in?"
     if "refused" in small:
-        return "nobody listens there; start the bench (cartlab emulate) first"
+        return "no bench listens there; start one (cartlab emulate) first"
     return f"cannot be opened ({failure})"
 
 

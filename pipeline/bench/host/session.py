@@ -158,10 +158,7 @@ class Session:
         self._swings_out = watch.is_too_far
         watch.forward(stream.finish())
         if not partial and recording.controller is None and stream.widest <= _STILL:
-            partial = (
-                "no cart that is free moved: is it held, is its encoder plugged in, "
-                "is the motor on?"
-            )
+            partial = "no free cart moved: is it held, is its encoder plugged in, is the motor on?"
         fit = stream.fit()
         if stream.lines > 1000 and not partial:  # enough to determine a clock's period
             self._say_other_period(fit.period)
@@ -198,8 +195,8 @@ class Session:
         if abs(period / stated - 1) > OTHER_PERIOD:
             self._observer.remark(
                 f"the bench states a line every {stated:.3g} ms and sends one every {period:.3g} "
-                "ms: its times are right, but a controller that counts in its periods is not; "
-                "mend the period that it states"
+                "ms: the times in the data are right, but its controller uses the stated period; "
+                "correct that period"
             )
 
     def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
@@ -392,7 +389,7 @@ class Session:
                 else:
                     unread = now if unread is None else unread
                     if now - unread > 0.25:  # s: the motor may be on, and nobody sees it
-                        return watch.stop("what the bench sends cannot be read: nothing is watched")
+                        return watch.stop("the bench's lines cannot be read, so nothing is watched")
             if why := self._by_hand():  # after the limits, whose message must never be lost
                 return why
             quiet = now - last

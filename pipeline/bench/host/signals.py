@@ -36,9 +36,9 @@ def stopping_on_signals() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C and similar signals until the block is over;
+    """Hold Ctrl-C and similar signals until the block is over.
 
-    the yielded function lets them in.
+    The yielded function lets them in.
     """
     waiting: list[int] = []
 

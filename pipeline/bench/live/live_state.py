@@ -1,6 +1,6 @@
-"""The content of a live page:
+"""The content of a live page.
 
-written by the acquisition in one thread, read by a server in another.
+Written by the acquisition in one thread, read by a server in another.
 """
 
 import threading
@@ -53,7 +53,7 @@ class ShownSession(ABC):
 
     @abstractmethod
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button:
+        """Take a button.
 
         `done` with an instruction or a wish for a turn; return whether it counts.
         """
@@ -261,7 +261,7 @@ class LiveState(ShownSession):
         return heeded
 
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button:
+        """Take a button.
 
         `done` with an instruction or a wish for a turn; return whether it counts.
         """

@@ -75,9 +75,9 @@ class Start:
 
 @dataclass(frozen=True, kw_only=True)
 class PidGains:
-    """`g`:
+    """`g`: the PID gains of later closed-loop starts.
 
-    duty = kp e + ki ∫e dt + kd de/dt, e in encoder counts; used by later closed-loop starts.
+    duty = kp e + ki ∫e dt + kd de/dt, with e in encoder counts.
     """
 
     kp: float
@@ -261,7 +261,7 @@ def parse_description(line: bytes) -> Description:
     head, *words = text.split(" ")
     entries = {key: value for key, _, value in (word.partition("=") for word in words)}
     if head != "?cartlab/1":
-        raise DataError(f"the bench answers {text[:60]!r}, which is no description of a bench")
+        raise DataError(f"the bench answers {text[:60]!r}, which is not a description of a bench")
 
     def read(key: str, kind: Callable[[str], _Read]) -> _Read:
         try:

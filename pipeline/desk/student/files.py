@@ -121,7 +121,7 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
     names = _list_names(own_folder(folder, "data") / name)
     target = next(path for path in names if not _is_there(path) or _holds(path, raw))
     if _is_there(target):
-        return Said(f"{quote(last)}: is there already", "changed")
+        return Said(f"{quote(last)}: exists already", "changed")
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)

@@ -64,7 +64,7 @@ class Misread:
     """
 
     words: str
-    remedy: str = "mend it in the files"
+    remedy: str = "correct it in the files"
     legal: bool = False
     scale: float | None = None
     clock: float | None = None
@@ -134,7 +134,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         rows = list(range(len(record.carts)))
         a, b = record.carts.index(i), record.carts.index(j)
         rows[a], rows[b] = b, a
-        words = f"x{i} and x{j} look exchanged"
+        words = f"x{i} and x{j} look swapped"
         other = replace(record, y=record.y[rows], resolution=record.resolution[rows])
         remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
         yield Misread(words=words, remedy=remedy), other
@@ -181,15 +181,15 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
         # Relative, of a unit's factor: known factors are at least 2.5 apart.
         if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
             words = (
-                "its positions or its input look to be in another unit: they move "
+                "its positions or its input seem to be in another unit: they move "
                 f"{scale:.3g} times as far as its input moves the carts"
             )
             return Misread(words=words, scale=scale), sign / scale
     turned = [f"x{cart}" for cart, s in zip(carts, sign, strict=True) if s < 0]
     if len(turned) == len(carts):
-        return Misread(words="its input looks to count the other way", legal=True), sign
+        return Misread(words="its input seems to count the other way", legal=True), sign
     if turned:
-        return Misread(words=f"the sign of {' and '.join(turned)} looks turned"), sign
+        return Misread(words=f"the sign of {' and '.join(turned)} looks reversed"), sign
     return None
 
 

@@ -174,7 +174,7 @@ class Exploration:
         try:
             self.gap = investigate(analysis, progress=self.progress, budget=_SEARCH)
         except DataError as error:
-            self.tell(f"the gap cannot be looked for: {error}")
+            self.tell(f"the search for the gap is not possible: {error}")
         self._propose(analysis)
         self.analysis = _identify_beside(analysis, self.gap)
 

@@ -73,9 +73,9 @@ class GapRun:
 
     @property
     def start_std(self) -> tuple[Array, Array]:
-        """(n,) Uncertainty of `start` and `slope` from the first readings;
+        """(n,) Uncertainty of `start` and `slope` from the first readings.
 
-        infinite where fitted.
+        Infinite where fitted.
         """
         known = np.full(self.zero.size, np.inf)
         if self.start_known:
@@ -95,7 +95,7 @@ class GapRun:
         return np.interp(self.t, self.knots, self.command)
 
     def by_cart(self, rows: Array, zero: Array) -> Array:
-        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples);
+        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples).
 
         0 for other carts.
         """

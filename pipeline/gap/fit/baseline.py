@@ -47,9 +47,9 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
 
 
 def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]]:
-    """Yield the equations of each moving cart from each window of a run:
+    """Yield the equations of each moving cart from each window of a run.
 
-    equation and right side.
+    Equation and right side.
     """
     # Windows of 0.3 s, every 50 ms, at the usual pace.
     step = max(1, round(0.05 * run.pace / run.record.sample_time))

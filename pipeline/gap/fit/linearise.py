@@ -99,9 +99,9 @@ def _simulate_variants(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linear:
-    """One run's contribution to a step:
+    """One run's contribution to a step.
 
-    the reduced system of the shared parameters, and the way back.
+    The reduced system of the shared parameters, and the way back.
     """
 
     reduced: Array  # (rows, size + 1) of R: shared parameters and residual

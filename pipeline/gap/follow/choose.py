@@ -1,6 +1,6 @@
-"""Choose the laws:
+"""Choose the laws.
 
-first all at once from zero, then those with a shape, then drop needless ones.
+First all at once from zero, then those with a shape, then drop needless ones.
 """
 
 from collections.abc import Sequence

@@ -235,9 +235,9 @@ class LawSet:
         return laws, np.concatenate([p, *(law.values for law in extra)])
 
     def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
-        """Return the laws and vector without some groups:
+        """Return the laws and vector without some groups.
 
-        laws by index, the drive's as -1 to -4.
+        Laws by index, the drive's as -1 to -4.
         """
         kept = [i for i in range(len(self.keys)) if i not in groups]
         drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
@@ -280,9 +280,9 @@ class LawSet:
         return {s: 0.0 if there is None else float(p[there + q]) for q, s in enumerate(symbols)}
 
     def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
-        """Return the values of the laws in the simulator's tables:
+        """Return the values of the laws in the simulator's tables.
 
-        by table and row (0 for a drive).
+        By table and row (0 for a drive).
         """
         n = self.bench.n
         out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}

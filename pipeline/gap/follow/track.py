@@ -181,9 +181,9 @@ def _shaped(track: Track, dead: float, limit: float) -> Array:
 
 
 def compile_follower() -> None:
-    """Follow a record of two readings, so that the code is compiled:
+    """Follow a record of two readings, so that the code is compiled.
 
-    seconds, unless it is stored.
+    Seconds, unless it is stored.
     """
     one, two = np.ones(1), np.array([0.0, 0.01])
     track = Track(

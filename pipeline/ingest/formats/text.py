@@ -96,9 +96,9 @@ def _parse(
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
-    """Return rows of numbers (n, width), or None if any is not a number;
+    """Return rows of numbers (n, width), or None if any is not a number.
 
-    rows are not checked singly.
+    Rows are not checked singly.
     """
     fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
     try:
@@ -330,7 +330,7 @@ def _heading(
 
 
 def _is_bench_log(names: Sequence[str]) -> bool:
-    """Return whether it is the bench's own log:
+    """Return whether it is the bench's own log.
 
     ECP headings, but no commanded position and no brackets.
     """

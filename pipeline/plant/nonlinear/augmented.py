@@ -22,7 +22,7 @@ from pipeline.plant.nonlinear.simulator.state import Push
 from pipeline.plant.nonlinear.simulator.step import advance, smooth_forces
 from pipeline.plant.nonlinear.tables import DRY, Cart, Drive, Spring, Tables
 
-_RUN_AWAY = "with these effects the carts run away: a spring softens too much, or a force is huge"
+_RUN_AWAY = "with these effects the carts diverge: a spring softens too much, or a force is huge"
 
 
 def simulate_augmented(
@@ -196,9 +196,9 @@ class SteppedBench:
         self.step(0.0, following=0.0, interval=interval)
 
     def let_go(self, cart: int, *, velocity: float) -> float:
-        """Free all carts again, this one with a velocity;
+        """Free all carts again, this one with a velocity.
 
-        return the force that held its springs.
+        Return the force that held its springs.
         """
         self._state[kernel.INV] = self._inverse_mass
         self._state[kernel.V, self._rows] = 0.0

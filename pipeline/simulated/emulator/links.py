@@ -81,8 +81,8 @@ def open_link(port: str, *, remote: bool = False) -> Link:
         raise ConfigError(f"{where}: {error.strerror}") from None
     if not (remote or ip_address(address[0]).is_loopback):
         raise ConfigError(
-            f"{where}: whoever reaches this port can drive the bench; "
-            "take 127.0.0.1, or add --remote if that is meant"
+            f"{where}: anyone who reaches this port can drive the bench; "
+            "take 127.0.0.1, or add --remote if you mean it"
         )
     listener = socket.socket(family, socket.SOCK_STREAM)
     if sys.platform != "win32":  # there it would let two emulators share a port

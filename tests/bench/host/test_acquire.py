@@ -232,14 +232,14 @@ def test_faults_of_every_kind_are_counted_and_the_rest_is_kept(tmp_path):
 @pytest.mark.parametrize(
     ("fault", "why"),
     [
-        ("reset@0.6", "the bench began again in mid-run"),
+        ("reset@0.6", "the bench restarted during the run"),
         ("disconnect@0.6", "the line to the bench is gone"),
     ],
 )
 def test_a_run_that_breaks_off_is_saved_as_partial_and_recorded_again(tmp_path, fault, why):
-    """The partial record is kept where no report mistakes it for a whole one;
+    """The partial record is kept where no report mistakes it for a whole one.
 
-    the retry succeeds.
+    The retry succeeds.
     """
     work = write_work(tmp_path, [sine("dwell", seconds=2)])
     notes = Notes()
@@ -337,7 +337,7 @@ def test_a_killed_host_leaves_a_readable_file_and_a_motor_that_is_off(tmp_path, 
     notes = Notes()
     *_, outcome = acquire(work, port=fast.address, observers=[notes], only=["dwell"])
     assert outcome.partial == ""
-    assert "data/dwell.partial.txt is what a session left that was cut off" in notes.remarks
+    assert "data/dwell.partial.txt is the data of an interrupted session" in notes.remarks
 
 
 def test_a_stuck_encoder_is_said(tmp_path):
@@ -354,7 +354,7 @@ def test_a_stuck_encoder_is_said(tmp_path):
 
 def test_nobody_at_the_port_is_said_at_once():
     """A port where nothing listens gives one line that says what to do."""
-    with pytest.raises(HardwareError, match="nobody listens there; start the bench"):
+    with pytest.raises(HardwareError, match="no bench listens there; start one"):
         open_line("socket://127.0.0.1:9", baud=115_200)
 
 
@@ -389,7 +389,7 @@ def test_what_is_no_bench_is_said():
         pass_fds=[controller],
     )  # fmt: skip
     try:
-        with pytest.raises(HardwareError, match="which is no line of a bench; is this"):
+        with pytest.raises(HardwareError, match="which is not a line of a bench; is this"):
             open_line(os.ttyname(device), baud=115_200)
     finally:
         echo.kill()
@@ -458,7 +458,7 @@ def test_either_a_port_or_a_folder(tmp_path, options):
 def test_an_id_that_the_plan_does_not_have_is_said(tmp_path, real):
     """`--only` with an unknown name lists the recordings of the plan."""
     work = write_work(tmp_path, [sine("a", seconds=1)])
-    with pytest.raises(ConfigError, match=r"--only nine: plan.toml has a$"):
+    with pytest.raises(ConfigError, match=r"--only nine: no such recording; plan.toml has a$"):
         acquire(work, port=real.address, observers=[Notes()], only=["nine"])
 
 

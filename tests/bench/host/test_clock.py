@@ -137,7 +137,7 @@ def test_lines_of_the_run_before_that_come_late_are_not_of_this_one(tmp_path):
     bench = OddBench(reset, late=[_with(r, ms=r.ms + 50) for r in _whole(NOTHING)])
     work = write_work(tmp_path, [sine("dwell", seconds=RUN / 1e3)])
     broken, again = acquire(work, port=bench.address, observers=[Notes()], only=["dwell"])
-    assert broken.partial.startswith("the bench began again in mid-run")
+    assert broken.partial.startswith("the bench restarted during the run")
     assert (again.partial, again.lines, str(again.anomalies)) == ("", RUN, "none")
 
 
@@ -192,9 +192,9 @@ def test_a_motor_driven_with_another_duty_than_the_target_is_stopped(tmp_path, f
     stated=st.booleans(),
 )
 def test_any_stamps_have_a_clock(steps, still, period, stated):
-    """Whatever the stamps, if they do not fall:
+    """Whatever the stamps, if they do not fall.
 
-    a positive period and no negative number of losses.
+    A positive period and no negative number of losses.
     """
     stamps = np.cumsum([0, *steps, *[still] * 60])
     fit = fit_stamps(stamps, period=period, stated=stated)

@@ -78,12 +78,12 @@ def test_a_raw_file_is_never_written_over(raw):
 @pytest.mark.parametrize(
     ("content", "why"),
     [
-        (b"", "its first line is no header"),
-        (b'{"schema": "cartlab-raw/1"', "its first line is no header"),
-        (b"1:2:3:4:5\n", "is no raw file of a bench"),
-        (b'{"schema": "cartlab-raw/9"}\n', "of the form 'cartlab-raw/9'"),
-        (b'{"schema": "cartlab-raw/1", "bench": 3}\n', "is no raw file of a bench"),
-        (b"[1]\n", "is no raw file of a bench"),
+        (b"", "its first line is not a header"),
+        (b'{"schema": "cartlab-raw/1"', "its first line is not a header"),
+        (b"1:2:3:4:5\n", "not a raw file of a bench"),
+        (b'{"schema": "cartlab-raw/9"}\n', "has the form 'cartlab-raw/9'"),
+        (b'{"schema": "cartlab-raw/1", "bench": 3}\n', "not a raw file of a bench"),
+        (b"[1]\n", "not a raw file of a bench"),
     ],
 )
 def test_what_is_no_raw_file_is_refused(tmp_path, content, why):

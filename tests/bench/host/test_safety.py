@@ -59,7 +59,7 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     with emulator("--fault", "garble=1") as bench:
         (outcome,) = acquire(work, port=bench.address, observers=[Alone()], only=["dwell"])
         sent = bench.event("run")
-    assert outcome.partial == "stopped: what the bench sends cannot be read: nothing is watched"
+    assert outcome.partial == "stopped: the bench's lines cannot be read, so nothing is watched"
     assert sent["ended"] == "stopped"
     assert sent["lines"] < 5000
 
@@ -88,7 +88,7 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
 
 
 def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
-    """The limits are listed beside full scale and count:
+    """The limits are listed beside full scale and count.
 
     2.5 cm in counts of 0.00227 cm are 1101.
     """
@@ -100,9 +100,9 @@ def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
 
 
 def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
-    """A chirp on a stock bench, and less than one count, are skipped with reasons;
+    """A chirp on a stock bench, and less than one count, are skipped with reasons.
 
-    exit status 1.
+    Exit status 1.
     """
     chirp = Recording(
         id="sweep",
@@ -176,7 +176,7 @@ def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, re
         monkeypatch.undo()
         sent = real.event("run")
         again = session.record(order, tmp_path / "dwell-2.raw")
-    assert outcome.partial.startswith("the bench follows another wave than it was sent")
+    assert outcome.partial.startswith("the bench follows another wave than ordered")
     assert sent["ended"] == "stopped"
     assert sent["lines"] < 1000
     assert again.partial == ""
@@ -272,7 +272,7 @@ def test_a_description_is_believed_when_it_came_twice():
         assert line.bench.position_per_count == 0.002
     port = Answers([*wrong, true])
     port.start()
-    with pytest.raises(HardwareError, match=r"never describes itself twice alike.*check cable"):
+    with pytest.raises(HardwareError, match=r"describes itself differently each time.*check cable"):
         open_line(port.address, baud=115_200)
 
 
@@ -397,9 +397,9 @@ def test_more_than_the_bench_can_give_is_refused():
 
 
 def test_a_lost_byte_leaves_no_gains_of_an_earlier_run():
-    """A gain command that lost a letter or a semicolon does nothing;
+    """A gain command that lost a letter or a semicolon does nothing.
 
-    old gains do not act either.
+    Old gains do not act either.
     """
     bench = Description(name="b", encoders=2, carts=2, commands=EXTENSIONS)
     loop = sine("loop", seconds=1).model_copy(update={"controller": StateLoop()})

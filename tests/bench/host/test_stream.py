@@ -164,7 +164,9 @@ def test_a_bench_that_begins_again_ends_the_run():
     sent = lines(500)
     got, stream = read(join(sent) + join(lines(300)))
     assert got == sent
-    assert stream.broken == "the bench began again in mid-run: its supply or its reset line"
+    assert (
+        stream.broken == "the bench restarted during the run: check its supply and its reset line"
+    )
     assert stream.anomalies().resets == 1
 
 
@@ -177,9 +179,9 @@ def test_what_an_earlier_run_left_in_the_line_is_not_of_this_one():
 
 @pytest.mark.parametrize("closed", [True, False])
 def test_a_kick_of_the_duty_is_a_line_in_a_closed_loop_only(closed):
-    """At rest a controller kicks for one line when an encoder flickers;
+    """At rest a controller kicks for one line when an encoder flickers.
 
-    in open loop nothing does.
+    In open loop nothing does.
     """
     sent = lines(100, period=1.0)
     sent[50] = Reading(counts=sent[50].counts, target=0, duty=120, ms=sent[50].ms)
@@ -206,9 +208,9 @@ def test_late_lines_are_counted_and_kept():
 
 
 def test_a_host_that_was_busy_makes_no_line_late():
-    """Lines that waited because the host was busy are not late:
+    """Lines that waited because the host was busy are not late.
 
-    its last look found the port empty.
+    Its last look found the port empty.
     """
     sent = lines(1000, period=1.0)
     stream = Stream(encoders=2)

@@ -157,7 +157,7 @@ def test_what_broke_off_is_kept_when_asked_about(tmp_path):
         thread.join()
     assert [bool(o.partial) for o in done] == [True, False]
     (kept,) = load_submission(work).experiments
-    assert "kept by hand: the bench began again" in kept.note
+    assert "kept by hand: the bench restarted" in kept.note
 
 
 @pytest.mark.parametrize("wish", ["stop", "skip"])

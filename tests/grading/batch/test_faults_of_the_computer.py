@@ -131,9 +131,9 @@ print(json.dumps(told))
 
 
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
-    """Grade without a limit, then with each;
+    """Grade without a limit, then with each.
 
-    return whether settled, short of space, reason and grade.
+    Return whether settled, short of space, reason and grade.
     """
     scratch.mkdir()
     words = [sys.executable, "-c", _STARVED, source, scratch, limit, *soft]

@@ -100,9 +100,9 @@ def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
 
 
 def test_only_what_changed_is_graded_again(school, graded, tmp_path):
-    """A second run starts no process;
+    """A second run starts no process.
 
-    a changed file causes only its own submission to be graded.
+    A changed file causes only its own submission to be graded.
     """
 
     def nobody(tasks, setup):

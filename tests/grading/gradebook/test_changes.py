@@ -20,9 +20,9 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_rubric_is_compared_by_its_criteria():
-    """New and removed criteria, changed numbers, changed order;
+    """New and removed criteria, changed numbers, changed order.
 
-    the rest of the rubric by its keys.
+    The rest of the rubric by its keys.
     """
     first, second, *rest = RUBRIC.criteria
     dearer = first.model_copy(update={"points": first.points + 1})

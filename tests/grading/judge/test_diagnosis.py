@@ -179,9 +179,9 @@ def test_a_decrement_with_log10(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts(carts, table):
-    """Twice the gain is peak to peak;
+    """Twice the gain is peak to peak.
 
-    divided by the encoder step it is in counts; both can meet.
+    Divided by the encoder step it is in counts; both can meet.
     """
     one, names = student(carts), own("K", carts)
     count = 0.00227  # cm, of the simulated encoder
@@ -296,9 +296,9 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
 
 
 def test_a_frequency_out_of_order_is_told_by_the_recordings():
-    """One wrong number also breaks the order of the nulls;
+    """One wrong number also breaks the order of the nulls.
 
-    the message gives the recordings' value.
+    The message gives the recordings' value.
     """
     one = student(3)
     flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
@@ -371,9 +371,9 @@ def test_a_state_model_that_follows_from_a_wrong_table_is_right():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
-    """Gains of reversed sign are wrong gains;
+    """Gains of reversed sign are wrong gains.
 
-    a prefilter equal to the static gain is its own mistake.
+    A prefilter equal to the static gain is its own mistake.
     """
     one = student(carts)
     feedback = one.reported.feedback

@@ -91,14 +91,14 @@ def frozen(name: str) -> Spoil:
 SPOILT = {
     "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
     "a decay in thousands of seconds": ("decay-1", slice(1), times(1e-3, "time"), "thousands"),
-    "two of four steps exchanged": ("step", slice(2, 4), exchanged, "exchanged"),
+    "two of four steps exchanged": ("step", slice(2, 4), exchanged, "swapped"),
     "cart 2 dead in every step": ("step", slice(None), dead("x2"), "encoder of cart 2"),
     "cart 1 dead in a step": ("step", slice(1), dead("x1"), "encoder of cart 1"),
-    "all dwells exchanged": ("sine", slice(None), exchanged, "exchanged"),
-    "four dwells exchanged": ("sine", slice(1, 22, 6), exchanged, "exchanged"),
-    "every second dwell exchanged": ("sine", slice(None, None, 2), exchanged, "exchanged"),
-    "a step exchanged": ("step", slice(1), exchanged, "exchanged"),
-    "the sweep exchanged": ("sweep", slice(None), exchanged, "exchanged"),
+    "all dwells exchanged": ("sine", slice(None), exchanged, "swapped"),
+    "four dwells exchanged": ("sine", slice(1, 22, 6), exchanged, "swapped"),
+    "every second dwell exchanged": ("sine", slice(None, None, 2), exchanged, "swapped"),
+    "a step exchanged": ("step", slice(1), exchanged, "swapped"),
+    "the sweep exchanged": ("sweep", slice(None), exchanged, "swapped"),
     "a dwell ten times too far": ("sine", slice(3, 4), times(10, "x1", "x2"), "another unit"),
     "a step ten times too far": ("step", slice(1), times(10, "x1", "x2"), "another unit"),
     "cart 1 turned in four dwells": ("sine", slice(1, 22, 6), times(-1, "x1"), "sign of x1"),
@@ -137,9 +137,9 @@ def _cases() -> Iterator[Any]:
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
 def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
-    """The spoilt records, and no others, are left out of all estimates;
+    """The spoilt records, and no others, are left out of all estimates.
 
-    report and grade say why.
+    Report and grade say why.
     """
     kind, which, how, word = SPOILT[case]
     folder = shutil.copytree(bench, tmp_path / "spoilt")
@@ -203,9 +203,9 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
 def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     kind, stated, word, bench, tmp_path
 ):
-    """A flag in grading corresponds to a failed check in the report;
+    """A flag in grading corresponds to a failed check in the report.
 
-    no number uses the recording.
+    No number uses the recording.
     """
     folder = shutil.copytree(bench, tmp_path / "kind")
     path = files(folder, kind)[1]

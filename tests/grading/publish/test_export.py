@@ -368,9 +368,9 @@ def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, pla
 
 
 def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
-    """If no author's id is known to Canvas, the number in the file's name counts;
+    """If no author's id is known to Canvas, the number in the file's name counts.
 
-    others are named.
+    Others are named.
     """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section\n"Doe, Jane",1001,S1,doejane,A\n'
     team = make_outcome(make_grade("t", authors=("u1a", "u1b")), owner="doejane (canvas 1001)")

@@ -34,9 +34,9 @@ def test_half_a_digit_is_that_of_the_typed_number(typed, half):
 
 @given(full=percents, width=percents)
 def test_the_edges_belong_to_the_tolerance(full, width):
-    """At exactly `full` all points are earned;
+    """At exactly `full` all points are earned.
 
-    at exactly `none` no points, unless they are equal.
+    At exactly `none` no points, unless they are equal.
     """
     none = float(Decimal(str(full)) + Decimal(str(width)))
     assert credit(Fraction(str(full)), full=full, none=none) == 1

@@ -31,9 +31,9 @@ def make_core(**changes) -> ReferenceCore:
 
 
 def run(core: ReferenceCore, commands: bytes, y, *, ticks: int, first: int = 0) -> list[Reading]:
-    """Send something to the core, then tick;
+    """Send something to the core, then tick.
 
-    return its lines. `y` gives the counts at each tick.
+    Return its lines. `y` gives the counts at each tick.
     """
     core.receive(commands)
     for k in range(first, first + ticks):
@@ -179,7 +179,7 @@ def test_silence_after_a_heartbeat_cuts_the_motor():
 
 
 def test_a_query_is_answered_and_hands_are_not_the_controllers():
-    """A query during a run gets its line between the others;
+    """A query during a run gets its line between the others.
 
     `h` changes nothing; stock is silent.
     """

@@ -317,7 +317,7 @@ def test_a_fault_that_is_none_is_said(fault, message):
         ("COM3", "write socket://127.0.0.1:5555"),
         ("socket://localhost", "write socket"),
         ("socket://localhost:99999", "write socket"),
-        ("socket://0.0.0.0:0", "whoever reaches this port"),
+        ("socket://0.0.0.0:0", "anyone who reaches this port"),
     ],
 )
 def test_a_port_that_will_not_do_is_said(port, message):

@@ -204,9 +204,9 @@ class Effect:
 
     @property
     def grown(self) -> Growth:
-        """The coordinates in which the law grows from zero:
+        """The coordinates in which the law grows from zero.
 
-        its parameters, unless others are given.
+        Its parameters, unless others are given.
         """
         symbols = tuple(p.symbol for p in self.parameters)
         return self.growth or Growth(symbols, signed=self.parameters[0].signed)
