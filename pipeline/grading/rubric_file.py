@@ -59,7 +59,7 @@ def find_rubric(path: Path) -> Path:
 
     Raises
     ------
-    ConfigError : there is none.
+    ConfigError : no rubric has this name.
     """
     path = Path(path)
     if not path.exists() and path.suffix == "" and (RUBRICS / f"{path.name}.toml").is_file():
