@@ -48,7 +48,7 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield _wrapped(f"`{effect.key}`: {effect.sentence}")
     yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
-    yield f"![{effect.title}: its fingerprint, and a run with and without it]({picture})"
+    yield f"![{effect.title}: fingerprint and example]({picture})"
     facts = {
         f"Parameters ({effect.place})": ", ".join(
             parameter_text(p) for p in effect.parameters if p.reported
