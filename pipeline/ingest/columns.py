@@ -18,6 +18,7 @@ _POSITION = re.compile(
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
 _NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, but unused
+_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # forms whose numbers are in the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
 # "time [ms]", "x1 (cm)", "x1_cm"; not for every unit, since "u_in" is no inch.
 _UNIT = re.compile(
@@ -69,7 +70,7 @@ class Column:
 
 def holds_counts(table: FileTable, column: Column) -> bool:
     """Return whether it holds counts: whole numbers, if form or heading names an encoder."""
-    return table.whole[column.index] and (table.form != "csv" or column.is_counted)
+    return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
 
 
 def conversion(found: str | None, wanted: str) -> float | None:

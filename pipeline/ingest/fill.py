@@ -430,7 +430,7 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
     """Yield the facts that a person knows and no file shows."""
     assert found.inspection is not None
     if found.inspection.guessed:
-        yield "the columns have no names, their numbers are guessed"
+        yield from (f"columns: {doubt}" for doubt in found.inspection.doubts)
     if found.kind == "closed_loop":
         yield "what ran: controller = { type = … }" + (", controlled_cart = …" if n > 1 else "")
     positions = found.inspection.positions

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.errors import SubmissionError
-from pipeline.ingest.formats.mat_variables import is_mat
-from pipeline.ingest.formats.recognise import ENDINGS, read_table
+from pipeline.ingest.formats.recognise import ENDINGS, is_recording, read_table
 from pipeline.submission.load import outside
 from pipeline.words.numbers import first_few
 
@@ -15,9 +14,9 @@ _DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the r
 _AS_TEXT = "save the recording as .csv"
 # Forms that are not read but may hold a recording, with the advice to give.
 _FORMS = {
-    ".xlsx .xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each sheet as .csv"),
+    ".xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each recording as .xlsx or .csv"),
     ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
-    ".h5 .hdf5 .npy .npz .parquet .tdms": ("data in a form that is not read", _AS_TEXT),
+    ".h5 .hdf5 .npy .npz .parquet": ("data in a form that is not read", _AS_TEXT),
     ".json .xml .out": ("data in a form that is not read", _AS_TEXT),
     ".fig": ("a MATLAB figure", "save the data that it shows as .csv"),
     ".doc .docx .rtf .pdf": ("a document", "save a table of numbers in it as .csv"),
@@ -106,7 +105,7 @@ def _is_table(root: Path, name: str) -> bool:
         with (root / name).open("rb") as file:
             # Bytes that show whether a file is text.
             head = file.read(1000)
-        if b"\0" in head and not is_mat(head):  # a film may be large
+        if b"\0" in head and not is_recording(head):  # a film may be large
             return False
         read_table(root, name)
     except (SubmissionError, OSError):

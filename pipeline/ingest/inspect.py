@@ -10,12 +10,12 @@ import numpy as np
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.channels import channel_problems, encoder_step, mirrors
-from pipeline.ingest.clock import SLOW, Clock, clock_notes, read_clock
+from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
 from pipeline.ingest.formats.table import FileTable, Variable
+from pipeline.ingest.unnamed import Roles, tell_columns
 from pipeline.results import Kind
-from pipeline.submission.models import MOST_CARTS
 from pipeline.words.numbers import by_note, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
@@ -52,6 +52,7 @@ class Inspection:
     needs : keys that its table in `submission.toml` must state ("columns", "sample_rate").
     variables : of a binary file, read or not.
     guessed : column numbers by role, if the file has no headings but the signals reveal them.
+    doubts : why a person should look at those numbers.
     """
 
     file: str
@@ -69,6 +70,7 @@ class Inspection:
     needs: tuple[str, ...]
     variables: tuple[Variable, ...]
     guessed: Mapping[str, int]
+    doubts: tuple[str, ...]
 
     @property
     def positions(self) -> dict[int, ColumnInspection]:
@@ -113,10 +115,11 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(unusable[-1])
     unnamed = all(name.isdigit() for name in table.names)
     bare = not assigned and unnamed
-    guessed = _suggest_columns(table) if bare else {}
+    told = tell_columns(table) if bare else Roles()
+    guessed = dict(told.columns)
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
-        problems.append(_name_them(guessed))
+        problems.append(_name_them(told))
     elif unused and not unnamed:
         problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
     # Without names everything else is missing too.
@@ -150,6 +153,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         needs=tuple(needs),
         variables=table.variables,
         guessed=guessed,
+        doubts=told.doubts,
     )
 
 
@@ -177,52 +181,24 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
     `state` is "broken" or "not_read"; `advice` says what to do.
     """
     nothing: dict[str, Any] = dict.fromkeys(field.name for field in fields(Inspection))
-    lists = {name: [] for name in ("columns", "unusable", "needs", "variables")}
+    lists = {name: [] for name in ("columns", "unusable", "needs", "variables", "doubts")}
     told = {"file": str(file), "problems": [problem], "advice": advice}
     return {"state": state, **nothing, **lists, "samples": 0, "guessed": {}, **told}
 
 
-def _name_them(guessed: Mapping[str, int]) -> str:
-    """Return how to name columns without headings; `guessed` may help."""
+def _name_them(told: Roles) -> str:
+    """Return how to name columns without headings, as far as their signals tell."""
     said = "the columns have no names: say in submission.toml which is what"
-    if guessed:
-        line = ", ".join(f"{role} = {number}" for role, number in guessed.items())
-        return f"{said}, perhaps columns = {{ {line} }}"
+    line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
+    if line and not told.doubts:
+        return f"the columns have no names; what they do says columns = {{ {line} }}"
+    if line:
+        return f"{said}, perhaps columns = {{ {line} }}: {'; '.join(told.doubts)}"
     return (
         f"{said}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
         "like the time: without it, state sample_rate = … (Hz) in its place"
+        + "".join(f"; {doubt}" for doubt in told.doubts)
     )
-
-
-def _suggest_columns(table: FileTable) -> dict[str, int]:
-    """Return each role's column, counted from 1; {} if no clock and encoders are visible.
-
-    The encoders follow the clock and hold whole numbers; the first may be a commanded position that
-    only mirrors encoder 1. The input is last, as in the exports of the ECP.
-    """
-    time = next((i for i, column in enumerate(table.values) if _looks_like_a_clock(column)), None)
-    if time is None:
-        return {}
-    after = [i for i in range(time + 1, len(table.names)) if np.ptp(table.values[i]) > 0]
-    given = {"time": time}
-    if len(after) > 1:
-        given["input"] = after.pop()
-    encoders = [i for i in after if table.whole[i]]
-    if len(encoders) > 1 and mirrors(*table.values[encoders[:2]]):
-        encoders = encoders[1:]
-    if not encoders or len(encoders) > MOST_CARTS:
-        return {}
-    given |= {f"x{cart}": i for cart, i in enumerate(encoders, start=1)}
-    return {role: i + 1 for role, i in given.items()}
-
-
-def _looks_like_a_clock(values: Array) -> bool:
-    if values.size < 3 or values[-1] <= values[0] or (np.diff(values) < 0).any():
-        return False
-    clock = read_clock(values)
-    regular = bool(clock.jitter < clock.mean_interval)
-    # No bench records more slowly or faster.
-    return clock.stopped is None and 1e-5 < clock.mean_interval < SLOW and regular
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:

@@ -24,12 +24,14 @@ from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
+from pipeline.ingest.formats.recognise import parse_table
 from pipeline.lock import turn_in
 from pipeline.processes import Failed
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
+from tests.helpers.recordings import xlsx
 from tests.helpers.waiting import PATIENCE, started, until
 
 HERE = "/student/0/"
@@ -782,11 +784,11 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
     """A spreadsheet and a link out of the folder are listed below the table, each with advice."""
     visitor, folder = filled
     assert "Not read" not in visitor.get(HERE).text
-    (folder / "data" / "book.xlsx").write_bytes(b"PK")
+    (folder / "data" / "book.ods").write_bytes(b"PK")
     (folder / "data" / "<b>.docx").write_bytes(b"PK")
     (folder / "data" / "away.csv").symlink_to(__file__)
     page = unescape(visitor.get(HERE).text)
-    assert "<b>data/book.xlsx</b>: a spreadsheet; save each sheet as .csv" in page
+    assert "<b>data/book.ods</b>: a spreadsheet; save each recording as .xlsx or .csv" in page
     assert "put the file itself here in place of the link" in page
     assert "&lt;b&gt;.docx" in visitor.get(HERE).text
 
@@ -883,3 +885,17 @@ def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
     page = visitor.get(HERE).text
     assert 'id="kind-unknown" open><summary>' in page
     assert "1 file needs you" in page
+
+
+def test_an_excel_file_is_dropped_like_any_other(room):
+    """Its recording is drawn and gets its table; a broken workbook says what is wrong."""
+    visitor, folder = room
+    (name, raw), *_ = [one for one in some_files() if one[0].startswith("step")]
+    table = parse_table(raw, source=name)
+    sheet = xlsx(dict(zip(table.names, table.values, strict=True)))
+    visitor.upload(HERE + "files", [("My run.xlsx", sheet), ("cut.xlsx", sheet[: len(sheet) // 2])])
+    page = visitor.get(HERE)
+    assert "the workbook is broken, cut short" in unescape(page.text)
+    assert page.text.count("<polyline") >= 1
+    (experiment,) = load_submission(folder).experiments
+    assert (experiment.file, experiment.kind) == ("data/My run.xlsx", "step")

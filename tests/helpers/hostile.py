@@ -21,6 +21,7 @@ import numpy as np
 import scipy.io
 
 from tests.helpers.poison import poisoned, zipped
+from tests.helpers.recordings import package, sheet_xml, tdms_of
 
 SECRET = "root:x:0:0:the-secret-outside"  # of a file beside the class: must be nowhere
 Files = Mapping[str, bytes]
@@ -238,6 +239,19 @@ def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
     data("mat junk", b"MATLAB 5.0 MAT-file" + rng.randbytes(4_000), file="step.mat")
     data("mat 7.3", b"MATLAB 7.3 MAT-file" + bytes(500) + b"\x89HDF\r\n\x1a\n", file="step.mat")
     data("mat bomb", _mat_bomb(), file="step.mat")
+    far = '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row></sheetData>'
+    sheet = sheet_xml([["time", "input", "x1"], *([0.01 * i, 1.0, 0.5] for i in range(50))])
+    data("workbook, far", package(sheet.replace("</sheetData>", far)), file="step.xlsx")
+    data("workbook, entities", package(_LAUGHS + sheet), file="step.xlsx")
+    data("workbook, bomb", package(sheet + " " * 30_000_000), file="step.xlsx")
+    data("workbook, texts", package(sheet, texts='<sst uniqueCount="99999999999"/>'),
+         file="step.xlsx")  # fmt: skip
+    data("workbook, cut", package(sheet)[: rng.randrange(200, 900)], file="step.xlsx")
+    tdms = tdms_of({"time": np.arange(50.0), "x1": np.arange(50.0)})
+    data("tdms absurd", b"TDSm" + struct.pack("<IIQQ", 14, 4712, 2**62, 2**62), file="step.tdms")
+    data("tdms segments", tdms + (b"TDSm" + bytes(24)) * 500_000, file="step.tdms")
+    data("tdms patched", tdms[:60] + rng.randbytes(40) + tdms[100:], file="step.tdms")
+    data("LabVIEW cut", b"LabVIEW Measurement\t\n" * 100_000, file="step.lvm")
     data("mat patched", mat[:200] + rng.randbytes(40) + mat[240:], file="step.mat")
     for name, notes in {
         "script": f"# {_SCRIPT}\n{_IMAGE}\n[x](javascript:alert(1))\n![x](http://evil.example/x)",
@@ -266,6 +280,13 @@ def _marked(toml: str, text: str) -> str:
         toml, times = re.subn(pattern, lambda _, new=new: new, toml, flags=re.MULTILINE)
         assert times, pattern
     return toml
+
+
+_LAUGHS = (
+    '<!DOCTYPE w [<!ENTITY a0 "ha">'
+    + "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
+    + "]>"
+)
 
 
 class _Evil:

@@ -81,7 +81,7 @@ def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
     assert {found.state for found in second} == {"there"}
     for one, again in zip(first, second, strict=True):
         assert (one.carts, one.unsure) == (again.carts, again.unsure)
-    assert sum(bool(found.unsure) for found in second) == 2
+    assert sum(bool(found.unsure) for found in second) == 1
     toml = tmp_path / "submission.toml"
     settled = [
         line for line in toml.read_text(encoding="utf-8").splitlines() if "unsure" not in line
@@ -94,14 +94,14 @@ def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
 def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, command):
     """A spreadsheet in `data/` is named beside the files that were read, or alone."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
-    (tmp_path / "data" / "b.xlsx").write_bytes(b"PK")
+    (tmp_path / "data" / "b.xls").write_bytes(b"PK")
     done = cartlab_here(command, tmp_path)
     assert done.returncode == 0
-    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
+    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xls"]
     (tmp_path / "data" / "a.csv").unlink()
     done = cartlab_here(command, tmp_path)
     assert done.returncode == 2
-    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xlsx"]
+    assert re.findall(r"not read: (\S+) ", done.stderr) == ["data/b.xls"]
 
 
 def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
@@ -122,7 +122,7 @@ def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
     found = files_not_read(data, root=tmp_path)
     sheets, _ = not_read_notes((one.file, one.reason, one.advice) for one in reversed(found))
     assert re.findall(r"run (\d+)\.ods", sheets) == ["19", "18", "17", "16"]
-    assert "16 more (a spreadsheet; save each sheet as .csv)" in sheets
+    assert "16 more (a spreadsheet; save each recording as .xlsx or .csv)" in sheets
 
 
 def test_fill_says_whether_it_wrote(tmp_path):
@@ -191,7 +191,7 @@ def test_the_same_samples_in_another_form_get_one_table(tmp_path):
 
 
 def test_a_bare_matrix_gets_its_columns(tmp_path):
-    """The columns that the signals reveal are written, and marked as guessed."""
+    """The columns that the signals reveal are written; nothing is left to ask."""
     (tmp_path / "data").mkdir()
     rows = [f"{t:.5f}\t{x:.0f}\t{u}" for t, x, u in zip(T, RING, STEP, strict=True)]
     (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
@@ -199,7 +199,21 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
     assert (found.state, found.kind) == ("new", "step")
     (experiment,) = load_submission(tmp_path).experiments
     assert experiment.columns == {"time": 1, "input": 3, "x1": 2}
-    assert any("guessed" in one for one in found.unsure)
+    assert found.unsure == ()
+    assert any("input = 3, x1 = 2" in one for one in found.remarks)
+
+
+def test_columns_that_the_signals_leave_open_are_asked_about(tmp_path):
+    """Any column may drive the other in a steady sine: one is proposed, the table says to look."""
+    (tmp_path / "data").mkdir()
+    sines = np.round(300 * np.sin(20 * T)), np.round(200 * np.sin(20 * T - 1))
+    rows = [f"{t:.5f}\t{x:.0f}\t{u:.0f}" for t, x, u in zip(T, *sines, strict=True)]
+    (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
+    (found,) = fill_submission(tmp_path)
+    assert found.state == "new"
+    (doubt,) = found.unsure
+    assert "which column is the input" in doubt
+    assert f"# unsure: {doubt}" in (tmp_path / "submission.toml").read_text(encoding="utf-8")
 
 
 def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
@@ -274,7 +288,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
 def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
     """If `data` leads out of the submission, no name inside it is shown."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
-    (tmp_path / "theirs" / "data" / "grades.xlsx").write_bytes(b"PK")
+    (tmp_path / "theirs" / "data" / "grades.xls").write_bytes(b"PK")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs" / "data")
     with pytest.raises(ConfigError, match="leaves the submission folder through a link") as told:
@@ -429,8 +443,8 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     text = (data / "a.csv").read_text(encoding="utf-8")
-    (data / "book.xlsx").write_bytes(b"PK")
-    (data / "scope.lvm").write_text(text, encoding="utf-8")
+    (data / "book.ods").write_bytes(b"PK")
+    (data / "scope.rec").write_text(text, encoding="utf-8")
     (data / "film.mp4").write_bytes(b"\0" * 100)
     (tmp_path / "spare.csv").write_text(text.replace("0.5", "0.7"), encoding="utf-8")
     (tmp_path / "words.txt").write_text("to do: everything", encoding="utf-8")
@@ -439,8 +453,8 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
     told = {row["file"]: (row["state"], row["advice"]) for row in json.loads(done.stdout)}
     assert told == {
         "data/a.csv": ("new", ""),
-        "data/book.xlsx": ("not_read", "save each sheet as .csv"),
-        "data/scope.lvm": ("not_read", "end it in .csv"),
+        "data/book.ods": ("not_read", "save each recording as .xlsx or .csv"),
+        "data/scope.rec": ("not_read", "end it in .csv"),
         "data/film.mp4": ("not_read", ""),
         "spare.csv": ("not_read", "move it into data/"),
     }

@@ -18,6 +18,7 @@ from pipeline.ingest.read import read_data
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import MOST_TOLD
 from tests.helpers.places import ROOT
+from tests.helpers.recordings import lvm, tdms_of, xlsx
 
 N = 60
 T = np.round(0.00884 * np.arange(N), 3)
@@ -88,6 +89,9 @@ FILES = {
     "mat, version 4": _mat("4", False),
     "mat, matrix": _matrix(),
     "mat, version 7.3": _mat73(),
+    "workbook": xlsx({"time": T, "input": U, "x1": X}),
+    "LabVIEW": lvm({"time": T, "input": U, "x1": X}),
+    "tdms": tdms_of({"time": T, "input": U, "x1": X}),
 }
 
 positions = st.floats(0.0, 1.0, exclude_max=True)

@@ -342,7 +342,17 @@ BAD_DATA = {
         r"line 3: expected 5 columns as in the heading",
     ),
     "ECP twice": (_ecp(ECP_ROWS + "];\n") * 2, r"two records pasted together"),
-    "workbook": (b"PK\x03\x04" + bytes(200), r"an Excel workbook or a zip archive; save .*CSV"),
+    "archive": (
+        b"PK\x03\x04" + bytes(200),
+        r"a zip archive, or .*: save the sheet as .xlsx or CSV",
+    ),
+    "workbook": (
+        b"PK\x03\x04" + bytes(26) + b"[Content_Types].xml" + bytes(200),
+        r"the workbook is broken, cut short or larger",
+    ),
+    "old workbook": (b"\xd0\xcf\x11\xe0" + bytes(99), r"an old Excel workbook, or a locked one"),
+    "LabVIEW cut short": (b"LabVIEW Measurement\t\nSeparator\tTab\n", r"line 1: .* cut short"),
+    "TDMS cut short": (b"TDSm" + bytes(10), r"broken at byte 0"),
     "gzip": (gzip.compress(b"time,x1\n"), r"a gzip archive; unpack it"),
     "HDF5": (b"\x89HDF\r\n\x1a\n" + bytes(100), r"an HDF5 file that MATLAB did not write"),
     "MATLAB 7.3": (b"MATLAB 7.3 MAT-file" + bytes(600), r"the \.mat file is broken or cut short"),

@@ -140,7 +140,7 @@ def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
     [
         ("notes.txt", "Remember to zero the encoders\n", "not a table of numbers"),
         ("cut.txt", STEP[: len(STEP) // 2], "cut short"),
-        ("sheet.csv", b"PK\x03\x04rest", "Excel workbook"),
+        ("sheet.csv", b"PK\x03\x04rest", "a zip archive"),
     ],
 )
 def test_what_is_no_record_is_refused_and_said(work, source, name, content, why):

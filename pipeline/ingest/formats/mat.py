@@ -1,13 +1,12 @@
 """The recording in a `.mat` file: which variables form it, and their columns."""
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.mat_variables import MatVariable, read_variables
-from pipeline.ingest.formats.table import FileTable, Variable, refuse_unusable
+from pipeline.ingest.formats.table import FileTable, not_read, refuse_unusable
 from pipeline.words.numbers import first_few
 
 _MAX_COLUMNS = 64
@@ -48,7 +47,7 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
         v.told(read=True) if v in record else v.told(read=False, advice=_advice(v, longest=longest))
         for v in variables
     )
-    notes += _not_read([variable for variable in made if not variable.read])
+    notes += not_read([variable for variable in made if not variable.read])
     columns = []
     for name, column in zip(names, arrays, strict=True):
         wide = column.astype(np.float64)
@@ -107,18 +106,6 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
     matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
     columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
     return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors
-
-
-def _not_read(variables: Sequence[Variable]) -> list[str]:
-    """Return a note on each unread variable, the largest first."""
-    large = [v for v in variables if v.advice]
-    large.sort(key=lambda v: -math.prod(v.size))
-    notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
-    alike: dict[str, list[str]] = {}
-    for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice)):
-        alike.setdefault(str(v).removeprefix(v.name), []).append(v.name)
-    rest = [first_few(names, _MOST_NAMED) + what for what, names in alike.items()]
-    return notes + ([f"not read: {first_few(rest, _MOST_NAMED)}"] if rest else [])
 
 
 def _advice(variable: MatVariable, *, longest: int) -> str:

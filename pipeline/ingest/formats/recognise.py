@@ -5,27 +5,42 @@ from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.errors import SubmissionError, lies_in_the_file
+from pipeline.ingest.formats.lvm import is_lvm, read_lvm
 from pipeline.ingest.formats.mat import read_mat
 from pipeline.ingest.formats.mat_variables import is_mat
 from pipeline.ingest.formats.table import FileTable
+from pipeline.ingest.formats.tdms import is_tdms, read_tdms
 from pipeline.ingest.formats.text import read_text
+from pipeline.ingest.formats.workbook import is_workbook, read_workbook
 from pipeline.submission.load import outside
 
-ENDINGS = (".txt", ".csv", ".mat", ".m", ".log", ".dat", ".tsv", ".asc")  # of data files
+# Of data files.
+ENDINGS = (
+    ".txt", ".csv", ".xlsx", ".mat", ".m", ".tdms", ".lvm", ".log", ".dat", ".tsv", ".asc",
+)  # fmt: skip
 FORM_TITLES = {
     "ecp": 'ECP "Export Raw Data" text',
-    "bench_log": "bench log, tab-separated",
+    "bench_log": "bench log",
     "bench_mat": "bench log, .mat",
     "matrix": "bare matrix, .mat",
     "variables": "vectors, .mat",
     "csv": "table of text (CSV)",
+    "workbook": "Excel workbook",
+    "tdms": "National Instruments .tdms",
+    "lvm": "LabVIEW measurement file (.lvm)",
 }
-_READERS = ((is_mat, read_mat),)  # what recognises a file, and reads it; all others are text
+# What recognises a file, and reads it; all others are text.
+_READERS = (
+    (is_mat, read_mat),
+    (is_workbook, read_workbook),
+    (is_lvm, read_lvm),
+    (is_tdms, read_tdms),
+)
 
 # Files that end up in a submission by mistake, by their first bytes, and the advice.
 _STRANGERS = (
-    (b"PK\x03\x04", "an Excel workbook or a zip archive; save the sheet as CSV"),
-    (b"\xd0\xcf\x11\xe0", "an old Excel workbook; save the sheet as CSV"),
+    (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
+    (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
     (b"\x89HDF", "an HDF5 file that MATLAB did not write; save the recording as CSV"),
     (b"\x1f\x8b", "a gzip archive; unpack it"),
     (b"%PDF", "a PDF document"),
@@ -57,6 +72,11 @@ def read_table(
             raise
         raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
     return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()
+
+
+def is_recording(head: bytes) -> bool:
+    """Tell by its first bytes a file that is no text and may hold a recording."""
+    return any(is_theirs(head) for is_theirs, _ in _READERS)
 
 
 def parse_table(raw: bytes, *, source: str) -> FileTable:

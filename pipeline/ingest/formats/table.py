@@ -1,5 +1,6 @@
 """A data file as written: named columns of numbers, without meaning or unit."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -9,7 +10,9 @@ from numpy.typing import NDArray
 
 from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
+from pipeline.words.numbers import first_few
 
+_MOST_NAMED = 8
 # The range of values a bench can measure, in any unit: times, positions, inputs, ratios. Powers and
 # products of some of them, as in the stages, neither overflow nor vanish.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
@@ -51,6 +54,7 @@ class FileTable:
     values : (n_columns, n), all finite.
     whole : (n_columns,) the column holds only whole numbers, written as such.
     lines : (n,) line of the file for each row; None for a binary file.
+    lines_are : what `lines` counts: "line", or "row" of a sheet.
     cut : the broken last line of a file that was cut short, or None.
     notes : repairs and omissions of reading.
     variables : of a binary file, in its order.
@@ -64,6 +68,7 @@ class FileTable:
     lines: NDArray[np.int64] | None
     cut: str | None = None
     notes: tuple[str, ...] = ()
+    lines_are: str = "line"
     variables: tuple[Variable, ...] = ()
 
     @property
@@ -74,8 +79,8 @@ class FileTable:
         return f"{self.cut}; the file was cut short: export it again, or delete its last line"
 
     def place(self, row: int) -> str:
-        """Return "line 12" (or "sample 12" of a binary file) for a row counted from 0."""
-        return f"sample {row + 1}" if self.lines is None else f"line {self.lines[row]}"
+        """Return "line 12" (or "row 12", or "sample 12") for a row counted from 0."""
+        return f"sample {row + 1}" if self.lines is None else f"{self.lines_are} {self.lines[row]}"
 
     def index(self, column: str | int) -> int:
         """Return the position, from 0, of a column given by heading or by number from 1.
@@ -108,6 +113,18 @@ class FileTable:
         """Return the headings as one short line."""
         shown = ", ".join(self.names[:12])
         return shown + (", …" if len(self.names) > 12 else "")
+
+
+def not_read(variables: Sequence[Variable]) -> list[str]:
+    """Return a note on each variable that is not read, the largest first."""
+    large = [v for v in variables if v.advice]
+    large.sort(key=lambda v: -math.prod(v.size))
+    notes = [f"not read: {v}; {v.advice}" for v in large[:_MOST_NAMED]]
+    alike: dict[str, list[str]] = {}
+    for v in (*large[_MOST_NAMED:], *(v for v in variables if not v.advice)):
+        alike.setdefault(str(v).removeprefix(v.name), []).append(v.name)
+    rest = [first_few(names, _MOST_NAMED) + what for what, names in alike.items()]
+    return notes + ([f"not read: {first_few(rest, _MOST_NAMED)}"] if rest else [])
 
 
 def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int], str]) -> None:

@@ -12,7 +12,7 @@ from pipeline.arrays import Array
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.table import FileTable, refuse_unusable
 
-_MAX_COLUMNS = 64
+MOST_COLUMNS = 64
 _SNIFFED_ROWS = 40
 # An ECP heading has names of two words with single spaces in them.
 _HEADING_WORDS = re.compile(
@@ -22,7 +22,7 @@ _TIME_HEADING = re.compile(r"(?:^|[,;\t])\W*(?:sample\s+)?(?:t|time)(?![a-z])", 
 _OPENING = re.compile(r"^[^\S\n]*(?:[A-Za-z]\w*\s*=\s*)?\[", re.MULTILINE)
 _LONGEST_HEADING = 100  # characters
 _LONGEST_UNIT = 8  # characters: "counts", "rad/s"
-_QUOTES = " \"'"
+QUOTES = " \"'"
 
 
 def read_text(raw: bytes, *, source: str) -> FileTable:
@@ -32,12 +32,18 @@ def read_text(raw: bytes, *, source: str) -> FileTable:
     ------
     SubmissionError : not text, not a table, or a row that does not fit; names the line.
     """
-    text = _decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
+    text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
     opening = _OPENING.search(text) if "[" in text else None
     return _ecp(text, opening, source) if opening else _delimited(text, source)
 
 
-def _decode(raw: bytes, *, source: str) -> str:
+def decode(raw: bytes, *, source: str) -> str:
+    """Return the text of a file in UTF-8, UTF-16 or the letters of old Windows programs.
+
+    Raises
+    ------
+    SubmissionError : no text.
+    """
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):  # Excel's "Unicode text"
         try:
             return raw.decode("utf-16")
@@ -56,7 +62,7 @@ def _decode(raw: bytes, *, source: str) -> str:
 
 
 @dataclass(frozen=True)
-class _Rows:
+class Rows:
     """Parsed rows of a file: (n, width) numbers, their lines, and signs of truncation."""
 
     source: str
@@ -66,14 +72,14 @@ class _Rows:
     cut: str | None
 
 
-def _parse(
+def parse_rows(
     rows: Sequence[str],
     lines: Sequence[int],
     *,
     split: Callable[[str], Sequence[str]],
     names: Sequence[str],
     source: str,
-) -> _Rows:
+) -> Rows:
     """Parse rows into numbers; a bad last row means a truncated file, any other is an error.
 
     Parameters
@@ -92,7 +98,7 @@ def _parse(
         raise SubmissionError(f"{source}: holds no rows of numbers")
     lines = lines[: len(values)]
     refuse_unusable(values.T, names=names, place=lambda row: f"{source} line {lines[row]}")
-    return _Rows(source=source, names=names, values=values, lines=np.array(lines), cut=cut)
+    return Rows(source=source, names=names, values=values, lines=np.array(lines), cut=cut)
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
@@ -108,24 +114,25 @@ def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
 
 
 def _fits(row: Sequence[str], *, width: int) -> bool:
-    return len(row) == width and all(map(_is_number, row))
+    return len(row) == width and all(map(is_number, row))
 
 
 def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
     """Return why a row does not fit its heading."""
-    if [field.strip(_QUOTES).casefold() for field in fields] == [n.casefold() for n in names]:
+    if [field.strip(QUOTES).casefold() for field in fields] == [n.casefold() for n in names]:
         return "a second heading: two records pasted together"
     if len(fields) != len(names):
         return f"expected {len(names)} columns, found {len(fields)}"
     for name, field in zip(names, fields, strict=True):
-        if not _is_number(field):
+        if not is_number(field):
             if not field.strip():
                 return f"{name!r} is empty"
             return f"{name!r} is no number: {field[:30]!r}"
     return "not a row of numbers"
 
 
-def _is_number(field: str) -> bool:
+def is_number(field: str) -> bool:
+    """Tell whether a field holds a number."""
     try:
         float(field)
     except ValueError:
@@ -133,14 +140,15 @@ def _is_number(field: str) -> bool:
     return True
 
 
-def _table(
-    rows: _Rows,
+def make_table(
+    rows: Rows,
     *,
     form: str,
     typed: Sequence[str],
     cut: str | None,
     notes: Sequence[str] = (),
 ) -> FileTable:
+    """Return rows as the columns of a file; `typed` is the first row, as it stands there."""
     values = np.ascontiguousarray(rows.values.T)
     whole = tuple(
         "." not in field and "," not in field and bool((column == np.round(column)).all())
@@ -158,21 +166,25 @@ def _table(
     )
 
 
-def _checked_names(names: Sequence[str], *, source: str, line: int) -> list[str]:
-    """Return headings without quotes; an empty one becomes its number."""
-    if len(names) > _MAX_COLUMNS:
-        raise SubmissionError(f"{source} line {line}: more than {_MAX_COLUMNS} columns")
+def checked_names(names: Sequence[str], *, place: str) -> list[str]:
+    """Return headings without quotes; an empty one becomes its number.
+
+    Raises
+    ------
+    SubmissionError : too many, too long, or one stands twice; begins with `place`.
+    """
+    if len(names) > MOST_COLUMNS:
+        raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
     if (longest := max(map(len, names), default=0)) > _LONGEST_HEADING:
         raise SubmissionError(
-            f"{source} line {line}: a heading of {longest:,} characters, at most "
-            f"{_LONGEST_HEADING} are read"
+            f"{place}: a heading of {longest:,} characters, at most {_LONGEST_HEADING} are read"
         )
-    clean = [name.strip(_QUOTES) or str(i) for i, name in enumerate(names, start=1)]
+    clean = [name.strip(QUOTES) or str(i) for i, name in enumerate(names, start=1)]
     clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
     seen: set[str] = set()
     for name in clean:
         if name.casefold() in seen:
-            raise SubmissionError(f"{source} line {line}: the heading {name[:40]!r} stands twice")
+            raise SubmissionError(f"{place}: the heading {name[:40]!r} stands twice")
         seen.add(name.casefold())
     return clean
 
@@ -201,8 +213,8 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
             f"{source} line {lines[0]}: expected {len(heading)} columns "
             f"as in the heading, found {width}"
         )
-    names = _checked_names(
-        heading or [str(i) for i in range(1, width + 1)], source=source, line=heading_line
+    names = checked_names(
+        heading or [str(i) for i in range(1, width + 1)], place=f"{source} line {heading_line}"
     )
     notes = []
     cut = None
@@ -216,8 +228,8 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
                 "two records pasted together"
             )
         notes.append(f"text after line {line} is not data and was not read")
-    return _table(
-        _parse(rows, lines, split=str.split, names=names, source=source),
+    return make_table(
+        parse_rows(rows, lines, split=str.split, names=names, source=source),
         form="ecp",
         typed=typed,
         cut=cut,
@@ -288,19 +300,20 @@ def _delimited(text: str, source: str) -> FileTable:
         )
     heading, first = _heading(lines, start, layout)
     typed = layout.fields(lines[first][1])
-    names = _checked_names(
-        heading or [str(i) for i in range(1, len(typed) + 1)], source=source, line=lines[start][0]
+    names = checked_names(
+        heading or [str(i) for i in range(1, len(typed) + 1)],
+        place=f"{source} line {lines[start][0]}",
     )
-    rows = _parse(
+    rows = parse_rows(
         [line for _, line in lines[first:]],
         [number for number, _ in lines[first:]],
         split=layout.split,
         names=names,
         source=source,
     )
-    return _table(
+    return make_table(
         rows,
-        form="bench_log" if _is_bench_log(names) else "csv",
+        form="bench_log" if is_bench_log(names) else "csv",
         typed=typed if len(typed) == len(names) else [""] * len(names),
         cut=None,
     )
@@ -321,15 +334,22 @@ def _heading(
         return (names if len(names) == width else None), start
     names = layout.fields(lines[start][1])
     if start + 2 < len(lines):
-        units = [unit.strip(' ()[]"') for unit in layout.fields(lines[start + 1][1])]
-        words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in units)
-        if words and len(units) == len(names) and units != names:
-            named = zip(names, units, strict=True)
-            return [f"{name.strip(_QUOTES)} [{unit}]" for name, unit in named], start + 2
+        united = with_units(names, layout.fields(lines[start + 1][1]))
+        if united is not None:
+            return united, start + 2
     return names, start + 1
 
 
-def _is_bench_log(names: Sequence[str]) -> bool:
+def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
+    """Return headings with the units below them, "time [ms]"; None where those are no units."""
+    bare = [unit.strip(' ()[]"') for unit in units]
+    words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in bare)
+    if not words or len(bare) != len(names) or bare == list(names):
+        return None
+    return [f"{name.strip(QUOTES)} [{unit}]" for name, unit in zip(names, bare, strict=True)]
+
+
+def is_bench_log(names: Sequence[str]) -> bool:
     """Return whether it is the bench's own log.
 
     ECP headings, but no commanded position and no brackets.
@@ -356,9 +376,9 @@ def _sniff(sample: Sequence[str]) -> _Layout | None:
             )
             layout = _Layout(delimiter, decimal_comma, has_heading=False, trailing=trailing)
             split = list(map(layout.split, sample))
-            has_heading = not all(map(_is_number, split[0]))
+            has_heading = not all(map(is_number, split[0]))
             width = len(split[0])
-            numeric = [len(row) for row in split[has_heading:] if all(map(_is_number, row))]
+            numeric = [len(row) for row in split[has_heading:] if all(map(is_number, row))]
             # One column only if nothing else fits; numbers under a heading of another width only to
             # report it.
             score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)

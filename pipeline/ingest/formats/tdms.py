@@ -1,0 +1,288 @@
+"""National Instruments' binary form (.tdms): the group of channels that is the recording.
+
+npTDMS reads it. A hostile file could keep it busy for hours. So the lengths before each segment are
+added up first: objects times segments, and bytes of metadata. Layout:
+"TDMS File Format Internal Structure", National Instruments.
+"""
+
+import logging
+import re
+import struct
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from itertools import islice
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.arrays import Array
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats.labview import even_times, with_unit
+from pipeline.ingest.formats.table import FileTable, Variable, not_read, refuse_unusable
+from pipeline.ingest.formats.text import checked_names
+from pipeline.words.numbers import first_few
+
+if TYPE_CHECKING:
+    from nptdms import TdmsChannel
+
+_LEAD_IN = 28  # bytes
+_METADATA, _NEW_LIST, _BIG_ENDIAN = 0x2, 0x4, 0x40  # flags of a segment
+_MOST_METADATA = 10_000_000  # bytes
+_MOST_OBJECTS = 1_000
+_MOST_VISITS = 2_000_000  # each segment looks at each object
+_MOST_VALUES, _MOST_CHUNKS = 5_000_000, 200_000
+_SETTING = 0.1  # of the longest channel, as in a .mat file
+_MOST_NAMED = 8
+_TIME = re.compile(r"\s*(elapsed[ _])?(t|times?|time[ _]?stamps?)\s*([\[(].*)?", re.IGNORECASE)
+
+
+def is_tdms(raw: bytes) -> bool:
+    """Tell a .tdms file by the tag of its first segment."""
+    return raw.startswith(b"TDSm")
+
+
+def read_tdms(raw: bytes, *, source: str) -> FileTable:
+    """Read the channels of the one group that holds a recording.
+
+    Raises
+    ------
+    SubmissionError : broken, cut short, or no recording in it, or several.
+    """
+    _refuse_endless(raw, source=source)
+    channels = _read_channels(raw, source=source)
+    group, read = _recording(channels, source=source)
+    longest = max(channel.samples for channel in read)
+    variables = tuple(
+        Variable(
+            name=f"{channel.group}/{channel.name}",
+            size=(channel.samples, 1),
+            kind=channel.kind,
+            read=channel in read,
+            advice=_advice(channel, longest=longest),
+        )
+        for channel in channels
+    )
+    names = [channel.heading for channel in read]
+    columns = [channel.numbers for channel in read]
+    if not any(_TIME.fullmatch(channel.name) for channel in read):
+        interval, start = _clock(read, source=source)
+        if interval:
+            names.insert(0, "time")
+            columns.insert(0, even_times(longest, start=start, interval=interval))
+    names = checked_names(names, place=f"{source} group {group!r}")
+    values = np.array(columns, dtype=np.float64)
+    refuse_unusable(values, names=names, place=lambda row: f"{source} sample {row + 1}")
+    return FileTable(
+        source=source,
+        form="tdms",
+        names=tuple(names),
+        values=values,
+        whole=tuple(bool((column == np.round(column)).all()) for column in values),
+        lines=None,
+        notes=tuple(not_read([variable for variable in variables if not variable.read])),
+        variables=variables,
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Channel:
+    """A channel: its numbers, or None and what it holds instead; its unit and clock, if stated."""
+
+    group: str
+    name: str
+    kind: str
+    samples: int
+    values: Array | None
+    unit: str
+    interval: float
+    start: float
+
+    @property
+    def numbers(self) -> Array:
+        """Its numbers, where it has any."""
+        assert self.values is not None
+        return self.values
+
+    @property
+    def heading(self) -> str:
+        """Its name and unit."""
+        return with_unit(self.name, self.unit)
+
+
+# -------------------------------------------------------------------- what npTDMS may be asked
+
+
+def _refuse_endless(raw: bytes, *, source: str) -> None:
+    """Refuse a file that is cut short, or takes npTDMS longer than any recording.
+
+    Raises
+    ------
+    SubmissionError : so it is.
+    """
+    at = named = objects = visits = metadata = 0
+    while at < len(raw):
+        if raw[at : at + 4] != b"TDSm" or at + _LEAD_IN > len(raw):
+            raise SubmissionError(f"{source}: broken at byte {at:,}, where a segment should begin")
+        (flags,) = struct.unpack_from("<I", raw, at + 4)
+        order = ">" if flags & _BIG_ENDIAN else "<"
+        length, data = struct.unpack_from(f"{order}QQ", raw, at + 12)
+        end = at + _LEAD_IN + length
+        if end > len(raw):  # also where LabVIEW never wrote the length
+            raise SubmissionError(
+                f"{source}: the segment at byte {at:,} is not whole: the file was cut short, or "
+                "copied while LabVIEW was writing it"
+            )
+        if flags & _METADATA and end >= at + _LEAD_IN + 4:
+            (named,) = struct.unpack_from(f"{order}I", raw, at + _LEAD_IN)
+            objects = named + (0 if flags & _NEW_LIST else objects)
+            metadata += data
+            visits += named
+        visits += objects
+        if named > _MOST_OBJECTS or visits > _MOST_VISITS or metadata > _MOST_METADATA:
+            raise SubmissionError(
+                f"{source}: in too many pieces, or of too many channels; keep one recording and "
+                "write it again with TDMS Defragment in LabVIEW"
+            )
+        at = end
+
+
+def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
+    """Return the channels of a file.
+
+    Raises
+    ------
+    SubmissionError : npTDMS fails, or complains of what it read.
+    """
+    from nptdms import TdmsFile
+
+    channels: list[_Channel] = []
+    with _complaints() as said:
+        try:
+            with TdmsFile.open(BytesIO(raw)) as file:
+                values = sum(len(one) for group in file.groups() for one in group.channels())
+                chunks = islice(file.data_chunks(), _MOST_CHUNKS + 1) if values else ()
+                large = values > _MOST_VALUES or sum(1 for _ in chunks) > _MOST_CHUNKS
+            if not large:
+                file = TdmsFile.read(BytesIO(raw))
+                channels = [_channel(one) for group in file.groups() for one in group.channels()]
+        except Exception:  # whatever it stumbles on
+            raise SubmissionError(f"{source}: the .tdms file is broken or cut short") from None
+    if large:
+        raise SubmissionError(
+            f"{source}: holds more than {_MOST_VALUES:,} numbers, or {_MOST_CHUNKS:,} pieces; "
+            "keep one recording"
+        )
+    if said:
+        raise SubmissionError(f"{source}: the .tdms file is damaged ({said[0][:100]})")
+    return channels
+
+
+def _channel(one: "TdmsChannel") -> _Channel:
+    values, kind = np.asarray(one[:]), str(one.dtype)
+    if values.dtype.kind == "M":
+        start = values[0] if values.size else None
+        values = (values - start) / np.timedelta64(1, "s") if values.size else values
+        kind = "times"
+    is_number = values.dtype.kind in "biuf" and values.ndim == 1
+    said = one.properties
+    return _Channel(
+        group=_printable(one.group_name),
+        name=_printable(one.name),
+        kind=kind if is_number else "no numbers",
+        samples=values.size,
+        values=values.astype(np.float64) if is_number else None,
+        unit="s" if kind == "times" else _printable(str(said.get("unit_string", ""))),
+        interval=_number(said.get("wf_increment")),
+        start=_number(said.get("wf_start_offset")),
+    )
+
+
+def _printable(text: str) -> str:
+    return text if text.isprintable() else repr(text)[1:-1]
+
+
+def _number(said: object) -> float:
+    """Return a property that is a finite number; 0 for any other."""
+    known = isinstance(said, float | int | np.number) and bool(np.isfinite(said))
+    return float(said) if known else 0.0  # type: ignore[arg-type]
+
+
+@contextmanager
+def _complaints() -> Iterator[list[str]]:
+    """Collect what npTDMS would only log: that it reads less than the file should hold."""
+    from nptdms.log import log_manager
+
+    log_manager.console_handler.setLevel(logging.CRITICAL)
+    heard = _Listener()
+    logger = logging.getLogger("nptdms")
+    logger.addHandler(heard)
+    try:
+        yield heard.said
+    finally:
+        logger.removeHandler(heard)
+
+
+class _Listener(logging.Handler):
+    """What is logged in this thread, from warnings on."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.said: list[str] = []
+        self._thread = threading.get_ident()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.thread == self._thread:
+            self.said.append(record.getMessage())
+
+
+# ----------------------------------------------------------------------- what the recording is
+
+
+def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[_Channel]]:
+    """Return the group that is the recording, and its channels; short ones are settings.
+
+    Raises
+    ------
+    SubmissionError : no recording, several, or channels of different lengths.
+    """
+    signals = [one for one in channels if one.values is not None and one.samples > 1]
+    if not signals:
+        found = first_few([f"{one.group}/{one.name}" for one in channels], _MOST_NAMED)
+        raise SubmissionError(f"{source}: holds no channel of numbers, but {found or 'nothing'}")
+    longest = max(one.samples for one in signals)
+    signals = [one for one in signals if one.samples > _SETTING * longest]
+    groups = list(dict.fromkeys(one.group for one in signals))
+    if len(groups) > 1:
+        shown = first_few([repr(group) for group in groups], _MOST_NAMED)
+        raise SubmissionError(f"{source}: holds several recordings, the groups {shown}; keep one")
+    if any(one.samples < longest for one in signals):
+        sizes = first_few([f"{one.name} ({one.samples:,})" for one in signals], _MOST_NAMED)
+        raise SubmissionError(f"{source}: the channels differ in length: {sizes}")
+    return groups[0], signals
+
+
+def _advice(channel: _Channel, *, longest: int) -> str:
+    """Return what to do for a channel that may belong to the recording and is not read."""
+    if channel.values is not None or channel.samples < longest:
+        return ""
+    return "if it is a signal, write it as numbers"
+
+
+def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
+    """Return the interval and the first time (s) that channels state; 0 without any.
+
+    Raises
+    ------
+    SubmissionError : not the same for all.
+    """
+    stated = {(one.interval, one.start) for one in channels if one.interval > 0}
+    if len(stated) > 1:
+        shown = first_few([f"{interval:g} s" for interval, _ in sorted(stated)], _MOST_NAMED)
+        raise SubmissionError(
+            f"{source}: the channels were sampled at different times (wf_increment {shown}); "
+            "keep those of one rate"
+        )
+    return stated.pop() if stated else (0.0, 0.0)

@@ -1,0 +1,408 @@
+"""The cells of an Excel workbook (.xlsx), with the standard library alone.
+
+A workbook of 2 kB may name two cells a million rows apart, or a billion texts; readers that reserve
+room for what is declared end the whole process. Here nothing declared is believed: parts are
+inflated and parsed piece by piece, and what comes out is counted. Layout: ECMA-376-1, chapter 18.
+"""
+
+import posixpath
+import re
+import struct
+import zipfile
+import zlib
+from array import array
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from io import BytesIO
+from xml.parsers import expat
+
+from pipeline.errors import SubmissionError
+
+_MOST_BYTES = 200_000_000  # of all parts, inflated
+_MOST_ELEMENTS = 6_000_000  # two a cell
+_MOST_CELLS, _MOST_TEXTS = 2_000_000, 500_000
+_MOST_DIRECTORY = 1_000_000  # bytes of the archive's table of contents
+_MOST_SHEETS = 250
+_MOST_ROWS, _MOST_COLUMNS = 1_048_576, 16_384  # of any sheet
+_CHUNK = 1 << 18
+_LONGEST_TOKEN = 1_000_000  # bytes; expat starts again at a tag's beginning until it is whole
+_DEEPEST = 60  # elements in elements
+_LONGEST_TEXT = 200  # characters kept of a cell
+_REFERENCE = re.compile(r"([A-Z]{1,3})([1-9]\d{0,6})")
+_NO_VALUE = "a formula without its value: open the file in a spreadsheet program and save it again"
+
+# Formats of numbers (18.8.30): those with a number of their own, then what a code says.
+_PERCENTS = {9, 10}
+_DATES = {14, 15, 16, 17, 22, *range(27, 37), *range(50, 59)}
+_TIMES = {18, 19, 20, 21, 45, 46, 47}
+_NO_CODE = re.compile(r'"[^"]*"|\\.|_.|\*.|\[(?![hms]+\])[^\]]*\]', re.IGNORECASE | re.DOTALL)
+
+
+class _Broken(Exception):
+    """What no spreadsheet program writes."""
+
+
+@dataclass(kw_only=True)
+class Cells:
+    """The cells of a sheet that hold something, in the order of the file.
+
+    Attributes
+    ----------
+    rows, columns : from 1, of the numbers in `values`; `looks`: their formats, see `Book.looks`.
+    texts : by (row, column).
+    wrong : by (row, column): contents that cannot be a measurement.
+    merged : for the cells of a merged range: its first cell, by (row, column).
+    """
+
+    rows: array = field(default_factory=lambda: array("l"))
+    columns: array = field(default_factory=lambda: array("l"))
+    values: array = field(default_factory=lambda: array("d"))
+    looks: array = field(default_factory=lambda: array("l"))
+    texts: dict[tuple[int, int], str] = field(default_factory=dict)
+    wrong: dict[tuple[int, int], str] = field(default_factory=dict)
+    merged: dict[tuple[int, int], tuple[int, int]] = field(default_factory=dict)
+
+
+class Book:
+    """An open workbook.
+
+    Attributes
+    ----------
+    sheets : the part of each worksheet, by name, in their order.
+    looks : "", "percent", "time" or "date", by the number of a format.
+
+    Raises
+    ------
+    SubmissionError : no workbook, broken, locked or too large.
+    """
+
+    def __init__(self, raw: bytes, *, source: str) -> None:
+        self._source = source
+        self._bytes, self._elements = _MOST_BYTES, _MOST_ELEMENTS
+        self._texts: list[str] | None = None
+        with _reported(source):
+            self._archive = zipfile.ZipFile(_Bounded(raw))
+            self._members = {info.filename: info for info in self._archive.infolist()}
+            if len(self._members) < len(self._archive.infolist()):
+                raise _Broken("two parts of one name")
+            self._open()
+
+    def _open(self) -> None:
+        office = [target for kind, target in self._related("").values() if kind == "officeDocument"]
+        main = office[0] if office else "xl/workbook.xml"
+        if not main.startswith("xl/") or main not in self._members:
+            raise SubmissionError(
+                f"{self._source}: no Excel workbook; save its table as .xlsx or CSV"
+            )
+        related = self._related(main)
+        named: list[tuple[str, str]] = []
+
+        def sheet(name: str, attributes: dict[str, str]) -> None:
+            if name == "sheet":
+                bare = {key.rpartition(":")[2]: value for key, value in attributes.items()}
+                named.append((bare.get("name", "")[:_LONGEST_TEXT], bare.get("id", "")))
+
+        self._parse(main, start=sheet)
+        if len(named) > _MOST_SHEETS:
+            raise _Broken("more sheets than any workbook has")
+        parts = [(name, *related.get(target, ("", ""))) for name, target in named]
+        self.sheets = {name: part for name, kind, part in parts if kind == "worksheet"}
+        one_of = {kind: part for kind, part in related.values()}
+        self._shared = one_of.get("sharedStrings", "")
+        self.looks = self._read_looks(one_of["styles"]) if "styles" in one_of else [""]
+
+    def _related(self, part: str) -> dict[str, tuple[str, str]]:
+        """Return (kind, part) of what a part refers to in this archive, by its id there."""
+        folder, name = posixpath.split(part)
+        listed = posixpath.join(folder, "_rels", f"{name}.rels")
+        found: dict[str, tuple[str, str]] = {}
+
+        def relation(name: str, attributes: dict[str, str]) -> None:
+            if name != "Relationship" or attributes.get("TargetMode") == "External":
+                return
+            kind = attributes.get("Type", "").rpartition("/")[2]
+            target = posixpath.normpath(posixpath.join("/", folder, attributes.get("Target", "")))
+            found[attributes.get("Id", "")] = kind, target.lstrip("/")
+
+        if listed in self._members:
+            self._parse(listed, start=relation)
+        return found
+
+    def _read_looks(self, part: str) -> list[str]:
+        codes: dict[int, str] = {}
+        looks: list[str] = []
+        within: list[str] = []
+
+        def start(name: str, attributes: dict[str, str]) -> None:
+            within.append(name)
+            if name == "numFmt":
+                codes[int(attributes["numFmtId"])] = attributes.get("formatCode", "")
+            elif name == "xf" and "cellXfs" in within:
+                number = int(attributes.get("numFmtId", 0))
+                looks.append(_look(number, codes.get(number, "")))
+
+        self._parse(part, start=start, end=lambda _: within.pop())
+        return looks or [""]
+
+    def _shared_texts(self) -> list[str]:
+        """Return the texts that cells refer to by number; read when the first one does."""
+        if self._texts is None:
+            reading = _Texts()
+            if self._shared:
+                self._parse(self._shared, start=reading.start, end=reading.end, said=reading.said)
+            self._texts = reading.texts
+        return self._texts
+
+    def has_cells(self, sheet: str) -> bool:
+        """Return whether a sheet has any filled cell."""
+        reading = _Sheet(list, most=0)
+        try:
+            self._read_sheet(sheet, reading)
+        except _Full:
+            return True
+        return False
+
+    def cells(self, sheet: str) -> Cells:
+        """Return the cells of a sheet.
+
+        Raises
+        ------
+        SubmissionError : broken, or more than any recording has.
+        """
+        reading = _Sheet(self._shared_texts, most=_MOST_CELLS)
+        try:
+            self._read_sheet(sheet, reading)
+        except _Full:
+            raise SubmissionError(
+                f"{self._source} sheet {sheet!r}: more than {_MOST_CELLS:,} cells, or "
+                f"{_MOST_TEXTS:,} texts; keep one recording, in numbers"
+            ) from None
+        return reading.cells
+
+    def _read_sheet(self, sheet: str, reading: "_Sheet") -> None:
+        with _reported(self._source):
+            self._parse(self.sheets[sheet], start=reading.start, end=reading.end, said=reading.said)
+
+    def _parse(
+        self,
+        part: str,
+        *,
+        start: Callable[[str, dict[str, str]], object],
+        end: Callable[[str], object] = lambda _: None,
+        said: Callable[[str], object] | None = None,
+    ) -> None:
+        """Parse a part; handlers get names without prefixes."""
+        if part not in self._members:
+            raise _Broken(f"the part {part} is missing")
+        depth = 0
+
+        def opened(name: str, attributes: dict[str, str]) -> None:
+            nonlocal depth
+            depth += 1
+            self._elements -= 1
+            if depth > _DEEPEST or self._elements < 0:
+                raise _Broken("too many elements")
+            start(name.rpartition(":")[2], attributes)
+
+        def closed(name: str) -> None:
+            nonlocal depth
+            depth -= 1
+            end(name.rpartition(":")[2])
+
+        def refuse(*_: object) -> None:
+            raise _Broken("a document type, which could hold entities")
+
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartDoctypeDeclHandler = refuse
+        parser.StartElementHandler, parser.EndElementHandler = opened, closed
+        parser.CharacterDataHandler = said
+        fed = 0
+        for chunk in self._inflated(part):
+            parser.Parse(chunk)
+            fed += len(chunk)
+            if fed - parser.CurrentByteIndex > _LONGEST_TOKEN:
+                raise _Broken("a tag without end")
+        parser.Parse(b"", True)
+
+    def _inflated(self, part: str) -> Iterator[bytes]:
+        info = self._members[part]
+        if info.flag_bits & 1:
+            raise SubmissionError(f"{self._source}: locked by a password; save it without one")
+        if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise _Broken("packed as no spreadsheet program does")
+        with self._archive.open(info) as file:
+            while chunk := file.read(_CHUNK):
+                self._bytes -= len(chunk)
+                if self._bytes < 0:
+                    raise _Broken("too large")
+                yield chunk
+
+
+@contextmanager
+def _reported(source: str) -> Iterator[None]:
+    """Turn whatever a broken workbook raises into one line."""
+    try:
+        yield
+    except (_Broken, zipfile.BadZipFile, zlib.error, struct.error, expat.ExpatError, EOFError,
+            LookupError, OSError, OverflowError, RuntimeError, ValueError):  # fmt: skip
+        said = f"{source}: the workbook is broken, cut short or larger than any recording"
+        raise SubmissionError(said) from None
+
+
+class _Bounded(BytesIO):
+    """Bytes of which `zipfile` may read only so many at once: the table of contents."""
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        if size is not None and size > max(_MOST_DIRECTORY, _CHUNK):
+            raise _Broken("too many parts")
+        return super().read(size)
+
+
+class _Full(Exception):
+    """More cells than are wanted."""
+
+
+class _Texts:
+    """The list of texts, each perhaps in pieces; how a Japanese word sounds is no part of it."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+        self._pieces: list[str] = []
+        self._in_text = self._in_sound = False
+
+    def start(self, name: str, _: dict[str, str]) -> None:
+        if name == "si":
+            self._pieces = []
+        elif name == "rPh":
+            self._in_sound = True
+        self._in_text = name == "t" and not self._in_sound
+
+    def said(self, text: str) -> None:
+        if self._in_text and len(self._pieces) < _LONGEST_TEXT:
+            self._pieces.append(text[:_LONGEST_TEXT])
+
+    def end(self, name: str) -> None:
+        self._in_text = False
+        if name == "rPh":
+            self._in_sound = False
+        elif name == "si":
+            self.texts.append("".join(self._pieces)[:_LONGEST_TEXT])
+            if len(self.texts) > _MOST_TEXTS:
+                raise _Broken("too many texts")
+
+
+class _Sheet:
+    """The cells of a sheet, as its elements come."""
+
+    def __init__(self, shared: Callable[[], list[str]], *, most: int) -> None:
+        self.cells = Cells()
+        self._shared, self._left = shared, most
+        self._row = self._column = 0
+        self._kind, self._look, self._formula = "n", 0, False
+        self._pieces: list[str] | None = None  # None where no value is being read
+        self._value: str | None = None
+        self._in_sound = False
+        self._numbers: dict[str, int] = {}
+
+    def start(self, name: str, attributes: dict[str, str]) -> None:
+        if name == "c":
+            self._place(attributes.get("r"))
+            self._kind = attributes.get("t", "n")
+            self._look = int(attributes.get("s", 0))
+            self._formula, self._value, self._in_sound = False, None, False
+        elif name == "v" or (name == "t" and not self._in_sound):
+            self._pieces = []
+        elif name == "f":
+            self._formula = True
+        elif name == "row":
+            self._row = int(attributes.get("r", self._row + 1))
+            self._column = 0
+        elif name == "rPh":
+            self._in_sound = True
+        elif name == "mergeCell":
+            self._merge(attributes.get("ref", ""))
+
+    def said(self, text: str) -> None:
+        if self._pieces is not None and len(self._pieces) < _LONGEST_TEXT:
+            self._pieces.append(text[:_LONGEST_TEXT])
+
+    def end(self, name: str) -> None:
+        if name == "c":
+            self._keep()
+        elif self._pieces is not None and name in ("v", "t"):
+            self._value = ((self._value or "") + "".join(self._pieces))[:_LONGEST_TEXT]
+            self._pieces = None
+        elif name == "rPh":
+            self._in_sound = False
+
+    def _place(self, reference: str | None) -> None:
+        if reference is None:
+            self._column += 1
+        else:
+            self._row, self._column = self._read(reference)
+        if not (0 < self._row <= _MOST_ROWS and 0 < self._column <= _MOST_COLUMNS):
+            raise _Broken("a cell that no sheet has")
+
+    def _read(self, reference: str) -> tuple[int, int]:
+        """Return (row, column) of "B12"."""
+        match = _REFERENCE.fullmatch(reference)
+        if match is None:
+            raise _Broken("a cell without a place")
+        letters = match[1]
+        column = self._numbers.get(letters)
+        if column is None:
+            column = 0
+            for letter in letters:
+                column = 26 * column + ord(letter) - 64
+            self._numbers[letters] = column
+        return int(match[2]), column
+
+    def _keep(self) -> None:
+        value, at = self._value, (self._row, self._column)
+        if not value and not self._formula:
+            return
+        self._left -= 1
+        if self._left < 0 or len(self.cells.texts) + len(self.cells.wrong) > _MOST_TEXTS:
+            raise _Full
+        if value is None or (not value and self._kind == "n"):
+            self.cells.wrong[at] = _NO_VALUE
+        elif self._kind == "n":
+            self.cells.rows.append(at[0])
+            self.cells.columns.append(at[1])
+            self.cells.values.append(float(value))
+            self.cells.looks.append(self._look)
+        elif self._kind == "s":
+            if text := self._shared()[int(value)].strip():
+                self.cells.texts[at] = text
+        elif self._kind in ("str", "inlineStr"):
+            if text := value.strip():
+                self.cells.texts[at] = text
+        else:  # "e" an error, "b" true or false, "d" a date in words
+            words = {"b": {"0": "FALSE", "1": "TRUE"}.get(value, value)}.get(self._kind, value)
+            self.cells.wrong[at] = f"no number: {words[:30]!r}"
+
+    def _merge(self, reference: str) -> None:
+        first, _, last = reference.partition(":")
+        (top, left), (bottom, right) = self._read(first), self._read(last or first)
+        if bottom - top < 10 and right - left < 10:  # a heading's
+            for row in range(top, bottom + 1):
+                for column in range(left, right + 1):
+                    self.cells.merged[row, column] = top, left
+        if len(self.cells.merged) > _MOST_TEXTS:
+            raise _Broken("too many merged cells")
+
+
+def _look(number: int, code: str) -> str:
+    """Return what a format makes of a number: "percent", "time", "date" or ""."""
+    bare = _NO_CODE.sub("", code).casefold()
+    if number in _PERCENTS or "%" in bare:
+        return "percent"
+    if bare == "general" or (code and not re.search(r"[ymdhs]", bare)):
+        return ""
+    if number in _DATES or re.search(r"[yd]", bare):
+        return "date"
+    if number in _TIMES or re.search(r"[hs]", bare):
+        return "time"
+    return "date" if "m" in bare else ""

@@ -1,0 +1,309 @@
+"""LabVIEW's text and National Instruments' binary files give the same numbers as any other form."""
+
+import struct
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from nptdms import ChannelObject
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats import tdms as tdms_module
+from pipeline.ingest.formats.recognise import parse_table
+from pipeline.ingest.formats.table import FileTable
+from tests.helpers.places import ROOT
+from tests.helpers.recordings import lvm, lvm_segment, tdms, tdms_of
+
+N = 40
+TIME = np.round(0.01 * np.arange(N), 2)
+X1 = np.round(3 * np.sin(20 * TIME), 4)
+U = 0.5 * np.sign(np.sin(9 * TIME))
+COLUMNS = {"time": TIME, "input": U, "x1": X1}
+
+
+def table(raw: bytes | str) -> FileTable:
+    """Read a file's bytes."""
+    return parse_table(raw.encode() if isinstance(raw, str) else raw, source="f")
+
+
+def table_or_one_line(raw: bytes) -> FileTable | None:
+    """Return the table, or None after an error of one line."""
+    try:
+        return table(raw)
+    except SubmissionError as error:
+        message = str(error)
+    assert "\n" not in message
+    return None
+
+
+# --------------------------------------------------------------------------------- .lvm
+
+GOOD = lvm(COLUMNS).decode()
+HEAD = GOOD[: GOOD.index("Channels")]
+LATER = {"time": TIME + 0.4, "input": U, "x1": X1}
+SPECIAL = "***Start_Special***\r\nWaveform\t1,2\r\n***End_Special***\r\n\r\n"
+
+
+def multi(clock: np.ndarray) -> str:
+    """Return a file with an X column for each channel, the second of these times."""
+    rows = ["\t".join(f"{v:.6f}" for v in row) for row in zip(TIME, U, clock, X1, strict=True)]
+    text = GOOD[: GOOD.index("X_Value")] + "X_Value\tinput\tX_Value\tx1\tComment\r\n"
+    return text.replace("X_Columns\tOne", "X_Columns\tMulti") + "\r\n".join(rows) + "\r\n"
+
+
+def no_times(**tags: list[str]) -> str:
+    """Return a file whose X column is empty; the header may state the interval."""
+    text = HEAD.replace("X_Columns\tOne", "X_Columns\tNo") + lvm_segment(COLUMNS, tags=tags)
+    head, names, rows = text.partition("X_Value\tinput\tx1\tComment\r\n")
+    return head + names + "\r\n".join("\t" + row.partition("\t")[2] for row in rows.splitlines())
+
+
+LVM = {
+    "tabs": GOOD,
+    "commas": lvm(COLUMNS, separator=",").decode(),
+    "decimal commas": lvm(COLUMNS, decimal=",").decode(),
+    "version 1": GOOD.replace("Decimal_Separator\t.\r\n", ""),
+    "line ends": GOOD.replace("\r\n", "\n"),
+    "special block": HEAD + SPECIAL + GOOD[len(HEAD) :],
+    "X for each channel": multi(TIME),
+    "X stated": no_times(Delta_X=["1.0E-2", "1.0E-2"]),
+    "byte-order mark": "\ufeff" + GOOD,
+}
+
+
+@pytest.mark.parametrize("content", LVM.values(), ids=LVM.keys())
+def test_every_dialect_of_lvm_gives_the_same_numbers(content):
+    """Separators, decimal marks and the three ways to write X change no number."""
+    got = table(content)
+    assert got.form == "lvm"
+    assert got.names == ("time", "input", "x1")
+    assert_allclose(got.values, [TIME, U, X1], rtol=0, atol=1e-12)
+    assert got.cut is None
+
+
+def test_units_of_the_header_go_into_the_headings():
+    """LabVIEW spells units in words."""
+    segment = lvm_segment(COLUMNS, tags={"Y_Unit_Label": ["Volts", "Millimeters"]})
+    assert table(HEAD + segment).names == ("time", "input [V]", "x1 [mm]")
+
+
+def test_segments_that_continue_each_other_are_one_recording():
+    """With a header each, or with one for all."""
+    for text in (
+        GOOD + "\r\n" + lvm_segment(LATER),
+        GOOD + "\r\n" + lvm_segment(LATER).partition("Comment\r\n")[2],
+    ):
+        got = table(text)
+        assert_allclose(got.values[0], np.r_[TIME, LATER["time"]], rtol=0, atol=1e-12)
+        assert got.lines is not None
+        assert got.lines[-1] == len(text.splitlines())
+
+
+def test_comments_beside_rows_are_said_not_read():
+    """The last column holds texts."""
+    got = table(GOOD.replace("\r\n0.010000", "\tknock\r\n0.010000"))
+    assert got.notes == ("comments beside the rows are not read",)
+    assert got.values.shape == (3, N)
+
+
+BAD_LVM = {
+    "twice": (GOOD + "\r\n" + lvm_segment(COLUMNS), r"line 66: a segment begins again at 0 s"),
+    "other channels": (
+        GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), r"line 66: other channels",
+    ),
+    "two clocks": (multi(TIME + 0.001), r"line 18: the channels were sampled at different times"),
+    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X differently for each"),
+    "no interval": (no_times(Delta_X=["a", "b"]), r"states Delta_X 'a, b', which is no number"),
+    "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is no number: '0.03x'"),
+    "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), r"line 22: 'input' is empty"),
+    "text between": (GOOD.replace("\r\n0.03", "\r\nhere\r\n0.03"), r"line 22: expected 3 columns"),
+    "no end of header": (GOOD.replace("***End_of_Header***", ""), r"line 1: the header .* no \*"),
+    "no end of special": (
+        HEAD + "***Start_Special***\r\n" + GOOD[len(HEAD) :], r"line 13: the special block",
+    ),
+    "no rows": (GOOD[: GOOD.index("0.000000\t")], r"holds no rows of numbers"),
+    "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), r"ends behind the header"),
+    "unknown X": (GOOD.replace("X_Columns\tOne", "X_Columns\tTwo"), r"X_Columns is 'two'"),
+    "infinite": (GOOD.replace("0.030000", "inf"), r"line 22: 'time' is not a finite number"),
+    "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), r"the heading 'x1' stands twice"),
+    "wide": (
+        lvm({f"c{i}": TIME for i in range(70)}), r"more than 64 columns",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("content", "said"), BAD_LVM.values(), ids=BAD_LVM.keys())
+def test_a_broken_lvm_names_its_line(content, said):
+    """One line, never a part of the recording in silence."""
+    with pytest.raises(SubmissionError, match=said) as caught:
+        table(content)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_lvm_cut_short_is_known_even_between_two_rows():
+    """The header says how many samples there are."""
+    got = table(GOOD[: GOOD.index("0.300000")])
+    assert got.cut is not None
+    assert "30 of 40 samples" in got.cut
+    assert "expected 3 columns" in (table(GOOD[:-12]).cut or "")
+
+
+@given(st.integers(0, len(GOOD) - 1))
+def test_any_piece_of_an_lvm_is_cut_or_refused(end):
+    """Of a file cut anywhere before its last row, no table comes without a word."""
+    got = table_or_one_line(GOOD[:end].encode())
+    assert got is None or got.cut or got.values.shape[1] == N
+
+
+# --------------------------------------------------------------------------------- .tdms
+
+
+def channel(name: str, values: np.ndarray, group: str = "run", **properties: Any) -> ChannelObject:
+    """Return a channel to be written."""
+    return ChannelObject(group, name, values, properties=properties)
+
+
+CLOCK: dict[str, Any] = {"wf_increment": 0.01, "wf_start_offset": 0.0}
+START = np.datetime64("2026-01-05T12:00:00", "ns")
+TDMS = {
+    "one segment": tdms_of(COLUMNS),
+    "two segments": tdms(*[
+        [channel(name, values[part]) for name, values in COLUMNS.items()]
+        for part in (slice(0, 15), slice(15, None))
+    ]),
+    "interval": tdms([channel("input", U, **CLOCK), channel("x1", X1, wf_increment=0.01)]),
+    "stamps": tdms([
+        channel("time", START + np.round(1e9 * TIME).astype("m8[ns]")),
+        channel("input", U), channel("x1", X1),
+    ]),
+    "settings": tdms([
+        *(channel(name, values) for name, values in COLUMNS.items()),
+        channel("gains", np.array([1.0, 2.0])), channel("by", np.array(["me"])),
+        channel("gain", np.array([1.0, 3.0]), group="settings"),
+    ]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("raw", TDMS.values(), ids=TDMS.keys())
+def test_every_tdms_gives_the_same_numbers(raw):
+    """Segments, waveforms without a time channel and time stamps change no number."""
+    got = table(raw)
+    assert got.form == "tdms"
+    assert [name.removesuffix(" [s]") for name in got.names] == ["time", "input", "x1"]
+    assert_allclose(got.values, [TIME, U, X1], rtol=0, atol=1e-9)
+
+
+def test_what_a_tdms_holds_besides_is_said():
+    """Short channels and texts are named with their sizes; units go into the headings."""
+    got = table(TDMS["settings"])
+    assert got.notes == (
+        "not read: run/gains, settings/gain (2 × 1, float64), run/by (1 × 1, no numbers)",
+    )
+    assert [one.read for one in got.variables] == [True, True, True, False, False, False]
+    unit: dict[str, Any] = {"unit_string": "Volts"}
+    assert table(tdms([channel("t", TIME), channel("u", U, **unit)])).names == ("t", "u [V]")
+
+
+GOOD_TDMS = tdms_of(COLUMNS)
+COUNT = struct.pack("<Q", N)
+
+
+def lead_in(flags: int, length: int, data: int) -> bytes:
+    """Return what stands before a segment."""
+    return b"TDSm" + struct.pack("<IIQQ", flags, 4712, length, data)
+
+
+def objects(*named: tuple[str, int]) -> bytes:
+    """Return metadata: paths and, above 0, how many doubles each has in a chunk."""
+    body = struct.pack("<I", len(named))
+    for path, count in named:
+        body += struct.pack("<I", len(path)) + path.encode()
+        body += struct.pack("<IIIQ", 20, 10, 1, count) if count else b"\xff" * 4
+        body += bytes(4)
+    return body
+
+
+MANY = objects(*[(f"/'g'/'{i}'", 0) for i in range(900)])
+TINY = objects(("/'g'/'t'", 1), ("/'g'/'x1'", 1))
+BAD_TDMS = {
+    "cut": (GOOD_TDMS[:-1], r"the segment at byte 0 is not whole: the file was cut short"),
+    "cut in the lead-in": (GOOD_TDMS[:20], r"broken at byte 0"),
+    "cut in the next": (GOOD_TDMS + GOOD_TDMS[:99], r"the segment at byte 1,145 is not whole"),
+    "never closed": (
+        GOOD_TDMS[:12] + b"\xff" * 8 + GOOD_TDMS[20:], r"copied while LabVIEW was writing it",
+    ),
+    "junk behind": (GOOD_TDMS + b"junk" * 9, r"broken at byte \d+"),
+    "absurd length": (lead_in(6, 2**60, 2**60) + bytes(99), r"the segment at byte 0 is not whole"),
+    "absurd count": (GOOD_TDMS.replace(COUNT, struct.pack("<Q", 2**60)), r"damaged|broken"),
+    "negative data": (lead_in(14, 50, 2**63) + bytes(50), r"too many pieces|broken"),
+    "fewer values than bytes": (GOOD_TDMS.replace(COUNT, struct.pack("<Q", 33)), r"damaged"),
+    "a million objects": (
+        lead_in(6, 8, 8) + struct.pack("<II", 10**6, 0), r"in too many pieces",
+    ),
+    "objects times segments": (
+        lead_in(6, len(MANY), len(MANY)) + MANY + lead_in(0, 0, 0) * 9_000, r"too many pieces",
+    ),
+    "empty segments": (lead_in(0, 0, 0) * 9, r"broken"),
+    "lengths": (tdms([channel("t", TIME), channel("x1", X1[:30])]), r"differ in length: t \(40\)"),
+    "two groups": (
+        tdms([channel("t", TIME), channel("t", TIME, group="b")]),
+        r"several recordings, the groups 'b', 'run'; keep one",
+    ),
+    "two rates": (
+        tdms([channel("u", U, wf_increment=0.1), channel("x1", X1, wf_increment=0.2)]),
+        r"wf_increment 0.1 s, 0.2 s",
+    ),
+    "no numbers": (tdms([channel("by", np.array(["me"] * 9))]), r"no channel of numbers, but run/"),
+    "nan": (tdms([channel("t", TIME), channel("x1", X1 * np.nan)]), r"sample 1: 'x1' is not a fin"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("raw", "said"), BAD_TDMS.values(), ids=BAD_TDMS.keys())
+def test_a_broken_tdms_is_one_line(raw, said, capfd):
+    """A file that npTDMS would read in part, with a line in a log, is refused."""
+    with pytest.raises(SubmissionError, match=said) as caught:
+        table(raw)
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_tdms_in_tiny_pieces_is_read_up_to_a_limit(monkeypatch):
+    """One value a piece is slow; past a number of pieces the file is refused."""
+    data = np.arange(200.0).tobytes()
+    raw = lead_in(14, len(TINY) + len(data), len(TINY)) + TINY + data
+    assert_array_equal(table(raw).values, np.arange(200.0).reshape(100, 2).T)
+    monkeypatch.setattr(tdms_module, "_MOST_CHUNKS", 99)
+    with pytest.raises(SubmissionError, match="or 99 pieces"):
+        table(raw)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, len(GOOD_TDMS) - 1), st.binary(min_size=1, max_size=8)),
+        min_size=1, max_size=4,
+    )
+)  # fmt: skip
+def test_a_damaged_tdms_is_a_table_or_one_line(hits):
+    """After damage anywhere, the file is a table or one line of error."""
+    raw = bytearray(GOOD_TDMS)
+    for at, junk in hits:
+        raw[at : at + len(junk)] = junk
+    table_or_one_line(bytes(raw))
+
+
+def test_other_forms_do_not_load_the_readers():
+    """Who grades text files pays for no other reader."""
+    code = (
+        "import sys; from pipeline.ingest.formats.recognise import parse_table; "
+        "parse_table(b'time,x1\\n0,1\\n1,2\\n', source='a'); "
+        "print(*[m for m in ('nptdms', 'h5py', 'openpyxl') if m in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.split() == []

@@ -1,0 +1,402 @@
+"""A recording in an Excel workbook is read as people make them; a broken one is one clear line."""
+
+import datetime as dt
+import re
+import tracemalloc
+from collections.abc import Callable
+from io import BytesIO
+
+import numpy as np
+import openpyxl
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+
+from pipeline.errors import SubmissionError
+from pipeline.ingest.formats import workbook_cells
+from pipeline.ingest.formats.recognise import parse_table
+from pipeline.ingest.formats.table import FileTable
+from tests.helpers.recordings import package, saved, sheet_xml, xlsx
+
+N = 40
+TIME = np.round(0.01 * np.arange(N), 2)
+X1 = np.round(3 * np.sin(20 * TIME), 4)
+U = 0.5 * np.sign(np.sin(9 * TIME))
+ROWS = [[float(v) for v in row] for row in zip(TIME, U, X1, strict=True)]
+HEADINGS = ["time", "input", "x1"]
+
+
+def table(raw: bytes) -> FileTable:
+    """Read a workbook's bytes."""
+    return parse_table(raw, source="f.xlsx")
+
+
+def sheet(fill: Callable[..., object]) -> bytes:
+    """Return a workbook whose first sheet is filled by a function."""
+    book = openpyxl.Workbook()
+    fill(book.active)
+    return saved(book)
+
+
+def plain(ws) -> None:
+    """Fill a sheet as a program would export it."""
+    for row in (HEADINGS, *ROWS):
+        ws.append(row)
+
+
+def changed(**cells: object) -> bytes:
+    """Return the plain workbook with other contents of some cells."""
+
+    def fill(ws) -> None:
+        plain(ws)
+        for at, value in cells.items():
+            ws[at] = value
+
+    return sheet(fill)
+
+
+def titled(ws) -> None:
+    """Fill a sheet as a person does: a title over columns, settings, units, empty rows, a note."""
+    ws["A1"] = "Bench 4, run 3"
+    ws.merge_cells("A1:C1")
+    ws["A2"], ws["B2"] = "mass of the cart", 2.5
+    for column, (name, unit) in enumerate(zip(HEADINGS, ["s", "(V)", "[cm]"], strict=True), 1):
+        ws.cell(5, column, name)
+        ws.cell(6, column, unit)
+    for row, values in enumerate(ROWS, 8):
+        for column, value in enumerate(values, 1):
+            ws.cell(row, column, value)
+    ws["H9"], ws["H10"] = "maximum", 0.5
+    ws["A60"] = "measured on Monday"
+
+
+def typed(ws) -> None:
+    """Fill a sheet with numbers as text, some with decimal commas."""
+    ws.append(HEADINGS)
+    for t, u, x in ROWS:
+        ws.append([f"{t:.2f}".replace(".", ","), u, f" {x} "])
+
+
+def merged(ws) -> None:
+    """Fill a sheet with a heading over two rows and one over two columns."""
+    ws["A1"], ws["B1"], ws["B2"], ws["C2"] = "time", "signals", "input", "x1"
+    ws.merge_cells("A1:A2")
+    ws.merge_cells("B1:C1")
+    for row in ROWS:
+        ws.append(row)
+
+
+def scattered(ws) -> None:
+    """Fill a sheet with an empty row behind each sample, and its columns apart."""
+    for at, row in enumerate([HEADINGS, *ROWS]):
+        for column, value in zip((2, 4, 7), row, strict=True):
+            ws.cell(3 + 2 * at, column, value)
+
+
+def remarked(ws) -> None:
+    """Fill a sheet with remarks beside some samples."""
+    ws.append([*HEADINGS, "remark"])
+    for i, row in enumerate(ROWS):
+        ws.append([*row, "knock" if i % 5 == 3 else None])
+
+
+SHEETS = {
+    "as exported": plain, "as typed": titled, "text": typed, "merged": merged,
+    "scattered": scattered, "remarks": remarked,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fill", SHEETS.values(), ids=SHEETS.keys())
+def test_every_sheet_gives_the_same_numbers(fill):
+    """Titles, units, empty rows, merged headings, text and remarks change no number."""
+    got = table(sheet(fill))
+    assert [re.sub(r" \[.*", "", name) for name in got.names] == HEADINGS
+    assert_array_equal(got.values, [TIME, U, X1])
+    assert got.form == "workbook"
+    assert got.cut is None
+
+
+def test_what_is_not_read_is_said():
+    """Rows and columns beside the recording, numbers in text and their comma are in the notes."""
+    got = table(sheet(titled))
+    assert got.names == ("time [s]", "input [V]", "x1 [cm]")
+    assert got.notes == ("not read: rows 1, 2, 60 and column H of the sheet",)
+    assert got.place(0) == "row 8"
+    (said,) = table(sheet(typed)).notes
+    assert said == (
+        "80 numbers that are kept as text were read; the comma in '0,00' is taken as a decimal mark"
+    )
+
+
+def test_the_first_sheet_with_headings_is_read():
+    """Sheets before and behind it are named; empty ones are not."""
+    book = openpyxl.Workbook()
+    assert book.active is not None
+    book.active["A1"] = "plan of the afternoon"
+    plain(book.create_sheet("Run 1"))
+    plain(book.create_sheet("Run 2"))
+    book.create_sheet("Empty")
+    got = table(saved(book))
+    assert_array_equal(got.values, [TIME, U, X1])
+    (said,) = got.notes
+    assert "'Sheet', 'Run 2'; save" in said
+    assert "Empty" not in said
+
+
+def test_a_bench_log_in_a_workbook_is_a_bench_log():
+    """Opened in Excel and saved, the log still holds duty counts."""
+    columns = {"Sample": np.arange(N), "Time": TIME, "Encoder 1 Pos": X1, "Control Effort": U}
+    assert table(xlsx(columns)).form == "bench_log"
+
+
+def test_dates_and_times_of_day_become_seconds():
+    """Dates start at 0, times of day keep their hour; the heading gets the right unit."""
+    begin = dt.datetime.fromisoformat("2026-01-05 12:00")
+
+    def dates(ws) -> None:
+        ws.append(["Time (ms)", "x1"])
+        for t, _, x in ROWS:
+            ws.append([begin + dt.timedelta(seconds=t), x])
+
+    def times(ws) -> None:
+        ws.append(["Time", "x1"])
+        for t, _, x in ROWS:
+            ws.append([(begin + dt.timedelta(seconds=t)).time(), x])
+
+    got = table(sheet(dates))
+    assert got.names[0] == "Time [s]"
+    assert_array_equal(got.values[0], TIME)
+    assert_array_equal(table(sheet(times)).values[0], 43_200 + TIME)
+
+
+def test_percent_is_read_as_kept_and_said():
+    """50 % is the number 0.5 in a workbook."""
+
+    def fill(ws) -> None:
+        plain(ws)
+        for row in range(2, N + 2):
+            ws.cell(row, 2).number_format = "0.0%"
+
+    got = table(sheet(fill))
+    assert_array_equal(got.values[1], U)
+    assert got.notes == ("'input' is shown in percent, but read as it is kept: 50 % as 0.5",)
+
+
+@pytest.mark.parametrize(
+    "code",
+    ["General", "0.000", '0.0" s"', "[Red]0.0", r"0.0\ \d", "#,##0.00 [$€-407]", "0.00E+00", "@"],
+)
+def test_a_format_that_is_no_date_changes_nothing(code):
+    """Letters in quotes, colours and currencies make no date."""
+
+    def fill(ws) -> None:
+        plain(ws)
+        for row in range(2, N + 2):
+            ws.cell(row, 3).number_format = code
+
+    assert_array_equal(table(sheet(fill)).values[2], X1)
+
+
+BAD = {
+    "empty": (changed(C7=None), r"sheet 'Sheet' cell C7: 'x1' is empty"),
+    "text": (changed(C7="stuck"), r"cell C7: 'x1' is no number: 'stuck'"),
+    "thousands": (changed(C7="1,234,5"), r"cell C7: 'x1' is no number"),
+    "nan": (changed(C7="nan"), r"cell C7: 'x1' is no number"),
+    "fault": (changed(C7="#DIV/0!"), r"cell C7: 'x1' is no number: '#DIV/0!'"),
+    "truth": (changed(C7=True), r"cell C7: 'x1' is no number: 'TRUE'"),
+    "formula": (changed(C7="=A2+1"), r"cell C7: 'x1' is a formula without its value: open"),
+    "formulas": (
+        changed(**{f"C{i}": "=A2" for i in range(2, N + 2)}),
+        r"cell C2: 'x1' is a formula without its value",
+    ),
+    "date": (
+        changed(C7=dt.datetime.fromisoformat("2026-05-01")),
+        r"cell C7: 'x1' is a date .* such as 1\.5",
+    ),
+    "huge": (changed(C7=1e60), r"row 7: 'x1' is too large"),
+    "mean": (changed(A42="mean", B42=0.5), r"cell A42: 'time' is no number: 'mean'"),
+    "marker": (changed(A30="here", B30=None, C30=None), r"cell A30: 'time' is no number: 'here'"),
+    "twice": (changed(C1="input"), r"row 1: the heading 'input' stands twice"),
+    "no headings": (sheet(lambda ws: [ws.append(r) for r in ROWS]), r"no sheet has a row of head"),
+    "nothing": (sheet(lambda ws: None), r"no sheet has a row of headings .*'Sheet'"),
+    "two tables": (
+        sheet(lambda ws: [plain(ws), plain(ws)]),
+        r"several tables, with headings in the rows 1, 42; keep one",
+    ),
+    "wide": (
+        xlsx({f"c{i}": TIME for i in range(65)}),
+        r"row 1: more than 64 columns",
+    ),
+}
+
+
+@pytest.mark.parametrize(("raw", "said"), BAD.values(), ids=BAD.keys())
+def test_a_cell_that_is_no_measurement_is_named(raw, said):
+    """One line with sheet, cell and column."""
+    with pytest.raises(SubmissionError, match=said) as caught:
+        table(raw)
+    assert "\n" not in str(caught.value)
+
+
+BOOK = sheet_xml([HEADINGS, *ROWS])
+NAMESPACE = "http://schemas.openxmlformats.org/spreadsheetml/2006/main"
+OPEN = f'<worksheet xmlns="{NAMESPACE}"><sheetData>'
+CLOSE = "</sheetData></worksheet>"
+FAR = '<row><c t="str"><v>x1</v></c></row><row r="2"><c r="A2"><v>1</v></c></row>'
+ENTITIES = "".join(f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12))
+
+BOMBS = {
+    "two cells far apart": (
+        package(OPEN + FAR + '<row r="1048576"><c r="XFD1048576"><v>2</v></c></row>' + CLOSE),
+        r"cell A1048576: 'x1' is empty",
+    ),
+    "a size that is not true": (
+        package(BOOK.replace("<sheetData>", '<dimension ref="A1:XFD1048576"/><sheetData>')),
+        "",
+    ),
+    "texts that are not there": (
+        package(OPEN + '<row><c t="s"><v>7</v></c></row>' + FAR + CLOSE, texts=(
+            f'<sst xmlns="{NAMESPACE}" uniqueCount="99999999999"><si><t>x1</t></si></sst>'
+        )),
+        r"broken, cut short or larger",
+    ),
+    "entities": (
+        package(f'<!DOCTYPE w [<!ENTITY a0 "aaaaaaaaaa">{ENTITIES}]>'
+                + OPEN + '<row><c t="str"><v>&a11;</v></c></row>' + CLOSE),
+        r"broken, cut short or larger",
+    ),
+    "a file elsewhere": (
+        package('<!DOCTYPE w [<!ENTITY a SYSTEM "file:///etc/passwd">]>'
+                + OPEN + '<row><c t="str"><v>&a;</v></c></row>' + CLOSE),
+        r"broken, cut short or larger",
+    ),
+    "a tag without end": (package(OPEN + f'<row x="{"y" * 5_000_000}"/>' + CLOSE), r"larger"),
+    "nested without end": (package(OPEN + "<a>" * 1_000), r"cut short or larger"),
+    "a cell beyond the last": (package(OPEN + '<c r="XFE1"><v>1</v></c>' + CLOSE), r"cut short"),
+    "row 0": (package(OPEN + '<c r="A0"><v>1</v></c>' + CLOSE), r"cut short"),
+    "a cell twice": (
+        package(BOOK.replace(CLOSE, '<row r="3"><c r="C3"><v>1</v></c></row>' + CLOSE)),
+        r"cell C3: the file has it twice",
+    ),
+    "many parts": (
+        package(BOOK, more={f"{i:0600}": b"" for i in range(2_000)}), r"cut short or larger",
+    ),
+    "a sheet that is elsewhere": (
+        package(BOOK, more={"xl/_rels/workbook.xml.rels": (
+            b'<Relationships><Relationship Id="b" Type="x/worksheet" TargetMode="External" '
+            b'Target="http://example.org/one.xml"/></Relationships>'
+        )}),
+        r"no sheet has a row of headings",
+    ),
+    "a sheet that is missing": (
+        package(BOOK, more={"xl/_rels/workbook.xml.rels": (
+            b'<Relationships><Relationship Id="b" Type="x/worksheet" Target="../../two.xml"/>'
+            b"</Relationships>"
+        )}),
+        r"broken, cut short",
+    ),
+    "not a workbook": (
+        package(BOOK, more={"_rels/.rels": (
+            b'<Relationships><Relationship Id="a" Type="x/officeDocument" '
+            b'Target="word/document.xml"/></Relationships>'
+        )}),
+        r"no Excel workbook",
+    ),
+    "bits": (package(b"\xff\xfe\0\0"), r"broken, cut short"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("raw", "said"), BOMBS.values(), ids=BOMBS.keys())
+def test_a_hostile_workbook_is_refused_in_little_memory(raw, said):
+    """Nothing that a workbook declares reserves memory; what it inflates to is counted."""
+    tracemalloc.start()
+    try:
+        if said:
+            with pytest.raises(SubmissionError, match=said):
+                table(raw)
+        else:
+            assert_array_equal(table(raw).values, [TIME, U, X1])
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 30_000_000
+
+
+def test_a_locked_workbook_says_so():
+    """A member with the flag of encryption is not opened."""
+    raw = bytearray(package(BOOK))
+    for start, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
+        at = raw.find(start)
+        while at >= 0:
+            raw[at + flags] |= 1
+            at = raw.find(start, at + 4)
+    with pytest.raises(SubmissionError, match="locked by a password"):
+        table(bytes(raw))
+
+
+@pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.999])
+def test_a_workbook_cut_short_is_refused(share):
+    """Whatever is left of the archive, its table of contents is missing."""
+    raw = xlsx({"time": TIME, "x1": X1})
+    with pytest.raises(SubmissionError, match=r"broken, cut short|zip archive"):
+        table(raw[: max(int(share * len(raw)), 10)])
+
+
+def test_what_inflates_without_end_is_refused(monkeypatch):
+    """Bytes are counted as they come out of the archive, whatever it says of their number."""
+    monkeypatch.setattr(workbook_cells, "_MOST_BYTES", 1_000_000)
+    with pytest.raises(SubmissionError, match="cut short or larger"):
+        table(package(OPEN + " " * 1_000_000 + CLOSE))
+
+
+def test_more_cells_than_a_recording_has_are_refused(monkeypatch):
+    """Millions of cells are not kept."""
+    monkeypatch.setattr(workbook_cells, "_MOST_CELLS", 100)
+    with pytest.raises(SubmissionError, match="more than 100 cells"):
+        table(xlsx({"time": TIME, "x1": X1, "x2": X1}))
+
+
+def table_or_one_line(raw: bytes) -> FileTable | None:
+    """Return the table, or None after an error of one line."""
+    try:
+        return table(raw)
+    except SubmissionError as error:
+        message = str(error)
+    assert "\n" not in message
+    return None
+
+
+cells = st.one_of(
+    st.floats(-1e6, 1e6), st.sampled_from(["time", "x1", "input", "s", "", "0,5", "#N/A", "x1"])
+)
+
+
+@given(st.lists(st.lists(cells, max_size=5), max_size=12))
+def test_any_sheet_is_a_table_or_one_line(rows):
+    """Of texts and numbers in any order, numbers that are read are those of the sheet."""
+    got = table_or_one_line(package(sheet_xml(rows)))
+    if got is None:
+        return
+    written = {value for row in rows for value in row if isinstance(value, float)} | {0.5}
+    assert set(got.values.ravel().tolist()) <= written
+
+
+@given(st.lists(st.tuples(st.floats(0, 1, exclude_max=True), st.binary(max_size=12)), max_size=4))
+def test_a_damaged_sheet_is_a_table_or_one_line(hits):
+    """After damage to its XML, a sheet is a table or one line of error."""
+    part = bytearray(BOOK.encode())
+    for where, junk in hits:
+        at = int(where * len(part))
+        part[at : at + len(junk)] = junk
+    table_or_one_line(package(bytes(part)))
+
+
+def test_openpyxl_reads_the_same_numbers():
+    """Of a workbook with long decimals, each value is the double that another reader finds."""
+    values = np.random.default_rng(1).normal(size=(3, 200)) * 10.0 ** np.arange(-9, 9, 6)[:, None]
+    raw = xlsx(dict(zip(HEADINGS, values, strict=True)))
+    book = openpyxl.load_workbook(BytesIO(raw))
+    assert book.active is not None
+    _, *rows = book.active.iter_rows(values_only=True)
+    assert_array_equal(table(raw).values.T, np.array(rows, dtype=np.float64))
