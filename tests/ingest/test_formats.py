@@ -1,6 +1,7 @@
 """Every form of data file gives the same numbers: text of any dialect, `.mat` of any layout."""
 
 import hashlib
+from collections.abc import Callable
 from io import BytesIO
 
 import h5py
@@ -413,3 +414,34 @@ def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
 
     assert table.names == ("time", "x1")
     assert [v.name for v in table.variables if not v.read] == ["odd"]
+
+
+def mat73_with(fill: Callable[[h5py.File], object]) -> bytes:
+    """Return a version 7.3 file with a time, and what a function adds."""
+    stream = BytesIO(mat73(time=TIME))
+    with h5py.File(stream, "r+") as file:
+        fill(file)
+    return stream.getvalue()
+
+
+def test_a_matlab_7_3_file_takes_no_more_memory_than_a_recording():
+    """A part that inflates to gigabytes is refused, and so are numbers that are not in the file."""
+    packed = {"dtype": "f8", "compression": "gzip"}
+    whole = {"shape": (1, N), "maxshape": (1, None), "chunks": (1, 2**26)}
+    absent = {"shape": (1, 20_000_000), "chunks": (1, 2**16)}
+    for shape in (whole, absent):
+        raw = mat73_with(lambda file, shape=shape: file.create_dataset("x1", **shape, **packed))
+        with pytest.raises(SubmissionError, match="broken or cut short"):
+            table(raw)
+
+
+def test_the_class_of_a_matlab_7_3_variable_is_one_line():
+    """Whatever its attribute holds, the variable is named with a short kind."""
+
+    def fill(file: h5py.File) -> None:
+        file["note"] = np.arange(5.0)
+        file["note"].attrs["MATLAB_class"] = np.arange(60.0).reshape(6, 10)
+
+    assert [str(v) for v in table(mat73_with(fill)).variables] == [
+        "note (5 × 1, unknown)", f"time (1 × {N}, float64)",
+    ]  # fmt: skip

@@ -22,6 +22,8 @@ from pipeline.ingest.formats.table import Variable
 _MOST_BYTES = 200_000_000  # of all variables, inflated
 _MOST_VARIABLES, _LONGEST_NAME = 1000, 64  # no workspace has more
 _MOST_DIMENSIONS = 32
+_MOST_PACKED = 1_100  # times its own size a deflated part can become
+_MOST_ABSENT = 1_000_000  # bytes of zeros that MATLAB may leave unwritten
 # Codes of version 5: elements, a flag, the classes of variables, and how their numbers are stored.
 _MATRIX, _COMPRESSED, _OPAQUE, _COMPLEX = 14, 15, 17, 0x800
 _CLASSES = {
@@ -254,7 +256,9 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
             if isinstance(item, h5py.Group):
                 kind = "sparse" if "MATLAB_sparse" in item.attrs else "struct"
                 own = [
-                    key for key in item if isinstance(item.get(key, getlink=True), h5py.HardLink)
+                    key
+                    for key in islice(item, _MOST_VARIABLES)
+                    if isinstance(item.get(key, getlink=True), h5py.HardLink)
                 ]
                 parts = [item[key] for key in own]
                 taken = sum(part.nbytes for part in parts if isinstance(part, h5py.Dataset))
@@ -264,7 +268,7 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
             kind = _class_of(item)
             if kind in _NUMBERS:  # so its attribute says
                 kind = _no_matrix(size) if _holds_numbers(item.dtype) else "unknown"
-            left -= item.nbytes if not kind else 0
+            left -= _bytes_to_read(item) if not kind else 0
             if left < 0 or item.is_virtual or item.external:  # the numbers of another file
                 raise ValueError(name)
             if kind:
@@ -274,6 +278,21 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
                 if values.dtype.names == ("real", "imag"):
                     values = values["real"] + 1j * values["imag"]
                 yield _matrix(name, values.T.reshape(size), bytes=item.nbytes)
+
+
+def _bytes_to_read(item: Any) -> int:
+    """Return the memory that reading a data set takes.
+
+    A part that is packed is inflated as a whole, however little of it is in the data set.
+
+    Raises
+    ------
+    ValueError : it has more numbers than its bytes in the file can hold.
+    """
+    part = math.prod(item.chunks or ()) * item.dtype.itemsize
+    if item.nbytes > max(_MOST_PACKED * item.id.get_storage_size(), _MOST_ABSENT):
+        raise ValueError(item.nbytes)
+    return max(item.nbytes, part)
 
 
 def _holds_numbers(dtype: np.dtype) -> bool:
@@ -289,6 +308,8 @@ def _class_of(item: Any) -> str:
         return "empty"
     of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")
     name = of.decode("ascii") if isinstance(of, bytes) else str(of)
+    if not name.isprintable() or len(name) > _LONGEST_NAME:
+        return "unknown"
     if name not in _NUMBERS and "MATLAB_object_decode" in item.attrs:
         return "object"
     return "text" if name == "char" else name
