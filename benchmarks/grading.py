@@ -203,7 +203,7 @@ All processes together, the start of the workers included; the client hashes, st
 recordings and writes the class's pages. Processors of the workers on a Dask cluster are not the
 client's children. The clock has in it whatever else the machine did, which was not the same from
 row to row: it does not tell one way from another. What workers and a cluster bring is simulated in
-[docs/scaling.md](../docs/scaling.md) with the costs of a core.
+[scaling.md](scaling.md) with the costs of a core.
 """,
     )
 

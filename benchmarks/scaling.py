@@ -1,7 +1,7 @@
 """From one class to a million hand-ins: costs measured here, a cluster simulated with them.
 
     python -m benchmarks.scaling measure [--teams 6]    # some minutes; keeps scaling.json
-    python -m benchmarks.scaling page                   # simulates, writes docs/scaling.md anew
+    python -m benchmarks.scaling page                   # simulates, writes benchmarks/scaling.md
 
 Seconds are of the processor, so that other work on the machine makes them longer only by what the
 memory and the caches are shared; the simulation draws service times from those measured.
@@ -34,7 +34,7 @@ from pipeline.output import write_file
 from pipeline.submission import load_submission
 
 COSTS = Path(__file__).with_name("scaling.json")
-PAGE = Path(__file__).parents[1] / "docs" / "scaling.md"
+PAGE = Path(__file__).with_name("scaling.md")
 PRESETS = ("throne-1dof", "throne-2dof", "throne-3dof")
 COMPARED = (50, 100, 200, 400)  # submissions at once
 NIGHT = 8 * 3600.0  # s
