@@ -1,4 +1,4 @@
-"""Make the pictures of the tutorials, the gallery and the desk anew; pages need Chromium."""
+"""Make the pictures of the tutorials, the gallery and the desk; pages need Chromium."""
 
 import shutil
 import subprocess

@@ -32,14 +32,14 @@ _SHOWN = (
     "rubrics/*.md",
 )
 _OUTSIDE = r"""["']?((?:https?:)?//[^"')\s>]+)"""
-# What a browser fetches by itself to show a page; a link is followed when the reader wants to.
+# Parts that a browser fetches by itself to show a page; links wait for a click.
 _FETCHED = re.compile(
     rf"<(?:script|img|iframe|source|video|audio|embed|object|use|image)\b[^>]*?"
     rf"\s(?:xlink:)?(?:src|srcset|href|data)={_OUTSIDE}"
     rf"|<link\b[^>]*?\shref={_OUTSIDE}"
     rf"|(?:url\(|@import)\s*{_OUTSIDE}"
 )
-# "name : meaning" in one line, as docstrings here are written; types stand in the annotations.
+# "name : meaning" in one line, as docstrings here are written; types are in the annotations.
 _ITEM = re.compile(r"^(\w[\w, ]*?) : (.+)$", re.MULTILINE)
 
 
