@@ -65,7 +65,7 @@ LEVELS = (
 )
 HOMES = {
     "matplotlib": ("report",),
-    "jinja2": ("report.render", "submission", "desk"),
+    "jinja2": ("report.render", "submission", "desk", "exchange.model"),
     "typst": ("report.render",),
     "markdown_it": ("report.sections",),
     "typer": ("cli",),

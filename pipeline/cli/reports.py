@@ -274,11 +274,19 @@ def gap(
         ),
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
+    model: Annotated[
+        bool,
+        typer.Option(
+            "--model", help="Write the model for other programs: model.fmu, model.c, model.m."
+        ),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
     with progress_line() as progress:
-        text, told = explain(folder, out=out, budget=budget, pdf=pdf, progress=progress)
+        text, told = explain(
+            folder, out=out, budget=budget, pdf=pdf, model=model, progress=progress
+        )
     for line in told:
         say(line)
     if as_json:
@@ -291,6 +299,7 @@ def explain(
     out: Path | None,
     budget: float | None = None,
     pdf: bool = True,
+    model: bool = False,
     progress: Progress,
 ) -> tuple[str, list[str]]:
     """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
@@ -304,16 +313,20 @@ def explain(
     submission = load_submission(folder)
     out = named_folder(out) if out else own_folder(submission.folder, "gap")
     analysis = analyse(submission, design=False, progress=progress)
-    from pipeline.experiments.discriminate import propose_for  # load the …
-    from pipeline.gap.explain import investigate  # … compiled simulator
+    from pipeline.exchange.model.saved import clear_model, save_model  # load the …
+    from pipeline.experiments.discriminate import propose_for  # … compiled …
+    from pipeline.gap.explain import investigate  # … simulator
 
     found = investigate(analysis, budget=budget, progress=progress)
     progress("weighing what to record next")
     found = propose_for(found, submission)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))
+    clear_model(out)
+    told = [save_model(found.model, analysis, out)] if model else []
     render_gap(found, analysis, out, pdf=pdf, progress=progress)
-    return text, [*_unreadable(analysis), terminal_verdict(found), _wrote(out, "gap", pdf=pdf)]
+    wrote = _wrote(out, "gap", pdf=pdf)
+    return text, [*_unreadable(analysis), terminal_verdict(found), wrote, *told]
 
 
 def _wrote(out: Path, name: str, *, pdf: bool) -> str:

@@ -141,6 +141,7 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 def make_gap(folder: str, *, progress: Progress) -> None:
     """Write what the linear model leaves out into the submission's own folder."""
+    from pipeline.exchange.model.saved import clear_model
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
     from pipeline.json_files import json_text
@@ -154,6 +155,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
         found = investigate(analysis, progress=progress)
         found = propose_for(found, submission)
         write_file(out / "gap.json", json_text(found))
+        clear_model(out)
         render_gap(found, analysis, out, progress=progress)
 
 

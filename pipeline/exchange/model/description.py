@@ -1,0 +1,415 @@
+"""What a model holds, the same for every language: its parameters, bodies and laws.
+
+Laws are expressions as `syntax` takes them, in names of the model: `p.m1`, `x.cart_1`, `v.motor`,
+`z.z1`; `u` is the force that arrives from the drive, `on` 1 while it is powered; of a spring `d` is
+the stretch and `rate` how fast it grows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.errors import DataError
+from pipeline.exchange.model.syntax import substitute
+from pipeline.plant.linear.chain import Chain
+from pipeline.plant.nonlinear.augmented import SteppedBench, rest_positions
+from pipeline.plant.nonlinear.effects.base import AugmentedChain, EffectTerm
+from pipeline.plant.nonlinear.effects.law import (
+    BuiltLaw,
+    ContactLaw,
+    ForceLaw,
+    FrictionLaw,
+    HysteresisLaw,
+    InputLaw,
+    names_in,
+)
+from pipeline.plant.nonlinear.simulator.laws import settling
+from pipeline.set_up import Units
+
+# Of the fastest oscillation, a contact's too, in a step: its period is right to 1e-4.
+_PHASE = 0.05
+_LONGEST = 2e-4  # s; what switches inside a step does so as late as this
+_DIGITS = 10  # as in gap.json
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number that may be changed."""
+
+    name: str
+    value: float
+    unit: str
+    meaning: str
+
+    @property
+    def text(self) -> str:
+        """The value as every language reads it."""
+        return f"{self.value:.{_DIGITS}g}"
+
+    @property
+    def label(self) -> str:
+        """Its unit, and what it is."""
+        return f"{self.unit}: {self.meaning}" if self.unit else self.meaning
+
+
+@dataclass(frozen=True)
+class Body:
+    """A cart, the motor behind a play, or a hidden mass.
+
+    Attributes
+    ----------
+    mass : an expression.
+    suffix : of its states, `x1` say.
+    start : the cart, from 0, that it starts with.
+    """
+
+    name: str
+    meaning: str
+    suffix: str
+    mass: str
+    start: int
+
+
+@dataclass(frozen=True)
+class Force:
+    """A force on a body, or a tension that a spring has more.
+
+    Attributes
+    ----------
+    side, depth, rate : of a contact: the sign of `side` tells where it acts, once `depth`, which
+        grows at `rate`, has that sign.
+    pulls : a contact may pull, too.
+    """
+
+    title: str
+    force: str
+    body: str = ""
+    side: str = ""
+    depth: str = ""
+    rate: str = ""
+    pulls: bool = True
+
+
+@dataclass(frozen=True)
+class SpringTension:
+    """A spring, its stretch and its tension; `left` and `right` are the bodies it ties, or ""."""
+
+    meaning: str
+    stretch: str
+    rate: str
+    left: str
+    right: str
+    tension: tuple[Force, ...]
+
+    @property
+    def needs_rate(self) -> bool:
+        """Whether any part of its tension is a damper."""
+        return any(part.rate or "rate" in names_in(part.force) for part in self.tension)
+
+
+@dataclass(frozen=True)
+class Bristle:
+    """A state of dry friction; `force` and `rate` are linear in its bend `z`."""
+
+    name: str
+    title: str
+    body: str
+    force: str
+    rate: str
+
+    @property
+    def now(self) -> str:
+        """The force as it is."""
+        return substitute(self.force, {"z": f"z.{self.name}"})
+
+    @property
+    def rate_at_zero(self) -> str:
+        """The rate while the bristle is straight."""
+        return substitute(self.rate, {"z": "0"})
+
+    @property
+    def rate_slope(self) -> str:
+        """What the rate has more for each unit of bend."""
+        return f"{substitute(self.rate, {'z': '1'})} - ({self.rate_at_zero})"
+
+    @property
+    def most(self) -> str:
+        """What the force has more for each unit of bend."""
+        return substitute(f"({self.force})", {"z": "1"}) + (
+            f" - ({substitute(self.force, {'z': '0'})})"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Description:
+    """A model, ready to be written in a language.
+
+    Attributes
+    ----------
+    links : forces between two bodies, on the first and back on the second.
+    play : the parameters gap, stiffness and damping between motor and cart 1, or none.
+    inputs : what becomes of `u`, one after the other; delay, lag : a parameter or "".
+    rest : (n_carts,) where the carts rest without friction.
+    titles : of its effects; turned : the input of the recordings counts the other way.
+    """
+
+    units: Units
+    n: int
+    parameters: tuple[Parameter, ...]
+    bodies: tuple[Body, ...]
+    springs: tuple[SpringTension, ...]
+    forces: tuple[Force, ...]
+    links: tuple[tuple[str, Force], ...]
+    play: tuple[str, str, str] | None
+    frictions: tuple[Force, ...]
+    bristles: tuple[Bristle, ...]
+    inputs: tuple[tuple[str, str], ...]
+    delay: str
+    lag: str
+    readings: tuple[str, ...]
+    rest: tuple[str, ...]
+    titles: tuple[str, ...]
+    turned: bool
+
+    @property
+    def driven(self) -> str:
+        """The body that the drive pushes."""
+        return "motor" if self.play else "cart_1"
+
+    @property
+    def contacts(self) -> list[Force]:
+        """What acts on one side of a position alone."""
+        parts = [*self.forces, *(part for s in self.springs for part in s.tension)]
+        return [part for part in parts if part.side]
+
+    @property
+    def pushes(self) -> list[Force]:
+        """The contacts that never pull."""
+        return [part for part in self.contacts if not part.pulls]
+
+    @property
+    def laws(self) -> list[str]:
+        """All expressions that a file evaluates, but those of masses and readings."""
+        parts = [*self.forces, *(part for s in self.springs for part in s.tension)]
+        texts = [part.force for part in (*parts, *self.frictions)]
+        texts += [text for bristle in self.bristles for text in (bristle.force, bristle.rate)]
+        return texts + [text for _, text in self.inputs]
+
+
+def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> Description:
+    """Return a model as every language writes it.
+
+    Parameters
+    ----------
+    turned : the input of the recordings counts the other way.
+
+    Raises
+    ------
+    DataError : the drive leads its log, which no program that runs forward in time can.
+    """
+    chain, terms = model.chain, model.terms
+    refuse_lead(terms)
+    by_law: dict[type, list[EffectTerm]] = {}
+    for term in terms:
+        by_law.setdefault(type(term.effect.law), []).append(term)
+    built = {
+        kind: [term for term in by_law.get(BuiltLaw, []) if term.effect.is_built(kind)]
+        for kind in ("hidden mass", "play", "delay", "lag", "reading")
+    }
+    play = _names(built["play"][0]) if built["play"] else None
+    bodies = _bodies(chain, built)
+    gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
+    step = Parameter("max_step", _longest_step(model), "s", "longest step inside")
+    inputs = sorted(by_law.get(InputLaw, []), key=lambda term: term.effect.key)
+    return Description(
+        units=units,
+        n=chain.n,
+        parameters=(*_parameters(chain, terms, units), step),
+        bodies=bodies,
+        springs=_springs(chain, terms),
+        forces=_forces(terms, driven="motor" if play else "cart_1", n=chain.n),
+        links=tuple(_link(term) for term in built["hidden mass"]),
+        play=play and (play[0], play[2], play[3]),
+        frictions=tuple(
+            Force(_title(term), _law(term, term.effect.law.size), f"cart_{term.place}")
+            for term in terms
+            if isinstance(term.effect.law, FrictionLaw)
+        ),
+        bristles=tuple(
+            Bristle(
+                f"z{term.place}",
+                _title(term),
+                f"cart_{term.place}",
+                _law(term, term.effect.law.force),
+                _law(term, term.effect.law.rate),
+            )
+            for term in terms
+            if isinstance(term.effect.law, HysteresisLaw)
+        ),
+        inputs=tuple(
+            (_title(term), _law(term, term.effect.law.arrives))
+            for term in inputs
+            if isinstance(term.effect.law, InputLaw)
+        ),
+        delay=_names(built["delay"][0])[0] if built["delay"] else "",
+        lag=_names(built["lag"][0])[0] if built["lag"] else "",
+        readings=tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1)),
+        rest=tuple(f"{position + 0.0:.{_DIGITS}g}" for position in rest_positions(model)),
+        titles=tuple(_title(term) for term in terms),
+        turned=turned,
+    )
+
+
+def refuse_lead(terms: Sequence[EffectTerm]) -> None:
+    """Check that the drive does not lead its log.
+
+    Raises
+    ------
+    DataError : it does.
+    """
+    for term in terms:
+        if term.effect.is_built("delay") and term.values[0] < 0.0:
+            raise DataError(
+                "the drive leads its log (a negative delay): a model would need the input before "
+                "it comes; move the input in the files by that time, then run cartlab gap again"
+            )
+
+
+def _title(term: EffectTerm) -> str:
+    at = f", {term.effect.place} {term.place}" if term.place else ""
+    return f"{term.effect.title}{at}"
+
+
+def _names(term: EffectTerm) -> list[str]:
+    """Return the parameters of an effect as expressions, in the effect's order."""
+    return [f"p.{_name(term, parameter)}" for parameter in term.effect.names]
+
+
+def _name(term: EffectTerm, parameter: str) -> str:
+    at = f"_{term.place}" if term.place else ""
+    return f"{term.effect.key}{at}_{parameter}"
+
+
+def _law(term: EffectTerm, text: str, **quantities: str) -> str:
+    """Return an expression of a law at its place."""
+    place = f"cart_{term.place or 1}"
+    known = {"x": f"x.{place}", "v": f"v.{place}", **quantities}
+    if term.effect.place == "spring":
+        known = {"k": f"p.k{term.place}"}
+    symbols = (p.symbol for p in term.effect.parameters)
+    return substitute(text, known | dict(zip(symbols, _names(term), strict=True)))
+
+
+def _parameters(chain: Chain, terms: Sequence[EffectTerm], units: Units) -> list[Parameter]:
+    carts = range(1, chain.n + 1)
+    springs = {j + 1 for j in np.flatnonzero(chain.k)}
+    springs |= {term.place for term in terms if term.effect.place == "spring"}
+    return [
+        *(Parameter(f"m{i}", chain.m[i - 1], units.mass, f"mass of cart {i}") for i in carts),
+        *(Parameter(f"c{i}", chain.c[i - 1], units.damping, f"damping of cart {i}") for i in carts),
+        *(
+            Parameter(f"k{j}", chain.k[j - 1], units.stiffness, f"spring {_between(j, chain.n)}")
+            for j in sorted(springs)
+        ),
+        *(
+            Parameter(
+                _name(term, parameter.name),
+                value,
+                parameter.unit_text(position=units.position, input=units.input),
+                f"{_title(term)}: {parameter.name.replace('_', ' ')}",
+            )
+            for term in terms
+            for parameter, value in zip(term.effect.parameters, term.values, strict=True)
+        ),
+    ]
+
+
+def _between(j: int, n: int) -> str:
+    ends = ["the left wall", *(f"cart {i}" for i in range(1, n + 1)), "the right wall"]
+    return f"{j}, from {ends[j - 1]} to {ends[j]}"
+
+
+def _bodies(chain: Chain, built: Mapping[str, list[EffectTerm]]) -> tuple[Body, ...]:
+    carts = [
+        Body(f"cart_{i}", f"cart {i}", f"{i}", f"p.m{i}", i - 1) for i in range(1, chain.n + 1)
+    ]
+    others = []
+    for term in built["play"]:
+        mass = _names(term)[1]
+        # As in our simulator, a motor never leaves cart 1 without a mass.
+        carts[0] = replace(carts[0], mass=f"max(p.m1 - {mass}, 0.02 * p.m1)")
+        others.append(Body("motor", "motor, in play with cart 1", "_motor", mass, 0))
+    for term in built["hidden mass"]:
+        i, mass = term.place, _names(term)[0]
+        others.append(Body(f"hidden_{i}", f"hidden mass on cart {i}", f"{i}_hidden", mass, i - 1))
+    return (*carts, *others)
+
+
+def _springs(chain: Chain, terms: Sequence[EffectTerm]) -> tuple[SpringTension, ...]:
+    springs = []
+    for j in range(1, chain.n + 2):
+        here = [t for t in terms if t.effect.place == "spring" and t.place == j]
+        if chain.k[j - 1] == 0.0 and not here:
+            continue
+        ends = [f"cart_{i}" if 1 <= i <= chain.n else "" for i in (j - 1, j)]
+        parts = [Force("", f"p.k{j} * d")]
+        for term in here:
+            law = term.effect.law
+            if isinstance(law, ForceLaw | ContactLaw):
+                part = Force(_title(term), _law(term, law.force))
+                if isinstance(law, ContactLaw):
+                    side = _law(term, law.past)
+                    part = replace(part, side=side, depth=f"d - {side}", rate="rate")
+                parts.append(part)
+        stretch, rate = (_difference(letter, *ends) for letter in "xv")
+        meaning = _between(j, chain.n)
+        springs.append(SpringTension(meaning, stretch, rate, *ends, tuple(parts)))
+    return tuple(springs)
+
+
+def _difference(letter: str, left: str, right: str) -> str:
+    """Return what one end has more than the other; a wall has nothing."""
+    if not (left and right):
+        return f"{letter}.{right}" if right else f"-{letter}.{left}"
+    return f"{letter}.{right} - {letter}.{left}"
+
+
+def _forces(terms: Sequence[EffectTerm], *, driven: str, n: int) -> tuple[Force, ...]:
+    forces = [Force("", f"-p.c{i} * v.cart_{i}", f"cart_{i}") for i in range(1, n + 1)]
+    for term in terms:
+        law, body = term.effect.law, f"cart_{term.place or 1}"
+        if term.effect.place == "spring":
+            continue
+        if isinstance(law, ForceLaw):
+            body = driven if law.on_motor else body
+            moved = {"x": f"x.{body}", "v": f"v.{body}"}
+            forces.append(Force(_title(term), _law(term, law.force, **moved), body))
+        elif isinstance(law, ContactLaw):
+            side = _law(term, law.past)
+            depth, rate = f"x.{body} - {side}", f"v.{body}"
+            force = _law(term, law.force)
+            forces.append(Force(_title(term), force, body, side, depth, rate, law.pulls))
+    return tuple(forces)
+
+
+def _link(term: EffectTerm) -> tuple[str, Force]:
+    """Return the hidden mass of an effect, and the force on the cart that it hangs on."""
+    cart, hidden = f"cart_{term.place}", f"hidden_{term.place}"
+    _, k, c = _names(term)
+    force = f"{k} * (x.{hidden} - x.{cart}) + {c} * (v.{hidden} - v.{cart})"
+    return hidden, Force(_title(term), force, cart)
+
+
+def _longest_step(model: AugmentedChain) -> float:
+    """Return a step in which nothing swings by more than a twentieth of a radian, s.
+
+    In a contact by twice as much: our own simulator takes four times such a step, of high order.
+    """
+    step = 0.25 * SteppedBench(model).shortest_step
+    cart = model.tables().cart
+    for i, mass in enumerate(model.chain.m):
+        holds, _, pace = settling(cart, i, 1.0)
+        if holds > 0.0:
+            step = min(step, _PHASE / np.sqrt(holds * pace / mass))
+    return float(min(step, _LONGEST))

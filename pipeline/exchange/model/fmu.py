@@ -1,0 +1,124 @@
+"""The model as an FMU: FMI 2.0, co-simulation, with its sources and, where one can, its binary.
+
+Reference: Functional Mock-up Interface for Model Exchange and Co-Simulation, version 2.0.4.
+"""
+
+import hashlib
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+
+from pipeline import __version__
+from pipeline.exchange.model.description import Description
+from pipeline.exchange.model.sources import c_sources, render
+
+_COMPILERS = ("cc", "gcc", "clang")
+_PATIENCE = 120.0  # s; a compiler takes a quarter of one
+_BEGINNING = (1980, 1, 1, 0, 0, 0)  # of time, in a zip: the same model, the same bytes
+_LIBRARY = {"linux": "so", "darwin": "dylib", "win32": "dll"}
+_SYSTEM = {"linux": "linux", "darwin": "darwin", "win32": "win"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Variable:
+    """A variable as modelDescription.xml has it; `member` is where it is in the C structure."""
+
+    index: int
+    name: str
+    member: str
+    meaning: str
+    unit: str
+    causality: str
+    variability: str = "continuous"
+    start: str = ""
+
+
+def fmu(description: Description) -> tuple[bytes, bool]:
+    """Return `model.fmu`, and whether it has a binary for this computer."""
+    sources = c_sources(description)
+    variables = _variables(description)
+    settable = sum(v.causality in ("input", "parameter") for v in variables)
+    # Whoever loads the binary must have the description that goes with it.
+    known = "".join([*sources.values(), *map(repr, variables), __version__])
+    guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
+    said = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
+    sources |= {name: render(name, description, **said) for name in ("fmi2.h", "fmi2.c")}
+    files: dict[str, str | bytes] = {
+        "modelDescription.xml": render("modelDescription.xml", description, **said),
+        **{f"sources/{name}": text for name, text in sources.items()},
+    }
+    binary = compile_library(sources)
+    if binary is not None:
+        bits = 64 if sys.maxsize > 2**32 else 32
+        system = _SYSTEM[sys.platform]
+        files[f"binaries/{system}{bits}/model.{_LIBRARY[sys.platform]}"] = binary
+    return _zip(files), binary is not None
+
+
+def _variables(description: Description) -> list[Variable]:
+    units, found = description.units, []
+
+    def add(name: str, member: str, meaning: str, unit: str, causality: str, **more: str) -> None:
+        index = len(found) + 1
+        found.append(
+            Variable(
+                index=index, name=name, member=member, meaning=meaning, unit=unit,
+                causality=causality, **more,
+            )
+        )  # fmt: skip
+
+    fixed = {"causality": "parameter", "variability": "fixed"}
+    tunable = {"causality": "parameter", "variability": "tunable"}
+    turned = "; the recordings count it the other way" if description.turned else ""
+    add("u", "u", f"input, held during a step{turned}", units.input, "input", start="0")
+    for i, start in enumerate(description.rest, start=1):
+        meaning = f"where cart {i} is let go"
+        add(f"x{i}_start", f"start[{i - 1}]", meaning, units.position, start=start, **fixed)
+    for p in description.parameters:
+        add(p.name, f"model.p.{p.name}", p.meaning, p.unit, start=p.text, **tunable)
+    for i in range(1, description.n + 1):
+        add(f"x{i}", f"model.y[{i - 1}]", f"what sensor {i} reads", units.position, "output")
+    speed = f"{units.position}/s"
+    for at, body in enumerate(description.bodies):
+        if at >= description.n:
+            meaning = f"position of {body.meaning}"
+            add(f"x{body.suffix}", f"model.x[{at}]", meaning, units.position, "local")
+        add(f"v{body.suffix}", f"model.v[{at}]", f"velocity of {body.meaning}", speed, "local")
+    for at, bristle in enumerate(description.bristles):
+        add(bristle.name, f"model.z[{at}]", f"bend, -1 to 1: {bristle.title}", "", "local")
+    if description.lag:
+        add("u_lag", "model.lagged", "the input behind the lag", units.input, "local")
+    return found
+
+
+def compile_library(sources: Mapping[str, str]) -> bytes | None:
+    """Return the sources as a library for this computer; None where no compiler can."""
+    compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
+    if compiler is None or sys.platform not in _LIBRARY:
+        return None
+    with tempfile.TemporaryDirectory() as name:
+        for file, text in sources.items():
+            (Path(name) / file).write_text(text, encoding="utf-8")
+        library = f"model.{_LIBRARY[sys.platform]}"
+        options = ["-std=c99", "-O2", "-shared", "-fPIC", "-fvisibility=hidden", "-o", library]
+        command = [compiler, *options, "model.c", "fmi2.c", "-lm"]
+        try:
+            done = subprocess.run(command, cwd=name, capture_output=True, timeout=_PATIENCE)
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return (Path(name) / library).read_bytes() if done.returncode == 0 else None
+
+
+def _zip(files: Mapping[str, str | bytes]) -> bytes:
+    stream = BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _BEGINNING), content, zipfile.ZIP_DEFLATED)
+    return stream.getvalue()

@@ -1,0 +1,39 @@
+"""A model saved for other programs: `model.fmu`, `model.c` with its header, and `model.m`."""
+
+from pathlib import Path
+
+from pipeline.errors import DataError
+from pipeline.exchange.model.description import describe
+from pipeline.exchange.model.fmu import fmu
+from pipeline.exchange.model.sources import c_sources, matlab_source
+from pipeline.output import write_file
+from pipeline.plant.nonlinear.effects.base import AugmentedChain
+from pipeline.results import Analysis
+
+FILES = ("model.fmu", "model.c", "model.h", "model.m")
+
+
+def save_model(model: AugmentedChain, analysis: Analysis, out: Path) -> str:
+    """Write a model into the folder `out`; return what is to be said of it.
+
+    A model that no program can run is not written, which is said.
+    """
+    driven = [record.input_scale for record in analysis.records if record.u is not None]
+    turned = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
+    try:
+        description = describe(model, units=analysis.bench.units, turned=turned)
+    except DataError as error:
+        return f"no model was written: {error}"
+    whole, compiled = fmu(description)
+    write_file(out / "model.fmu", whole)
+    for name, text in c_sources(description).items():
+        write_file(out / name, text)
+    write_file(out / "model.m", matlab_source(description))
+    alone = "" if compiled else "; no C compiler was found, so model.fmu holds its sources alone"
+    return f"wrote {out / 'model.fmu'}, model.c, model.h and model.m{alone}"
+
+
+def clear_model(out: Path) -> None:
+    """Remove a model that was written earlier, so that it does not stand beside another gap."""
+    for name in FILES:
+        (out / name).unlink(missing_ok=True)

@@ -1,0 +1,333 @@
+"""The same model in C, in Octave, as an FMU and in python-control moves as our simulator does.
+
+The programs take steps of second order, of h s. An oscillation of ω rad/s is then too fast by
+(ω h)² / 24 of itself: after 1.5 s of the fastest motion here, ω = 35, by ω t (ω h)² / 24 = 4e-5 rad
+at h = 0.125 ms. A knock across a play, of ω = 370 in the contact, is some twenty times as sharp.
+"""
+
+import io
+import subprocess
+import zipfile
+from pathlib import Path
+
+import control
+import fmpy
+import numpy as np
+import pytest
+from fmpy.fmi2 import FMU2Slave
+from fmpy.validation import validate_fmu
+from numpy.testing import assert_allclose, assert_array_equal
+
+from pipeline.arrays import Array
+from pipeline.exchange.model import fmu as fmu_module
+from pipeline.exchange.model.description import describe
+from pipeline.exchange.model.fmu import fmu
+from pipeline.exchange.model.sources import matlab_source
+from pipeline.plant.linear.presets import PRESETS
+from pipeline.plant.nonlinear.augmented import simulate_augmented
+from pipeline.plant.nonlinear.effects import CATALOGUE, AugmentedChain, find_effect
+from pipeline.plant.nonlinear.effects.base import Effect
+from pipeline.plant.nonlinear.motion import EquationsOfMotion
+from pipeline.set_up import PAPER_UNITS
+from tests.helpers.effects import SIZES, make_term
+from tests.helpers.exported import OCTAVE, CompiledModel, no_compiler, no_octave
+
+CHAIN = PRESETS["throne-2dof"]
+T = np.arange(0.0, 1.5, 0.002)
+STEP = np.where((T >= 0.1) & (T < 0.9), 0.05, 0.0)
+SWEEP = 0.05 * np.sin(2 * np.pi * (0.5 * T + 2.0 * T**2))  # 0.5 to 6.5 Hz
+RUNS = {
+    "step": (STEP, np.zeros(2)),
+    "sweep": (SWEEP, np.zeros(2)),
+    "release": (np.zeros(T.size), np.array([1.5, 0.5])),
+}
+SMOOTH, KNOCKS = 4e-5, 1e-3
+
+
+def model_of(*keys: str, last: bool = True) -> AugmentedChain:
+    """Return the carts with effects of sizes that are plain to see."""
+    effects = [find_effect(key) for key in keys]
+    places = [(one.places((True, True, True)) or (0,))[-1 if last else 0] for one in effects]
+    terms = [
+        make_term(effect, place=place, values=SIZES[effect.key], chain=CHAIN)
+        for effect, place in zip(effects, places, strict=True)
+    ]
+    return AugmentedChain(chain=CHAIN, terms=tuple(terms))
+
+
+def compiled(model: AugmentedChain, folder: Path) -> CompiledModel:
+    return CompiledModel(describe(model, units=PAPER_UNITS), folder)
+
+
+def off(found: Array, expected: Array) -> float:
+    """Return the root mean square of a difference, over that of the motion."""
+    return float(np.sqrt(np.mean((found - expected) ** 2) / np.mean(expected**2)))
+
+
+HARD = model_of("coulomb_friction", "backlash", "input_delay", last=False)
+
+
+@no_compiler
+@pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
+def test_c_moves_as_the_simulator_does(effect: Effect, tmp_path):
+    """A step, a sweep and a release with each effect; a quarter of the step, a fourth of the error.
+
+    (A sixteenth would be of second order; where the motion switches it is at times less.)
+    """
+    model = model_of(effect.key)
+    in_c = compiled(model, tmp_path)
+    step = float(describe(model, units=PAPER_UNITS).parameters[-1].text)
+    for u, x0 in RUNS.values():
+        expected = simulate_augmented(model, T, u, x0=x0)
+        limit = KNOCKS if effect.has_play else SMOOTH
+        assert off(in_c.simulate(T, u, x0=x0), expected) < limit
+        assert off(in_c.simulate(T, u, x0=x0, step=step / 4), expected) < limit / 4
+
+
+@no_compiler
+@pytest.mark.parametrize("run", RUNS)
+def test_c_moves_as_the_simulator_does_with_friction_play_and_delay(run, tmp_path):
+    """All three at once; and without any effect."""
+    u, x0 = RUNS[run]
+    for name, model, limit in (("hard", HARD, KNOCKS), ("linear", model_of(), SMOOTH)):
+        (tmp_path / name).mkdir()
+        found = compiled(model, tmp_path / name).simulate(T, u, x0=x0)
+        assert off(found, simulate_augmented(model, T, u, x0=x0)) < limit
+
+
+@no_compiler
+def test_a_cart_that_friction_holds_does_not_move(tmp_path):
+    """Under a force below the friction not by a bit, and from above it to a stop for good."""
+    model = model_of("coulomb_friction", last=False)
+    in_c = compiled(model, tmp_path)
+    held = in_c.simulate(T, np.full(T.size, 0.99e-3), x0=np.zeros(2))
+    assert_array_equal(held, np.zeros((2, T.size)))
+    long = np.arange(0.0, 20.0, 0.01)
+    stopped = in_c.simulate(long, np.zeros(long.size), x0=np.array([0.3, 0.2]))
+    assert np.ptp(stopped[0, -100:]) == 0.0
+    assert abs(stopped[0, -1]) > 1e-4
+
+
+@no_compiler
+@pytest.mark.parametrize("interval", [1e-5, 1e-3, 7e-3])
+def test_a_delay_is_true_at_any_length_of_step(interval, tmp_path):
+    """Nothing moves before its time is over; then all moves as without it.
+
+    Where the input jumps more often than the model remembers, 254 times in a delay, its mean comes:
+    here an input that jumps a hundred times as often, about that of the run without.
+    """
+    delay = SIZES["input_delay"]["delay"]
+    t = np.arange(0.0, 0.2, interval)
+    u = 0.05 * (1.0 + (-1.0) ** np.arange(t.size)) if interval < 1e-4 else np.full(t.size, 0.05)
+    (tmp_path / "late").mkdir()
+    (tmp_path / "prompt").mkdir()
+    late = compiled(model_of("input_delay"), tmp_path / "late").simulate(t, u, x0=np.zeros(2))
+    prompt = compiled(model_of(), tmp_path / "prompt").simulate(t, u, x0=np.zeros(2))
+    assert_array_equal(late[:, t <= delay - interval], 0.0)
+    shifted = np.array([np.interp(t - delay, t, y, left=0.0) for y in prompt])
+    # Linear interpolation between samples: by up to a interval² / 8, of 160 cm/s².
+    assert_allclose(late, shifted, atol=160 * interval**2 / 8 + 2e-5)
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_python_control_moves_as_the_simulator_does(name):
+    """Its system too: to half a percent, since it brakes and delays only nearly so (`motion`).
+
+    It takes the input as straight between samples, so the simulator holds the middle of each.
+    """
+    u, x0 = RUNS[name]
+    motion = EquationsOfMotion(HARD)
+    found = control.input_output_response(
+        motion.to_control(), T, u, motion.start(x0),
+        solve_ivp_method="LSODA", solve_ivp_kwargs={"rtol": 1e-6, "atol": 1e-9, "max_step": 0.02},
+    )  # fmt: skip
+    midway = np.append(0.5 * (u[1:] + u[:-1]), 0.0)
+    assert off(found.outputs, simulate_augmented(HARD, T, midway, x0=x0)) < 5e-3
+
+
+# --------------------------------------------------------------- MATLAB, Octave
+
+
+def in_octave(models: dict[str, AugmentedChain], runs: str, folder: Path) -> dict[str, Array]:
+    """Return what a script prints for each model, a row of numbers for each time."""
+    found = {}
+    for name, model in models.items():
+        home = folder / name
+        home.mkdir()
+        source = matlab_source(describe(model, units=PAPER_UNITS))
+        (home / "model.m").write_text(source, encoding="ascii")
+    script = "".join(
+        f"cd('{folder / name}'); clear model\n{runs.format(out=f'{name}.txt')}" for name in models
+    )
+    (folder / "all.m").write_text(script, encoding="ascii")
+    command = [str(OCTAVE), "--norc", "--no-gui", "all.m"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for name in models:
+        found[name] = np.loadtxt(folder / name / f"{name}.txt").T
+    return found
+
+
+@no_octave
+@no_compiler
+def test_octave_moves_as_c_does_with_every_effect(tmp_path):
+    """All effects, in two models of many effects each, from a release under a step: to rounding."""
+    keys = [effect.key for effect in CATALOGUE]
+    models = {
+        "many": model_of(*(key for key in keys if key != "coulomb_friction"), last=False),
+        "few": model_of("coulomb_friction", "input_delay", "load_friction"),
+        "none": model_of(),
+    }
+    runs = (
+        "t = (0:0.004:0.1)'; u = 0.05 * (t > 0.01);\n"
+        "y = model('simulate', t, u, [], [0.9 0.2]); save('-ascii', '-double', '{out}', 'y')\n"
+    )
+    found = in_octave(models, runs, tmp_path)
+    t = np.arange(0.0, 0.1001, 0.004)
+    for name, model in models.items():
+        (tmp_path / f"c-{name}").mkdir()
+        in_c = compiled(model, tmp_path / f"c-{name}")
+        y = in_c.simulate(t, np.where(t > 0.01, 0.05, 0.0), x0=np.array([0.9, 0.2]))
+        assert_allclose(found[name], y, atol=1e-9)
+
+
+@no_octave
+def test_octave_moves_as_the_simulator_does(tmp_path):
+    """A step, a sweep and a release of 0.6 s with friction, play and delay, taken step by step."""
+    u = {name: run[0][T < 0.6] for name, run in RUNS.items()}
+    np.savetxt(tmp_path / "u.txt", np.column_stack(list(u.values())), fmt="%.17g")
+    runs = (
+        f"u = load('{tmp_path / 'u.txt'}'); y = zeros(rows(u), 6); p = model('parameters');\n"
+        "x0 = {{[0 0], [0 0], [1.5 0.5]}};\n"
+        "for k = 1:3\n  s = model('start', p, x0{{k}});\n  y(1, 2*k-1:2*k) = s.y;\n"
+        "  for i = 2:rows(u)\n    [now, s] = model('step', s, u(i - 1, k), 0.002);\n"
+        "    y(i, 2*k-1:2*k) = now;\n  end\nend\nsave('-ascii', '-double', '{out}', 'y')\n"
+    )
+    found = in_octave({"hard": HARD}, runs, tmp_path)["hard"]
+    for k, (name, (_, x0)) in enumerate(RUNS.items()):
+        expected = simulate_augmented(HARD, T[T < 0.6], u[name], x0=x0)
+        assert off(found[2 * k : 2 * k + 2], expected) < KNOCKS
+
+
+# -------------------------------------------------------------------------- FMU
+
+
+@pytest.fixture(scope="module")
+def hard_fmu(tmp_path_factory) -> Path:
+    whole, _ = fmu(describe(HARD, units=PAPER_UNITS))
+    path = tmp_path_factory.mktemp("fmu") / "model.fmu"
+    path.write_bytes(whole)
+    return path
+
+
+def simulate_in_fmpy(path: Path, u: Array, x0: Array, **more) -> Array:
+    """Return the readings (carts, samples), the input held from sample to sample."""
+    instance, description, folder = instantiate(path)
+    refer = {v.name: v.valueReference for v in description.modelVariables}
+    values = {f"x{i + 1}_start": x for i, x in enumerate(x0)} | more
+    y = run(instance, refer, u, values)
+    instance.terminate()
+    instance.freeInstance()
+    return y
+
+
+def instantiate(path: Path):
+    description = fmpy.read_model_description(str(path))
+    folder = fmpy.extract(str(path))
+    instance = FMU2Slave(
+        guid=description.guid,
+        unzipDirectory=folder,
+        modelIdentifier=description.coSimulation.modelIdentifier,
+        instanceName="one",
+    )
+    instance.instantiate()
+    return instance, description, folder
+
+
+def run(instance, refer, u: Array, values) -> Array:
+    instance.setupExperiment(startTime=0.0)
+    instance.enterInitializationMode()
+    instance.setReal([refer[name] for name in values], list(values.values()))
+    instance.exitInitializationMode()
+    outputs = [refer["x1"], refer["x2"]]
+    y = [instance.getReal(outputs)]
+    for k in range(T.size - 1):
+        instance.setReal([refer["u"]], [u[k]])
+        instance.doStep(currentCommunicationPoint=T[k], communicationStepSize=T[k + 1] - T[k])
+        y.append(instance.getReal(outputs))
+    return np.array(y).T
+
+
+@no_compiler
+def test_fmpy_finds_no_fault_in_the_fmu(hard_fmu, tmp_path):
+    """The schema, names, units and structure of its description; with every effect too."""
+    assert validate_fmu(str(hard_fmu)) == []
+    everything = model_of(*(effect.key for effect in CATALOGUE))
+    for name, model in (("all", everything), ("none", model_of())):
+        whole, compiled_too = fmu(describe(model, units=PAPER_UNITS, turned=True))
+        (tmp_path / f"{name}.fmu").write_bytes(whole)
+        assert compiled_too
+        assert validate_fmu(str(tmp_path / f"{name}.fmu")) == []
+
+
+@no_compiler
+@pytest.mark.parametrize("name", RUNS)
+def test_fmpy_moves_as_the_simulator_does(name, hard_fmu):
+    """A step, a sweep and a release with friction, play and delay."""
+    u, x0 = RUNS[name]
+    found = simulate_in_fmpy(hard_fmu, u, x0)
+    assert off(found, simulate_augmented(HARD, T, u, x0=x0)) < KNOCKS
+
+
+@no_compiler
+def test_an_fmu_forgets_at_a_reset_and_returns_to_a_state(hard_fmu):
+    """After a reset the same run again; from a state kept, also as bytes, the same rest."""
+    instance, description, _ = instantiate(hard_fmu)
+    refer = {v.name: v.valueReference for v in description.modelVariables}
+    values = {"x1_start": 1.5, "x2_start": 0.5, "m1": 2 * CHAIN.m[0]}
+    first = run(instance, refer, STEP, values)
+    state = instance.getFMUState()
+    kept = instance.serializeFMUState(state)
+    instance.doStep(currentCommunicationPoint=T[-1], communicationStepSize=0.1)
+    after = instance.getReal([refer["x1"], refer["v1"], refer["x_motor"]])
+    instance.setFMUState(instance.deserializeFMUState(kept))
+    instance.doStep(currentCommunicationPoint=T[-1], communicationStepSize=0.1)
+    assert instance.getReal([refer["x1"], refer["v1"], refer["x_motor"]]) == after
+    instance.reset()
+    assert_array_equal(run(instance, refer, STEP, values), first)
+    instance.reset()
+    assert off(run(instance, refer, STEP, {**values, "m1": CHAIN.m[0]}), first) > 0.1
+    instance.freeInstance()
+
+
+@no_compiler
+def test_an_fmu_refuses_what_it_cannot(hard_fmu):
+    """A step before the start, a value for a state, a run-away cart: each an error."""
+    instance, description, _ = instantiate(hard_fmu)
+    refer = {v.name: v.valueReference for v in description.modelVariables}
+    with pytest.raises(fmpy.fmi1.FMICallException, match="DoStep"):
+        instance.doStep(currentCommunicationPoint=0.0, communicationStepSize=0.01)
+    with pytest.raises(fmpy.fmi1.FMICallException, match="SetReal"):
+        instance.setReal([refer["v1"]], [0.0])
+    with pytest.raises(fmpy.fmi1.FMICallException, match="DoStep"):
+        run(instance, refer, STEP, {"k3": -1e6})
+    instance.freeInstance()
+
+
+@no_compiler
+def test_the_same_model_gives_the_same_bytes(hard_fmu):
+    """Twice the same file; another number, another GUID."""
+    assert fmu(describe(HARD, units=PAPER_UNITS))[0] == hard_fmu.read_bytes()
+    other, _ = fmu(describe(model_of("coulomb_friction"), units=PAPER_UNITS))
+    guids = {fmpy.read_model_description(f).guid for f in (io.BytesIO(other), str(hard_fmu))}
+    assert len(guids) == 2
+
+
+def test_without_a_compiler_the_fmu_has_its_sources(monkeypatch):
+    """Which other tools compile; no binary then, and it is told."""
+    monkeypatch.setattr(fmu_module.shutil, "which", lambda name: None)
+    whole, compiled_too = fmu(describe(HARD, units=PAPER_UNITS))
+    assert not compiled_too
+    names = zipfile.ZipFile(io.BytesIO(whole)).namelist()
+    assert {f"sources/{n}" for n in ("model.c", "model.h", "fmi2.c", "fmi2.h")} <= {*names}
+    assert not [name for name in names if name.startswith("binaries")]
