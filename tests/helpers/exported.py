@@ -3,7 +3,6 @@
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -55,9 +54,7 @@ class CompiledModel:
         self._run = ctypes.CDLL(str(folder / "model.so")).run
         self._run.restype = ctypes.c_int
 
-    def simulate(
-        self, t: Array, u: Array, *, x0: Sequence[float] | None = None, step: float = 0.0
-    ) -> Array:
+    def simulate(self, t: Array, u: Array, *, x0: Array | None = None, step: float = 0.0) -> Array:
         """Return the readings (carts, samples), from rest at `x0` or where the carts rest."""
         y = np.zeros((self._n, t.size))
         given = [np.ascontiguousarray(a, dtype=np.float64) for a in (t, u)]

@@ -520,7 +520,7 @@ def bench(tmp_path_factory):
         (folder / name).write_text(text, encoding="utf-8")
         toml += f'[[experiments]]\nid = "{record.id}"\nkind = "{kind}"\nfile = "{name}"\n'
     (folder / "submission.toml").write_text(toml, encoding="utf-8")
-    done = cartlab_here("gap", folder, "--json")
+    done = cartlab_here("gap", folder, "--json", "--model")
     (hidden,) = case.hidden
     return SimpleNamespace(folder=folder, done=done, force=hidden.parameters["force"])
 
@@ -546,6 +546,10 @@ def test_command_writes_everything_and_names_the_friction(bench):
         f"data/{path.name}" for path in (bench.folder / "data").iterdir()
     }
     assert "Dry (Coulomb) friction on cart 1 explains" in bench.done.stderr
+    assert "model.fmu, model.c, model.h and model.m" in bench.done.stderr
+    force = effect["parameters"]["force"]["value"]
+    for name in ("model.c", "model.m"):
+        assert f"coulomb_friction_1_force = {force}" in (out / name).read_text(encoding="ascii")
 
 
 @pytest.mark.slow

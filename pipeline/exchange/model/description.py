@@ -1,8 +1,8 @@
-"""What a model holds, the same for every language: its parameters, bodies and laws.
+"""The content of a model, the same for every language: its parameters, bodies and laws.
 
-Laws are expressions as `syntax` takes them, in names of the model: `p.m1`, `x.cart_1`, `v.motor`,
-`z.z1`; `u` is the force that arrives from the drive, `on` 1 while it is powered; of a spring `d` is
-the stretch and `rate` how fast it grows.
+Laws are expressions for `syntax`, with the names of the model: `p.m1`, `x.cart_1`, `v.motor`,
+`z.z1`. `u` is the force that arrives from the drive, and `on` is 1 while the drive is powered. In a
+spring, `d` is the stretch and `rate` its velocity.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,9 +27,8 @@ from pipeline.plant.nonlinear.effects.law import (
 from pipeline.plant.nonlinear.simulator.laws import settling
 from pipeline.set_up import Units
 
-# Of the fastest oscillation, a contact's too, in a step: its period is right to 1e-4.
-_PHASE = 0.05
-_LONGEST = 2e-4  # s; what switches inside a step does so as late as this
+_PHASE = 0.05  # rad of the fastest oscillation in a step: its period is right to 1e-4
+_LONGEST = 2e-4  # s
 _DIGITS = 10  # as in gap.json
 
 
@@ -44,7 +43,7 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """The value as every language reads it."""
+        """The value as a number of any language."""
         return f"{self.value:.{_DIGITS}g}"
 
     @property
@@ -73,13 +72,13 @@ class Body:
 
 @dataclass(frozen=True)
 class Force:
-    """A force on a body, or a tension that a spring has more.
+    """A force on a body, or a part of a spring's tension.
 
     Attributes
     ----------
-    side, depth, rate : of a contact: the sign of `side` tells where it acts, once `depth`, which
-        grows at `rate`, has that sign.
-    pulls : a contact may pull, too.
+    side, depth, rate : of a contact, which acts while `depth` has the sign of `side`. `rate` is the
+        velocity of `depth`.
+    pulls : whether a contact may pull too.
     """
 
     title: str
@@ -93,7 +92,7 @@ class Force:
 
 @dataclass(frozen=True)
 class SpringTension:
-    """A spring, its stretch and its tension; `left` and `right` are the bodies it ties, or ""."""
+    """A spring with its stretch and its tension; `left` and `right` are its bodies, "" a wall."""
 
     meaning: str
     stretch: str
@@ -130,12 +129,12 @@ class Bristle:
 
     @property
     def rate_slope(self) -> str:
-        """What the rate has more for each unit of bend."""
+        """The derivative of the rate by the bend."""
         return f"{substitute(self.rate, {'z': '1'})} - ({self.rate_at_zero})"
 
     @property
     def most(self) -> str:
-        """What the force has more for each unit of bend."""
+        """The derivative of the force by the bend."""
         return substitute(f"({self.force})", {"z": "1"}) + (
             f" - ({substitute(self.force, {'z': '0'})})"
         )
@@ -143,15 +142,17 @@ class Bristle:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A model, ready to be written in a language.
+    """A model for the templates.
 
     Attributes
     ----------
-    links : forces between two bodies, on the first and back on the second.
-    play : the parameters gap, stiffness and damping between motor and cart 1, or none.
-    inputs : what becomes of `u`, one after the other; delay, lag : a parameter or "".
-    rest : (n_carts,) where the carts rest without friction.
-    titles : of its effects; turned : the input of the recordings counts the other way.
+    links : each hidden mass, with the force on its cart; the opposite force acts on the mass.
+    play : gap, stiffness and damping between motor and cart 1, or None.
+    inputs : title and law of each step from the logged input to `u`, in order.
+    delay, lag : a parameter, or "".
+    rest : (n_carts,) positions at which the carts rest without friction.
+    titles : of its effects.
+    turned : whether the recordings count the input the other way.
     """
 
     units: Units
@@ -179,18 +180,18 @@ class Description:
 
     @property
     def contacts(self) -> list[Force]:
-        """What acts on one side of a position alone."""
+        """The forces that act on one side of a position only."""
         parts = [*self.forces, *(part for s in self.springs for part in s.tension)]
         return [part for part in parts if part.side]
 
     @property
     def pushes(self) -> list[Force]:
-        """The contacts that never pull."""
+        """The contacts that cannot pull."""
         return [part for part in self.contacts if not part.pulls]
 
     @property
     def laws(self) -> list[str]:
-        """All expressions that a file evaluates, but those of masses and readings."""
+        """All expressions of the file except masses and readings."""
         parts = [*self.forces, *(part for s in self.springs for part in s.tension)]
         texts = [part.force for part in (*parts, *self.frictions)]
         texts += [text for bristle in self.bristles for text in (bristle.force, bristle.rate)]
@@ -198,18 +199,18 @@ class Description:
 
 
 def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> Description:
-    """Return a model as every language writes it.
+    """Return the content of a model.
 
     Parameters
     ----------
-    turned : the input of the recordings counts the other way.
+    turned : whether the recordings count the input the other way.
 
     Raises
     ------
-    DataError : the drive leads its log, which no program that runs forward in time can.
+    DataError : the drive leads its log, so the model would need future inputs.
     """
     chain, terms = model.chain, model.terms
-    refuse_lead(terms)
+    _refuse_lead(terms)
     by_law: dict[type, list[EffectTerm]] = {}
     for term in terms:
         by_law.setdefault(type(term.effect.law), []).append(term)
@@ -217,7 +218,10 @@ def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> De
         kind: [term for term in by_law.get(BuiltLaw, []) if term.effect.is_built(kind)]
         for kind in ("hidden mass", "play", "delay", "lag", "reading")
     }
-    play = _names(built["play"][0]) if built["play"] else None
+    play = None
+    for term in built["play"]:
+        gap, _, stiffness, damping = _names(term)
+        play = gap, stiffness, damping
     bodies = _bodies(chain, built)
     gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
     step = Parameter("max_step", _longest_step(model), "s", "longest step inside")
@@ -230,7 +234,7 @@ def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> De
         springs=_springs(chain, terms),
         forces=_forces(terms, driven="motor" if play else "cart_1", n=chain.n),
         links=tuple(_link(term) for term in built["hidden mass"]),
-        play=play and (play[0], play[2], play[3]),
+        play=play,
         frictions=tuple(
             Force(_title(term), _law(term, term.effect.law.size), f"cart_{term.place}")
             for term in terms
@@ -261,7 +265,7 @@ def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> De
     )
 
 
-def refuse_lead(terms: Sequence[EffectTerm]) -> None:
+def _refuse_lead(terms: Sequence[EffectTerm]) -> None:
     """Check that the drive does not lead its log.
 
     Raises
@@ -271,8 +275,8 @@ def refuse_lead(terms: Sequence[EffectTerm]) -> None:
     for term in terms:
         if term.effect.is_built("delay") and term.values[0] < 0.0:
             raise DataError(
-                "the drive leads its log (a negative delay): a model would need the input before "
-                "it comes; move the input in the files by that time, then run cartlab gap again"
+                f"the drive leads its log by {-term.values[0]:.3g} s, so a model would need future "
+                "inputs; shift the input in the data files by this time, then repeat cartlab gap"
             )
 
 
@@ -303,7 +307,7 @@ def _law(term: EffectTerm, text: str, **quantities: str) -> str:
 
 def _parameters(chain: Chain, terms: Sequence[EffectTerm], units: Units) -> list[Parameter]:
     carts = range(1, chain.n + 1)
-    springs = {j + 1 for j in np.flatnonzero(chain.k)}
+    springs = {j for j, k in enumerate(chain.k, start=1) if k != 0.0}
     springs |= {term.place for term in terms if term.effect.place == "spring"}
     return [
         *(Parameter(f"m{i}", chain.m[i - 1], units.mass, f"mass of cart {i}") for i in carts),
@@ -327,7 +331,8 @@ def _parameters(chain: Chain, terms: Sequence[EffectTerm], units: Units) -> list
 
 def _between(j: int, n: int) -> str:
     ends = ["the left wall", *(f"cart {i}" for i in range(1, n + 1)), "the right wall"]
-    return f"{j}, from {ends[j - 1]} to {ends[j]}"
+    alone = " (of two springs, their sum)" if n == 1 else ""
+    return f"{j}, from {ends[j - 1]} to {ends[j]}{alone}"
 
 
 def _bodies(chain: Chain, built: Mapping[str, list[EffectTerm]]) -> tuple[Body, ...]:
@@ -337,7 +342,7 @@ def _bodies(chain: Chain, built: Mapping[str, list[EffectTerm]]) -> tuple[Body, 
     others = []
     for term in built["play"]:
         mass = _names(term)[1]
-        # As in our simulator, a motor never leaves cart 1 without a mass.
+        # As in our own simulator, cart 1 keeps some mass of its own.
         carts[0] = replace(carts[0], mass=f"max(p.m1 - {mass}, 0.02 * p.m1)")
         others.append(Body("motor", "motor, in play with cart 1", "_motor", mass, 0))
     for term in built["hidden mass"]:
@@ -352,7 +357,7 @@ def _springs(chain: Chain, terms: Sequence[EffectTerm]) -> tuple[SpringTension, 
         here = [t for t in terms if t.effect.place == "spring" and t.place == j]
         if chain.k[j - 1] == 0.0 and not here:
             continue
-        ends = [f"cart_{i}" if 1 <= i <= chain.n else "" for i in (j - 1, j)]
+        left, right = (f"cart_{i}" if 1 <= i <= chain.n else "" for i in (j - 1, j))
         parts = [Force("", f"p.k{j} * d")]
         for term in here:
             law = term.effect.law
@@ -362,14 +367,14 @@ def _springs(chain: Chain, terms: Sequence[EffectTerm]) -> tuple[SpringTension, 
                     side = _law(term, law.past)
                     part = replace(part, side=side, depth=f"d - {side}", rate="rate")
                 parts.append(part)
-        stretch, rate = (_difference(letter, *ends) for letter in "xv")
+        stretch, rate = (_difference(letter, left, right) for letter in "xv")
         meaning = _between(j, chain.n)
-        springs.append(SpringTension(meaning, stretch, rate, *ends, tuple(parts)))
+        springs.append(SpringTension(meaning, stretch, rate, left, right, tuple(parts)))
     return tuple(springs)
 
 
 def _difference(letter: str, left: str, right: str) -> str:
-    """Return what one end has more than the other; a wall has nothing."""
+    """Return right minus left; a wall is at zero."""
     if not (left and right):
         return f"{letter}.{right}" if right else f"-{letter}.{left}"
     return f"{letter}.{right} - {letter}.{left}"
@@ -402,9 +407,9 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
 
 
 def _longest_step(model: AugmentedChain) -> float:
-    """Return a step in which nothing swings by more than a twentieth of a radian, s.
+    """Return the longest step in s: a twentieth of a radian of the fastest oscillation.
 
-    In a contact by twice as much: our own simulator takes four times such a step, of high order.
+    In a contact it is a tenth. Our own simulator, of higher order, takes steps four times as long.
     """
     step = 0.25 * SteppedBench(model).shortest_step
     cart = model.tables().cart

@@ -1,10 +1,9 @@
-"""The model as an FMU: FMI 2.0, co-simulation, with its sources and, where one can, its binary.
+"""The model as an FMU: FMI 2.0, co-simulation, with sources and, if there is a compiler, a binary.
 
 Reference: Functional Mock-up Interface for Model Exchange and Co-Simulation, version 2.0.4.
 """
 
 import hashlib
-import platform
 import shutil
 import subprocess
 import sys
@@ -20,15 +19,15 @@ from pipeline.exchange.model.description import Description
 from pipeline.exchange.model.sources import c_sources, render
 
 _COMPILERS = ("cc", "gcc", "clang")
-_PATIENCE = 120.0  # s; a compiler takes a quarter of one
-_BEGINNING = (1980, 1, 1, 0, 0, 0)  # of time, in a zip: the same model, the same bytes
+_PATIENCE = 120.0  # s; compiling takes 0.3 s
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # the first date of a zip: the same model gives the same bytes
 _LIBRARY = {"linux": "so", "darwin": "dylib", "win32": "dll"}
 _SYSTEM = {"linux": "linux", "darwin": "darwin", "win32": "win"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variable:
-    """A variable as modelDescription.xml has it; `member` is where it is in the C structure."""
+    """A variable in modelDescription.xml; `member` is its place in the C structure."""
 
     index: int
     name: str
@@ -45,7 +44,7 @@ def fmu(description: Description) -> tuple[bytes, bool]:
     sources = c_sources(description)
     variables = _variables(description)
     settable = sum(v.causality in ("input", "parameter") for v in variables)
-    # Whoever loads the binary must have the description that goes with it.
+    # A tool checks that binary and description have the same GUID.
     known = "".join([*sources.values(), *map(repr, variables), __version__])
     guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
     said = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
@@ -99,7 +98,7 @@ def _variables(description: Description) -> list[Variable]:
 
 
 def compile_library(sources: Mapping[str, str]) -> bytes | None:
-    """Return the sources as a library for this computer; None where no compiler can."""
+    """Return the sources as a library for this computer; None without a working compiler."""
     compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
     if compiler is None or sys.platform not in _LIBRARY:
         return None
@@ -120,5 +119,5 @@ def _zip(files: Mapping[str, str | bytes]) -> bytes:
     stream = BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in files.items():
-            archive.writestr(zipfile.ZipInfo(name, _BEGINNING), content, zipfile.ZIP_DEFLATED)
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), content, zipfile.ZIP_DEFLATED)
     return stream.getvalue()

@@ -14,9 +14,9 @@ FILES = ("model.fmu", "model.c", "model.h", "model.m")
 
 
 def save_model(model: AugmentedChain, analysis: Analysis, out: Path) -> str:
-    """Write a model into the folder `out`; return what is to be said of it.
+    """Write a model into the folder `out`; return a sentence about it.
 
-    A model that no program can run is not written, which is said.
+    A model that needs future inputs is not written; the sentence says why.
     """
     driven = [record.input_scale for record in analysis.records if record.u is not None]
     turned = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
@@ -29,11 +29,11 @@ def save_model(model: AugmentedChain, analysis: Analysis, out: Path) -> str:
     for name, text in c_sources(description).items():
         write_file(out / name, text)
     write_file(out / "model.m", matlab_source(description))
-    alone = "" if compiled else "; no C compiler was found, so model.fmu holds its sources alone"
+    alone = "" if compiled else "; without a C compiler, model.fmu has C sources but no binary"
     return f"wrote {out / 'model.fmu'}, model.c, model.h and model.m{alone}"
 
 
 def clear_model(out: Path) -> None:
-    """Remove a model that was written earlier, so that it does not stand beside another gap."""
+    """Remove an earlier model, which does not belong to the new gap analysis."""
     for name in FILES:
         (out / name).unlink(missing_ok=True)

@@ -30,7 +30,7 @@ def matlab_source(description: Description) -> str:
 def render(
     name: str, description: Description, *, code: Callable[[str], str] = in_c, **more: Any
 ) -> str:
-    """Return a file of `templates/model`, its expressions in a language."""
+    """Fill in a file of `templates/model`; `code` writes an expression in the file's language."""
     import jinja2  # costs 50 ms
 
     environment = jinja2.Environment(
@@ -50,6 +50,6 @@ def render(
 
 
 def comment(text: str) -> str:
-    """Return a text for a comment, in ASCII, which every compiler reads; it ends no comment."""
-    plain = text.translate(_LETTERS).encode("ascii", "replace").decode()
-    return plain.replace("*/", "* /").replace("\\", "/").replace("??", "? ?")
+    """Return a text that is safe in a comment: ASCII, and nothing that ends or opens a comment."""
+    plain = text.translate(_LETTERS).encode("ascii", "replace").decode().replace("\\", "/")
+    return plain.replace("/*", "/ *").replace("*/", "* /").replace("??", "? ?")

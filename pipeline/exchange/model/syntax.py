@@ -1,8 +1,8 @@
-"""Expressions in Python's syntax, as C and as MATLAB write them.
+"""Translate expressions from Python's syntax to C and to MATLAB.
 
-The laws of the effects are such expressions (`plant.nonlinear.effects.law`). Here their symbols
-have become names of the model: `p.NAME` is a parameter, `x.BODY` and `v.BODY` a position and a
-velocity, `z.NAME` a bristle; all other names are local variables.
+The laws of the effects are such expressions (`plant.nonlinear.effects.law`). Here their symbols are
+names of the model: `p.NAME` is a parameter, `x.BODY` a position, `v.BODY` a velocity and `z.NAME` a
+bristle. All other names are local variables.
 """
 
 import ast
@@ -13,19 +13,22 @@ _FORMS = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub,
 )  # fmt: skip
 
+# The functions of a law, and `pow` for powers that have no operator.
+_MATH = {name: name for name in ("abs", "min", "max", "exp", "sin", "cos", "sign", "pow")}
+
 
 def substitute(text: str, symbols: Symbols) -> str:
-    """Return an expression with other names, or expressions, for its symbols."""
+    """Replace symbols of an expression by names or expressions."""
     return ast.unparse(_Substitution(symbols).visit(ast.parse(text, mode="eval")))
 
 
 def in_c(text: str) -> str:
-    """Return an expression in C; `sign` and `PI` are defined in the file, all else in math.h."""
+    """Return an expression in C; `sign` and `PI` must be defined in the file."""
     return ast.unparse(_C().visit(ast.parse(text, mode="eval")))
 
 
 def in_matlab(text: str, *, bodies: Sequence[str], bristles: Sequence[str]) -> str:
-    """Return an expression in MATLAB, whose bodies and bristles have numbers in this order."""
+    """Return an expression in MATLAB; bodies and bristles are numbered in the given order."""
     written = ast.unparse(_Matlab(bodies, bristles).visit(ast.parse(text, mode="eval")))
     return written.replace(" ** ", "^")
 
@@ -41,7 +44,7 @@ class _Substitution(ast.NodeTransformer):
         return ast.Call(node.func, [self.visit(one) for one in node.args], [])
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Leave out what a one or a zero, put in for a symbol, has made idle."""
+        """Simplify products and sums with 0 and 1, which may have replaced a symbol."""
         left, right = self.visit(node.left), self.visit(node.right)
         match node.op, _value(left), _value(right):
             case (ast.Mult(), 0, _) | (ast.Mult(), _, 0):
@@ -66,10 +69,10 @@ def _not_known(node: ast.AST) -> ValueError:
 
 
 class _Printer(ast.NodeTransformer):
-    """What the languages have in common: the forms that a law may have, each printed."""
+    """The part common to both languages; refuses every form that laws do not have."""
 
-    pi = ""
-    functions: Mapping[str, str]
+    def __init__(self, functions: Mapping[str, str], *, pi: str) -> None:
+        self._functions, self._pi = functions, pi
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         if not isinstance(node, _FORMS):
@@ -77,7 +80,7 @@ class _Printer(ast.NodeTransformer):
         return super().generic_visit(node)
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        return ast.Name(self.pi) if node.id == "π" else node
+        return ast.Name(self._pi) if node.id == "π" else node
 
     def visit_Constant(self, node: ast.Constant) -> ast.expr:
         if not isinstance(node.value, int | float):
@@ -95,20 +98,17 @@ class _Printer(ast.NodeTransformer):
                 for other in others:
                     first = self._call(name, first, other)
                 return first
-            case ast.Name(id=name) if name in self.functions:
+            case ast.Name(id=name) if name in self._functions:
                 return self._call(name, *given)
         raise _not_known(node)
 
     def _call(self, name: str, *given: ast.expr) -> ast.expr:
-        return ast.Call(ast.Name(self.functions[name]), list(given), [])
+        return ast.Call(ast.Name(self._functions[name]), list(given), [])
 
 
 class _C(_Printer):
-    pi = "PI"
-    functions = {
-        "abs": "fabs", "min": "fmin", "max": "fmax", "exp": "exp", "sin": "sin", "cos": "cos",
-        "sign": "sign", "pow": "pow",
-    }  # fmt: skip
+    def __init__(self) -> None:
+        super().__init__(_MATH | {"abs": "fabs", "min": "fmin", "max": "fmax"}, pi="PI")
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
         of = ast.unparse(node.value)
@@ -125,12 +125,8 @@ class _C(_Printer):
 
 
 class _Matlab(_Printer):
-    pi = "pi"
-    functions = {
-        name: name for name in ("abs", "min", "max", "exp", "sin", "cos", "sign", "power")
-    }  # fmt: skip
-
     def __init__(self, bodies: Sequence[str], bristles: Sequence[str]) -> None:
+        super().__init__(_MATH | {"pow": "power"}, pi="pi")
         self._order = {"x": bodies, "v": bodies, "z": bristles}
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
@@ -143,5 +139,5 @@ class _Matlab(_Printer):
         # a^b^c is (a^b)^c here, but a**(b**c) in Python.
         nested = isinstance(node.right, ast.BinOp) and isinstance(node.right.op, ast.Pow)
         if isinstance(node.op, ast.Pow) and nested:
-            return self._call("power", self.visit(node.left), self.visit(node.right))
+            return self._call("pow", self.visit(node.left), self.visit(node.right))
         return self.generic_visit(node)

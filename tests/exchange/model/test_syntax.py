@@ -21,8 +21,8 @@ FUNCTIONS = {
     **{"sign": np.sign, "clip": lambda a, low, high: min(max(a, low), high), "π": np.pi},
 }
 TRICKY = (
-    "a - (b - c)", "a / (b * c)", "a / b * c", "-a ** 2", "(-a) ** 2", "a ** c ** c", "(a ** c) ** c",
-    "a ** -c", "1 / 2 * a", "a - -b", "a * -b", "min(a, b, c)", "max(a, c, b) - 1",
+    "a - (b - c)", "a / (b * c)", "a / b * c", "-a ** 2", "(-a) ** 2", "a ** c ** c",
+    "(a ** c) ** c", "a ** -c", "1 / 2 * a", "a - -b", "a * -b", "min(a, b, c)", "max(a, c, b) - 1",
     "clip(a, -1, 1)", "clip(b, 0, 1)", "sign(b) * max(abs(b) - 0.2, 0)", "sin(2 * π * a / b + c)",
     "exp(-(a / b) ** 2)", "3 * cos(a) ** 2",
 )  # fmt: skip
@@ -53,14 +53,14 @@ MODELLED = [substitute(text, {name: f"s{i}" for i, name in enumerate(SYMBOLS)}) 
 
 
 def test_every_law_of_the_catalogue_is_an_expression():
-    """All but those that have a state of their own, which the simulators have built in."""
+    """Only laws with a state of their own are built into the simulators instead."""
     assert all(laws(effect) or isinstance(effect.law, BuiltLaw) for effect in CATALOGUE)
     assert len(LAWS) >= 15
 
 
 @no_compiler
 def test_expressions_keep_their_value_in_c(tmp_path):
-    """Precedence, powers, whole numbers and functions, and every law of the catalogue."""
+    """The value is the same with precedence, powers, whole numbers, functions and every law."""
     known = "".join(f"static const double {n} = {v!r};\n" for n, v in named().items())
     body = "".join(f"    out[{i}] = {in_c(text)};\n" for i, text in enumerate(MODELLED))
     source = (
@@ -93,15 +93,15 @@ def test_expressions_keep_their_value_in_octave(tmp_path):
 
 @pytest.mark.parametrize("text", ["a if b else c", "a < b", "[a]", "f(a)", "a @ b", "'a'"])
 def test_what_no_law_may_have_is_refused(text):
-    """Nothing is printed that a language would read in another way."""
+    """A form that no law has is an error, in both languages."""
     with pytest.raises(ValueError, match="no part of a law"):
         in_c(text)
     with pytest.raises(ValueError, match="no part of a law"):
         in_matlab(text, bodies=(), bristles=())
 
 
-def test_a_number_for_a_symbol_folds_what_it_makes_idle():
-    """A straight bristle leaves the first term, a fully bent one both."""
+def test_numbers_for_symbols_simplify_an_expression():
+    """The expressions of a straight and of a fully bent bristle are short."""
     rate = "(v - abs(v) * z) / d"
     assert substitute(rate, {"z": "0"}) == "v / d"
     assert substitute(rate, {"z": "1"}) == "(v - abs(v)) / d"
