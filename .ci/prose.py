@@ -63,6 +63,10 @@ def texts(file: Path) -> Iterator[tuple[int, str]]:
             yield from ((number, text) for text in quoted)
             if line.lstrip().startswith("#"):
                 yield number, line.lstrip("# ")
+    elif file.name.endswith((".c.j2", ".h.j2", ".m.j2")):
+        for found in re.finditer(r"(?ms)/\*.*?\*/|^% .*?$", raw):
+            plain = re.sub(r"(?m)^ \* ?|\{[%#{].*?[%#}]\}|^/\*|^% ?", " ", found[0])
+            yield raw[: found.start()].count("\n") + 1, plain
     else:
         yield from _paragraphs(raw, marked_up=file.suffix != ".md")
 

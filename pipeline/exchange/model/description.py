@@ -146,13 +146,10 @@ class Description:
 
     Attributes
     ----------
-    links : each hidden mass, with the force on its cart; the opposite force acts on the mass.
-    play : gap, stiffness and damping between motor and cart 1, or None.
-    inputs : title and law of each step from the logged input to `u`, in order.
-    delay, lag : a parameter, or "".
+    links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
+    inputs : title and law of each step from the logged input to `u`.
     rest : (n_carts,) positions at which the carts rest without friction.
-    titles : of its effects.
-    turned : whether the recordings count the input the other way.
+    turned : True if the recordings count the input the other way.
     """
 
     units: Units
@@ -162,11 +159,11 @@ class Description:
     springs: tuple[SpringTension, ...]
     forces: tuple[Force, ...]
     links: tuple[tuple[str, Force], ...]
-    play: tuple[str, str, str] | None
+    play: tuple[str, str, str] | None  # gap, stiffness, damping
     frictions: tuple[Force, ...]
     bristles: tuple[Bristle, ...]
     inputs: tuple[tuple[str, str], ...]
-    delay: str
+    delay: str  # a parameter, or ""
     lag: str
     readings: tuple[str, ...]
     rest: tuple[str, ...]

@@ -76,14 +76,14 @@ def _variables(description: Description) -> list[Variable]:
     fixed = {"causality": "parameter", "variability": "fixed"}
     tunable = {"causality": "parameter", "variability": "tunable"}
     turned = "; the recordings count it the other way" if description.turned else ""
-    add("u", "u", f"input, held during a step{turned}", units.input, "input", start="0")
+    add("u", "u", f"input, constant during a step{turned}", units.input, "input", start="0")
     for i, start in enumerate(description.rest, start=1):
-        meaning = f"where cart {i} is let go"
+        meaning = f"start position of cart {i}"
         add(f"x{i}_start", f"start[{i - 1}]", meaning, units.position, start=start, **fixed)
     for p in description.parameters:
         add(p.name, f"model.p.{p.name}", p.meaning, p.unit, start=p.text, **tunable)
     for i in range(1, description.n + 1):
-        add(f"x{i}", f"model.y[{i - 1}]", f"what sensor {i} reads", units.position, "output")
+        add(f"x{i}", f"model.y[{i - 1}]", f"reading of sensor {i}", units.position, "output")
     speed = f"{units.position}/s"
     for at, body in enumerate(description.bodies):
         if at >= description.n:
@@ -93,7 +93,7 @@ def _variables(description: Description) -> list[Variable]:
     for at, bristle in enumerate(description.bristles):
         add(bristle.name, f"model.z[{at}]", f"bend, -1 to 1: {bristle.title}", "", "local")
     if description.lag:
-        add("u_lag", "model.lagged", "the input behind the lag", units.input, "local")
+        add("u_lag", "model.lagged", "input after the lag", units.input, "local")
     return found
 
 

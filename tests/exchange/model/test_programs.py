@@ -201,13 +201,20 @@ def test_octave_moves_as_the_simulator_does(tmp_path):
     """A step, a sweep and a release of 0.6 s with friction, play and delay, taken step by step."""
     u = {name: run[0][T < 0.6] for name, run in RUNS.items()}
     np.savetxt(tmp_path / "u.txt", np.column_stack(list(u.values())), fmt="%.17g")
-    runs = (
-        f"u = load('{tmp_path / 'u.txt'}'); y = zeros(rows(u), 6); p = model('parameters');\n"
-        "x0 = {{[0 0], [0 0], [1.5 0.5]}};\n"
-        "for k = 1:3\n  s = model('start', p, x0{{k}});\n  y(1, 2*k-1:2*k) = s.y;\n"
-        "  for i = 2:rows(u)\n    [now, s] = model('step', s, u(i - 1, k), 0.002);\n"
-        "    y(i, 2*k-1:2*k) = now;\n  end\nend\nsave('-ascii', '-double', '{out}', 'y')\n"
+    lines = (
+        f"u = load('{tmp_path / 'u.txt'}');",
+        "y = zeros(rows(u), 6);",
+        "x0 = {{[0 0], [0 0], [1.5 0.5]}};",
+        "for k = 1:3",
+        "  s = model('start', model('parameters'), x0{{k}});",
+        "  y(1, 2*k-1:2*k) = s.y;",
+        "  for i = 2:rows(u)",
+        "    [y(i, 2*k-1:2*k), s] = model('step', s, u(i - 1, k), 0.002);",
+        "  end",
+        "end",
+        "save('-ascii', '-double', '{out}', 'y')",
     )
+    runs = "".join(f"{line}\n" for line in lines)
     found = in_octave({"hard": HARD}, runs, tmp_path)["hard"]
     for k, (name, (_, x0)) in enumerate(RUNS.items()):
         expected = simulate_augmented(HARD, T[T < 0.6], u[name], x0=x0)
