@@ -1,6 +1,6 @@
 """Compensate for dry friction with a model that cartlab found, and try it on a bench.
 
-    python friction_compensation.py team-07/gap/model.fmu socket://127.0.0.1:40123
+Usage: `python friction_compensation.py team-07/gap/model.fmu socket://127.0.0.1:40123`.
 
 A PD controller moves cart 1 by 1 cm, but the spring and dry friction keep it off the target. The
 linear model corrects the set point for the spring, the model with friction corrects it for both.

@@ -302,7 +302,7 @@ def explain(
     model: bool = False,
     progress: Progress,
 ) -> tuple[str, list[str]]:
-    """Write what a submission's linear model leaves out; return gap.json and what is to be said."""
+    """Write the gap analysis of a submission; return gap.json and the messages."""
     from pipeline.json_files import json_text
     from pipeline.output import named_folder, own_folder, write_file
     from pipeline.report.gap.story import render_gap

@@ -17,26 +17,7 @@ OCTAVE = shutil.which("octave-cli") or shutil.which("octave")
 no_compiler = pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 no_octave = pytest.mark.skipif(OCTAVE is None, reason="needs Octave")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O1", "-fPIC", "-shared")
-_RUN = """
-#include "model.h"
-
-int run(const double *t, const double *u, int n, const double *x0, double longest, double *y)
-{
-    CartModel model = {.p = cart_parameters};
-    int fine = 1;
-
-    if (longest > 0.0)
-        model.p.max_step = longest;
-    cart_model_start(&model, x0 ? x0 : cart_rest);
-    for (int k = 0; k < n; k++) {
-        for (int i = 0; i < CARTS; i++)
-            y[i * n + k] = model.y[i];
-        if (k + 1 < n)
-            fine = cart_model_step(&model, u[k], t[k + 1] - t[k]) && fine;
-    }
-    return fine;
-}
-"""
+_RUN = Path(__file__).with_name("run_model.c")
 
 
 class CompiledModel:
@@ -44,10 +25,10 @@ class CompiledModel:
 
     def __init__(self, description: Description, folder: Path) -> None:
         assert COMPILER is not None
-        for name, text in {**c_sources(description), "run.c": _RUN}.items():
-            (folder / name).write_text(text, encoding="utf-8")
-        files = [folder / "model.c", folder / "run.c"]
-        command = [COMPILER, *STRICT, "-o", folder / "model.so", *files, "-lm"]
+        for name, text in c_sources(description).items():
+            (folder / name).write_text(text, encoding="ascii")
+        files = [folder / "model.c", _RUN]
+        command = [COMPILER, *STRICT, f"-I{folder}", "-o", folder / "model.so", *files, "-lm"]
         done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         self._n = description.n

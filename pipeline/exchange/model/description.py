@@ -147,9 +147,9 @@ class Description:
     Attributes
     ----------
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
-    inputs : title and law of each step from the logged input to `u`.
-    rest : (n_carts,) positions at which the carts rest without friction.
-    turned : True if the recordings count the input the other way.
+    inputs : title and law of each step to `u`.
+    rest : (n_carts,) positions without dry friction.
+    turned : the recordings count the input the other way.
     """
 
     units: Units
