@@ -23,6 +23,7 @@ import psutil
 
 from pipeline.errors import PipelineError
 from pipeline.garbage import collect_seldom
+from pipeline.threads import ONE_EACH
 from pipeline.words.progress import Progress, silent
 
 _GLANCE = 0.05  # s between looks at the clock, the memory and who wants it stopped
@@ -33,13 +34,7 @@ _GRACE = 30.0  # s after its limit until a task without a parent to stop it ends
 _LAST_WORDS = 300  # characters of what a process, or a fault of our own, said
 _LUMP = 65_536  # bytes
 # One thread computes; another only listens, and needs no heap of its own, of 64 MB in glibc.
-_ONE_EACH = (
-    "OMP_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "VECLIB_MAXIMUM_THREADS",
-    "MALLOC_ARENA_MAX",
-)
+_SPARING = {**ONE_EACH, "MALLOC_ARENA_MAX": "1"}
 
 
 class Failed(PipelineError):
@@ -369,7 +364,7 @@ def _environment() -> dict[str, str]:
     package = str(Path(__file__).resolve().parents[1])
     before = os.environ.get("PYTHONPATH")
     path = f"{package}{os.pathsep}{before}" if before else package
-    return {**os.environ, **dict.fromkeys(_ONE_EACH, "1"), "PYTHONPATH": path}
+    return {**os.environ, **_SPARING, "PYTHONPATH": path}
 
 
 def _listen(sent: "queue.SimpleQueue[bytes]") -> None:

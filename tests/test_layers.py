@@ -13,7 +13,7 @@ PIPELINE = ROOT / "pipeline"
 
 # From the ground up, rooms and the rooms within them; a module imports from its own room or below.
 LEVELS = (
-    ("__init__", "arrays", "errors", "garbage", "resources", "plant.limits"),
+    ("__init__", "arrays", "errors", "garbage", "threads", "resources", "plant.limits"),
     ("json_files",),
     ("set_up",),
     ("names",),

@@ -6,7 +6,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
@@ -202,6 +201,8 @@ def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
 
 def _guided(record: Record, *, n: int) -> Array:
     """Return (n, samples) the smoothed motion of held carts, if it exceeds that of a reading."""
+    from scipy.signal import savgol_filter  # half a second: imported where it is used
+
     guided = np.zeros((n, record.t.size))
     # A local cubic over 20 ms to either side: a hand holds no faster motion.
     half = max(2, round(0.02 / record.sample_time))

@@ -1,12 +1,14 @@
-"""The designed loop as systems of python-control, and its distance from instability.
+"""The designed loop as a system of python-control, and its distance from instability.
 
 The loop is that of `sampled_loop`: gains on the state predicted for the moment the input acts, the
 observer's prediction, one sample of delay.
 """
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import brentq, minimize_scalar
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
@@ -19,7 +21,6 @@ if TYPE_CHECKING:
 
 _SLOWER = 1e-2  # times the slowest pole: the lower end of the band
 _NEAREST, _AROUND = 1e-6, 30  # of a mode's frequency, the least distance looked at, and how many
-_ON_AXIS = 1e-2  # rad, by which a crossing of the interpolated curve may miss the true one
 
 
 @result()
@@ -79,8 +80,6 @@ def stability_margins(
     ------
     DataError : a mode of the carts is undamped, such as one whose damping a fit held at zero.
     """
-    import control
-
     A, B, C = broken_loop(chain, controller, sample_time=sample_time)
     opened, closed = np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(B, C))
     if np.abs(closed).max() >= 1:
@@ -94,28 +93,44 @@ def stability_margins(
         shifted = np.exp(1j * sample_time * omega)[:, None, None] * np.eye(B.size) - A
         return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0].astype(np.complex128)
 
-    L = response(omega)
-    _, _, _, at_180, at_one, near_minus_one = control.stability_margins(
-        (np.abs(L), np.degrees(np.angle(L)), omega), returnall=True
-    )
+    at_180 = _crossings(lambda omega: response(omega).imag, omega)
     # At both ends of the band the response is real, and if negative it crosses -180° too; carts
     # without a spring to a wall have no lower end.
     at_180 = np.append(at_180, [0.0, np.pi / sample_time] if chain.is_tied else np.pi / sample_time)
-    # The curve between the frequencies was interpolated; now the true one is used.
-    real, size_one = response(at_180), response(at_one)
-    crosses = np.abs(np.angle(-real)) < _ON_AXIS
-    at_180, gain = at_180[crosses], 1 / np.abs(real[crosses])
-    reaches = np.abs(np.log(np.abs(size_one))) < _ON_AXIS
-    at_one, phase = at_one[reaches], np.degrees(np.angle(-size_one[reaches]))
+    real = response(at_180).real
+    at_180, gain = at_180[real < 0], -1 / real[real < 0]
+    at_one = _crossings(lambda omega: np.log(np.abs(response(omega))), omega)
+    phase = np.degrees(np.angle(-response(at_one)))
     gain_of, phase_of = np.argsort(np.abs(np.log(gain))), np.argsort(np.abs(phase))
-    distances = np.abs(1 + np.concatenate([L, real, response(near_minus_one)]))
     return Margins(
         gain=float(gain[gain_of[0]]) if gain.size else None,
         phase_deg=float(phase[phase_of[0]]) if phase.size else None,
-        modulus=float(distances.min()),
+        modulus=_least(lambda omega: np.abs(1 + response(omega)), np.append(omega, at_180)),
         omega_gain=float(at_180[gain_of[0]]) if gain.size else None,
         omega_phase=float(at_one[phase_of[0]]) if phase.size else None,
     )
+
+
+def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
+    """Return where a real curve passes zero; `omega` is so dense that it does once between two."""
+    sign = np.sign(curve(omega))
+    between = np.flatnonzero(sign[1:] * sign[:-1] < 0)
+
+    def value(at: float) -> float:
+        return float(curve(np.array([at]))[0])
+
+    found = [brentq(value, omega[i], omega[i + 1]) for i in between]
+    return np.append(omega[sign == 0], np.array(found, dtype=np.float64))
+
+
+def _least(curve: Callable[[Array], Array], omega: Array) -> float:
+    """Return the least value of a curve around the frequency where it is least."""
+    omega = np.unique(omega)
+    values = curve(omega)
+    i = int(values.argmin())
+    bounds = omega[max(i - 1, 0)], omega[min(i + 1, omega.size - 1)]
+    found = minimize_scalar(lambda w: curve(np.array([w]))[0], bounds=bounds, method="bounded")
+    return float(min(values[i], found.fun))
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:

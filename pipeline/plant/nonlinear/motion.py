@@ -17,7 +17,6 @@ from math import cos, exp, pi, sin
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.signal import tf2ss
 from scipy.special import factorial
 
 from pipeline.arrays import Array
@@ -285,6 +284,8 @@ class EquationsOfMotion:
 
 def _pade(delay: float) -> tuple[Array, Array, Array, float]:
     """Return A, b, c and d of the Padé approximation of exp(-s delay)."""
+    from scipy.signal import tf2ss  # half a second: imported where it is used
+
     q = np.arange(_PADE_ORDER, -1, -1)
     order = _PADE_ORDER
     weight = factorial(2 * order - q) * factorial(order)
