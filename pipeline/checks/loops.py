@@ -37,9 +37,9 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
 def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     """Check that the gains give the loop that was asked for.
 
-    Its value is the largest difference of a coefficient of the loop's polynomial, poles in z, from
-    the desired poles, or with LQR from the loop by scipy's Riccati solver; or the relative error of
-    the static gain, whichever is larger.
+    Its value is the largest difference of a coefficient of the loop's polynomial (poles in z), or
+    the relative error of the static gain if that is larger. The other polynomial is that of the
+    poles asked for, or with LQR that of the loop by scipy's Riccati solver.
     """
     asked = "the poles asked for" if design.Q is None else "the loop of scipy's Riccati solver"
     try:
