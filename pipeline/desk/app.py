@@ -250,9 +250,10 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
         if request.method == "POST":
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)
         ask = Ask(desk=desk, user=user, request=request, form=form)
-        if room == "student" and is_refused(path, user, ask.place):
-            raise HTTPException(403, REFUSED)
         try:
+            ask.require_place()
+            if room == "student" and is_refused(path, user, ask.place):
+                raise HTTPException(403, REFUSED)
             if iscoroutinefunction(handler):
                 return await handler(ask)
             # A Stop does not wait for one of the threads in which all others are answered.

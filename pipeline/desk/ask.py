@@ -160,6 +160,20 @@ class Ask:
             raise HTTPException(404, "there is nothing here that is yours to see")
         return self.place
 
+    def require_place(self) -> None:
+        """Refuse an address whose folder was moved or deleted, or lies on a lost disk.
+
+        Raises
+        ------
+        ConfigError : the folder cannot be reached.
+        """
+        if isinstance(self.place, Path) and not self.place.is_dir():
+            shown = self.place if self.user.owns else self.place.name
+            raise ConfigError(
+                f"{shown}: this folder is not there now; it was moved or deleted, or its disk is "
+                "not connected. Bring it back, then reload this page"
+            )
+
     @property
     def job(self) -> Job | None:
         """The last work in the place of the address, as this person may read of it."""

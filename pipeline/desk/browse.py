@@ -3,7 +3,6 @@
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +12,7 @@ from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import NAME
 
 MOST = 200  # folders in a list
-_LOOKED_AT = 20_000  # entries of a folder that are looked at
+_LOOKED_AT = 20_000  # folders of one, in their order, that are looked into
 
 Kind = Literal["submission", "grading", "empty", "folder"]
 
@@ -86,14 +85,14 @@ def list_folders(root: Path, inside: str) -> FolderList:
 
 
 def _list_names(folder: Path) -> tuple[list[str], bool]:
-    """Return the names of the folders in a folder, and whether it holds more than was looked at."""
+    """Return the first folders in a folder by name, and whether there are more."""
     try:
         with os.scandir(folder) as entries:
-            looked = list(islice(entries, _LOOKED_AT + 1))
+            names = [e.name for e in entries if not _is_hidden(e.name) and _is_folder(e)]
     except OSError as error:
         raise ConfigError(f"{folder}: cannot be looked into ({error.strerror})") from None
-    names = [entry.name for entry in looked if not _is_hidden(entry.name) and _is_folder(entry)]
-    return sorted(names, key=str.casefold), len(looked) > _LOOKED_AT
+    names.sort(key=str.casefold)
+    return names[:_LOOKED_AT], len(names) > _LOOKED_AT
 
 
 def _is_folder(entry: "os.DirEntry[str]") -> bool:

@@ -110,7 +110,7 @@ def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
     try:
         # A link may lead to a whole disk.
         files = 0 if data.is_symlink() else sum(1 for path in data.rglob("*") if path.is_file())
-        report = find_state(folder)
+        report = find_state(folder) if folder.is_dir() else "unreadable"
     except OSError:  # the desk may not look into it, or its disk is gone
         files, report = 0, "unreadable"
     return {

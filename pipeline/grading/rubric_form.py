@@ -1,6 +1,6 @@
-"""The numbers of a rubric as a form, and written back into its text.
+"""The values of a rubric as a form, and written back into its text.
 
-The text stays the truth. Only the digits of a value that changed are replaced, or a line is added:
+The text stays the truth. Only a value that changed is replaced, or a line is added:
 comments, order and everything else stay byte for byte.
 """
 
@@ -10,17 +10,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pipeline.errors import ConfigError
 from pipeline.grading import rubric as asked
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.rubric_file import key_lines
 from pipeline.names import read_name
+from pipeline.submission import Students
 from pipeline.submission.complaints import quote
 
-Unit = Literal["points", "percent", "share", "days", "percentage points"]
+Unit = Literal["points", "percent", "share", "days", "percentage points", "choice"]
 Key = tuple[str | int, ...]  # ("criteria", 3, "points")
+Value = Decimal | str
 
 _UNITS: Mapping[str, Unit] = {
     "points": "points",
@@ -30,25 +32,29 @@ _UNITS: Mapping[str, Unit] = {
     "overshoot_none": "percentage points",
 }
 _LATE = ("percent_per_day", "grace_days", "most_percent")
-_NUMBER = re.compile(
-    r"^(?P<before>\s*[A-Za-z0-9_.\"'-]+\s*=\s*)[-+]?[0-9][0-9_.eE+-]*(?P<after>\s*(?:#.*)?)$"
+_SEE: tuple[str, ...] = get_args(Students.model_fields["see"].annotation)
+_VALUE = re.compile(
+    r"^(?P<before>\s*[A-Za-z0-9_.\"'-]+\s*=\s*)"
+    r"(?:[-+]?[0-9][0-9_.eE+-]*|\"[a-z]*\"|'[a-z]*')(?P<after>\s*(?:#.*)?)$"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
 class RubricField:
-    """A number of a rubric.
+    """A number of a rubric, or one of several words.
 
     Attributes
     ----------
     name : of the input; that of a criterion has its id in it.
     value : as it is shown; a share is shown in percent.
+    choices : the words that the value can be; none: it is a number.
     """
 
     name: str
     key: Key
     unit: Unit
     value: str
+    choices: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,12 +70,13 @@ class CriterionFields:
 
 @dataclass(frozen=True, kw_only=True)
 class RubricForm:
-    """All numbers of a rubric; `costs` by the code of the remark."""
+    """What a form can change of a rubric; `costs` by the code of the remark."""
 
     criteria: tuple[CriterionFields, ...]
     late: Mapping[str, RubricField]
     costs: Mapping[str, RubricField]
     step: RubricField
+    see: RubricField
 
     @property
     def charged(self) -> list[str]:
@@ -84,10 +91,11 @@ class RubricForm:
         yield from self.late.values()
         yield from self.costs.values()
         yield self.step
+        yield self.see
 
 
 class WrongFields(ConfigError):
-    """Fields that are no numbers; `problems` by the name of the field."""
+    """Fields with wrong values; `problems` by the name of the field."""
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         self.problems = dict(problems)
@@ -95,7 +103,7 @@ class WrongFields(ConfigError):
 
 
 def rubric_form(rubric: Rubric) -> RubricForm:
-    """Return the numbers of a rubric as fields; defaults are filled in."""
+    """Return the values of a rubric as fields; defaults are filled in."""
     return RubricForm(
         criteria=tuple(_criterion(i, own, rubric.names) for i, own in enumerate(rubric.criteria)),
         late={key: _field(("late", key), getattr(rubric.late, key)) for key in _LATE},
@@ -104,6 +112,13 @@ def rubric_form(rubric: Rubric) -> RubricForm:
             for code, cost in rubric.flags.model_dump().items()
         },
         step=_field(("step",), rubric.step),
+        see=RubricField(
+            name="students.see",
+            key=("students", "see"),
+            unit="choice",
+            value=rubric.students.see,
+            choices=_SEE,
+        ),
     )
 
 
@@ -155,21 +170,27 @@ def _digits(number: Decimal) -> str:
 # ------------------------------------------------------------------------ written back
 
 
-def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Decimal]:
+def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Value]:
     """Return the values that were changed in a form, as the file has them.
 
     Fields that are not among `typed` stay.
 
     Raises
     ------
-    WrongFields : some are no numbers, or no fields of this rubric.
+    WrongFields : some have wrong values, or are no fields of this rubric.
     """
     fields = {field.name: field for field in form.fields()}
-    changed: dict[Key, Decimal] = {}
+    changed: dict[Key, Value] = {}
     wrong = {name: "the text does not have it any more" for name in typed if name not in fields}
     for name, field in fields.items():
         text = typed.get(name)
         if text is None or text.strip() == field.value:
+            continue
+        if field.choices:
+            if text in field.choices:
+                changed[field.key] = text
+            else:
+                wrong[name] = f"needs {' or '.join(field.choices)}, found {quote(text)}"
             continue
         try:
             number = Decimal(text.strip().replace(",", "."))
@@ -184,21 +205,25 @@ def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Deci
     return changed
 
 
-def with_values(text: str, values: Mapping[Key, Decimal]) -> str:
-    """Return the text of a rubric with other numbers in it.
+def with_values(text: str, values: Mapping[Key, Value]) -> str:
+    """Return the text of a rubric with other values in it.
 
     Raises
     ------
     ConfigError : a value is not on a line of its own; a person must change it in the text.
     """
-    for key, number in values.items():
-        text = _with_value(text, key, number)
+    for key, value in values.items():
+        text = _with_value(text, key, _toml(value))
     return text
 
 
-def _with_value(text: str, key: Key, number: Decimal) -> str:
-    wanted = _set(tomllib.loads(text), key, number)
-    for candidate in _candidates(text, key, _digits(number)):
+def _toml(value: Value) -> str:
+    return f'"{value}"' if isinstance(value, str) else _digits(value)
+
+
+def _with_value(text: str, key: Key, value: str) -> str:
+    wanted = _set(tomllib.loads(text), key, value)
+    for candidate in _candidates(text, key, value):
         try:
             if tomllib.loads(candidate) == wanted:
                 return candidate
@@ -208,28 +233,28 @@ def _with_value(text: str, key: Key, number: Decimal) -> str:
     raise ConfigError(f"{name}: is not on a line of its own; change it in the text")
 
 
-def _set(document: dict[str, Any], key: Key, number: Decimal) -> dict[str, Any]:
-    """Return a document with another number in it."""
+def _set(document: dict[str, Any], key: Key, value: str) -> dict[str, Any]:
+    """Return a document with another value in it, given as TOML."""
     document = deepcopy(document)
     here: Any = document
     for part in key[:-1]:
         here = here.setdefault(part, {}) if isinstance(here, dict) else here[part]
-    here[key[-1]] = tomllib.loads(f"x = {_digits(number)}")["x"]
+    here[key[-1]] = tomllib.loads(f"x = {value}")["x"]
     return document
 
 
-def _candidates(text: str, key: Key, digits: str) -> Iterator[str]:
-    """Yield the text with a number in the line that has it, or in a new one; the best first.
+def _candidates(text: str, key: Key, value: str) -> Iterator[str]:
+    """Yield the text with a value in the line that has it, or in a new one; the best first.
 
     What looks like a key may stand within a longer value: whoever asks sees what TOML makes of it.
     """
     lines, places = text.split("\n"), list(key_lines(text))
     for number, path in places:
-        found = _NUMBER.match(lines[number - 1]) if path == key else None
+        found = _VALUE.match(lines[number - 1]) if path == key else None
         if found:
-            line = f"{found['before']}{digits}{found['after']}"
+            line = f"{found['before']}{value}{found['after']}"
             yield "\n".join([*lines[: number - 1], line, *lines[number:]])
-    new, table = f"{key[-1]} = {digits}", key[:-1]
+    new, table = f"{key[-1]} = {value}", key[:-1]
     inside = [n for n, path in places if path == table or path[:-1] == table]
     for number in reversed(inside):
         yield "\n".join([*lines[:number], new, *lines[number:]])

@@ -87,17 +87,21 @@ document.addEventListener("htmx:afterSwap", (event) => {
     if (!kept.has(key(one))) continue;
     one[switched(one) ? "checked" : "value"] = kept.get(key(one));
     back.push(one);
-    for (let around = one.closest("details"); around; around = around.parentElement.closest("details")) around.open = true;
+    unfold(one);
   }
   if (heading() !== before) return scrollTo(0, 0); // another page altogether
   go_on_typing();
   rows = back.filter((one) => one.form?.dataset.row && (left.has(key(one)) || one === document.activeElement));
   left.clear();
 });
-// What is folded cannot have the focus, so it comes back after that.
+const unfold = (one) => {
+  for (let around = one.closest("details"); around; around = around.parentElement.closest("details")) around.open = true;
+};
+// What is folded cannot have the focus: the row may now be among the understood ones.
 const go_on_typing = () => {
   const field = typing && document.getElementById(typing.id);
   if (!field || field === document.activeElement) return;
+  unfold(field);
   field.focus();
   if (typing.at != null) field.setSelectionRange(typing.at, typing.to);
 };

@@ -41,6 +41,46 @@ def links(page: str) -> list[str]:
     return [unescape(name) for name in re.findall(r">([^<>]+)</a>", line)]
 
 
+def test_a_long_list_is_cut_after_it_is_sorted(root, monkeypatch):
+    """What is left off is at its end, in whatever order the disk has the folders."""
+    monkeypatch.setattr("pipeline.desk.browse._LOOKED_AT", 5)
+    (root / "long").mkdir()
+    for n in (7, 2, 9, 4, 1, 8, 3, 6, 5):
+        (root / "long" / f"{n}").mkdir()
+    listed = list_folders(root, "long")
+    assert [one.path.name for one in listed.found] == ["1", "2", "3", "4", "5"]
+    assert listed.left_off
+
+
+@pytest.mark.parametrize("instead", ["nothing", "a file", "a link to itself"])
+def test_a_lost_folder_is_named_on_its_page_and_breaks_no_other(tmp_path, instead):
+    """Deleted, moved or on a lost disk: one sentence says so, and what to do."""
+    team, graded = a_submission(tmp_path / "team"), tmp_path / "graded"
+    write_class(graded)
+    with DeskServer(folder=team) as server:
+        visitor = Visitor.of(server.url)
+        assert visitor.post("/open", folder=str(graded)).status == 303
+        for folder in (team, graded):
+            folder.rename(tmp_path / f"{folder.name}-away")
+            if instead == "a file":
+                folder.write_text("x", encoding="utf-8")
+            elif instead == "a link to itself":
+                folder.symlink_to(folder)
+        for room, folder in (("student/0/", team), ("student/0/report", team),
+                             ("bench/0/", team), ("solution/0/", team),
+                             ("grades/0/", graded)):  # fmt: skip
+            page = visitor.get(f"/{room}")
+            assert page.status == 422, room
+            assert f"{folder}: this folder is not there now" in page.text
+            assert "reload this page" in page.text
+        home = visitor.get("/")
+        assert (home.status, "cannot be read" in home.text) == (200, True)
+        for folder in (team, graded):
+            folder.unlink(missing_ok=True)
+            (tmp_path / f"{folder.name}-away").rename(folder)
+        assert [visitor.get(f"/{room}").status for room in ("student/0/", "grades/0/")] == [200] * 2
+
+
 def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
     """Each folder once, with its kind; links that lead out or to hidden folders are left out."""
     found = {one.inside: one.kind for one in list_folders(root, "").found}

@@ -43,7 +43,11 @@ def test_a_form_keeps_comments_and_order(data):
     form = rubric_form(parse_rubric(text, where=""))
     fields = data.draw(st.lists(st.sampled_from(list(form.fields())), min_size=1, max_size=6))
     typed = {
-        field.name: str(data.draw(st.decimals(0, 100, places=2, allow_nan=False)))
+        field.name: data.draw(
+            st.sampled_from(field.choices)
+            if field.choices
+            else st.decimals(0, 100, places=2, allow_nan=False).map(str)
+        )
         for field in fields
     }
 
@@ -51,15 +55,18 @@ def test_a_form_keeps_comments_and_order(data):
     new = with_values(text, changed)
 
     document, before = tomllib.loads(new), tomllib.loads(text)
-    for key, number in changed.items():
+    for key, value in changed.items():
         here: Any = document
         for part in key[:-1]:
             here = here[part]
-        assert Decimal(str(here.pop(key[-1]))) == number
+        found = here.pop(key[-1])
+        assert (found if isinstance(value, str) else Decimal(str(found))) == value
         was: Any = before
         for part in key[:-1]:
             was = was.get(part, {}) if isinstance(was, dict) else was[part]
         was.pop(key[-1], None)
+        if key[0] not in before:
+            assert document.pop(key[0]) == {}  # a table of its own
     assert document == before
     assert _comments(new) == _comments(text)
     left = iter(_without_numbers(new))
@@ -77,7 +84,9 @@ def test_nothing_changed_is_the_same_text():
         shown = {field.name: field.value for field in form.fields()}
         assert with_values(text, changed_fields(form, shown)) == text
         zeros = {
-            name: f"{value}0" if "." in value else f"{value}.0" for name, value in shown.items()
+            field.name: f"{field.value}0" if "." in field.value else f"{field.value}.0"
+            for field in form.fields()
+            if not field.choices
         }
         assert with_values(text, changed_fields(form, zeros)) == text
 
@@ -124,12 +133,31 @@ def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
     assert new == text.replace('"""\npoints = 1', '"""\npoints = 2')
 
 
-def test_no_number_is_named_with_its_field():
+def test_what_students_see_is_chosen_in_a_table_of_its_own_or_in_its_line():
+    """A comment behind the value stays."""
+    text = SHIPPED["throne-1dof"]
+    new = typed_into(text, students__see="check")
+    assert '[students]\nsee = "check"\n' in new
+    assert parse_rubric(new, where="").students.see == "check"
+    told = new.replace('see = "check"', "see = 'check'  # until week 3")
+    again = typed_into(told, students__see="report")
+    assert again == told.replace("'check'", '"report"')
+
+
+def test_a_wrong_value_is_named_with_its_field():
     """All of them at once."""
     form = rubric_form(load_rubric(Path("throne-1dof")))
     with pytest.raises(WrongFields) as wrong:
         changed_fields(
-            form, {"step": "much", "criteria.pieces.points": "", "late.grace_days": "nan"}
+            form,
+            {
+                "step": "much",
+                "criteria.pieces.points": "",
+                "late.grace_days": "nan",
+                "students.see": "all",
+            },
         )
-    assert sorted(wrong.value.problems) == ["criteria.pieces.points", "late.grace_days", "step"]
+    fields = ["criteria.pieces.points", "late.grace_days", "step", "students.see"]
+    assert sorted(wrong.value.problems) == fields
+    assert wrong.value.problems["students.see"] == "needs report or check, found 'all'"
     assert wrong.value.problems["step"] == "needs a number, found 'much'"

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 from pipeline.desk.browse import find_root
@@ -71,7 +70,7 @@ def _toml_files(root: Path) -> Iterator[Path]:
     """Yield the TOML files of a folder and of those directly in it."""
     for pattern in ("*.toml", "*/*.toml"):
         try:
-            found = sorted(islice(root.glob(pattern), _LOOKED_AT))
+            found = sorted(root.glob(pattern))[:_LOOKED_AT]
         except OSError:
             continue
         for path in found:
