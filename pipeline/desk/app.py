@@ -104,6 +104,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/aside", "POST", submission_page.set_aside),
     ("/student/{n:int}/save", "POST", submission_page.save),
     ("/student/{n:int}/experiments/{index:int}", "POST", submission_page.save_experiment),
+    ("/student/{n:int}/answer-together", "POST", submission_page.answer_together),
     ("/student/{n:int}/make-report", "POST", _start("make_report", "The report", then="#report")),
     ("/student/{n:int}/make-gap", "POST", _start("make_gap", "The gap", then="#report")),
     ("/student/{n:int}/gap/{name:path}", "GET", _serve("gap")),

@@ -74,7 +74,8 @@ document.addEventListener("htmx:beforeSwap", (event) => {
   const field = document.activeElement;
   typing = field.id && { id: field.id, at: field.selectionStart, to: field.selectionEnd };
   going_on = [];
-  for (let around = event.detail.requestConfig?.elt.closest("form, details"); around; around = around.parentElement.closest("details"))
+  const began = event.detail.requestConfig?.elt; // an answer for several rows lets their group fold
+  for (let around = began?.matches(".together") ? null : began?.closest("form, details"); around; around = around.parentElement.closest("details"))
     going_on.push(around.id, ...[...around.querySelectorAll("details[open]")].map((one) => one.id));
   unsaved.set(before, new Map(kept.map((one) => [key(one), state(one)])));
 });

@@ -12,7 +12,7 @@ import zipfile
 from concurrent.futures import ThreadPoolExecutor
 from html import unescape
 from pathlib import Path
-from urllib.parse import unquote
+from urllib.parse import unquote, urlencode
 
 import pytest
 
@@ -859,6 +859,45 @@ def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
     assert load_submission(folder).experiments[0].carts == (1,)
     assert "It was held" not in answers(visitor.get(HERE).text)
     assert "hardly moves" not in (folder / NAME).read_text(encoding="utf-8")
+
+
+def test_one_click_answers_what_several_recordings_ask(room):
+    """All of them are written, and the marks removed; wrong numbers are refused."""
+    visitor, folder = room
+    for name, n in (("a", 400), ("b", 420), ("c", 440)):
+        rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(n)]
+        visitor.upload(
+            HERE + "files", [(f"{name}.csv", "\n".join(["time,input,x1,x2", *rows]).encode())]
+        )
+    page = visitor.get(HERE)
+    assert "3 recordings: cart 2 hardly moves" in page.text
+    assert "It was held in all 3" in page.text
+    assert 'name="carts" value="1"' in page.text
+    before, seen = (folder / NAME).read_text(encoding="utf-8"), page.value("seen")
+    for wrong in ("3", "-1", "x", ""):
+        answer = visitor.post(HERE + "answer-together", seen=seen, carts="1", recording=wrong)
+        assert answer.status == 422
+    assert (folder / NAME).read_text(encoding="utf-8") == before
+    body = urlencode({"seen": seen, "carts": "1", "recording": [0, 1, 2]}, doseq=True).encode()
+    kind = "application/x-www-form-urlencoded"
+    assert visitor.send(HERE + "answer-together", body, kind=kind).status == 303
+    assert [run.carts for run in load_submission(folder).experiments] == [(1,)] * 3
+    assert "hardly moves" not in (folder / NAME).read_text(encoding="utf-8")
+    shown = visitor.get(HERE).text
+    assert "It was held" not in shown
+    assert visitor.send(HERE + "answer-together", body, kind=kind).status == 409  # outdated
+
+
+def test_what_needs_a_person_comes_first_and_the_rest_is_folded(filled):
+    """In a group of which some are understood; without a doubt there is one table."""
+    visitor, folder = filled
+    assert "rest-decay" not in visitor.get(HERE).text
+    file = folder / "data" / "decay-1b.csv"
+    file.write_bytes(file.read_bytes()[:-3].rpartition(b",")[0])
+    group = visitor.get(HERE).text.partition('id="kind-decay"')[2].partition("</section>")[0]
+    first, _, rest = group.partition('<details class="kind" id="rest-decay"><summary>')
+    assert ("decay-1b.csv" in first, "decay-1b.csv" in rest) == (True, False)
+    assert re.match(r"\d+ understood</summary>", rest)
 
 
 def test_what_was_not_taken_does_not_look_like_what_was(room):

@@ -8,7 +8,7 @@ from typing import Any
 
 from pipeline.desk.ask import NOTHING_KNOWN, Ask
 from pipeline.desk.student.doubts import ask_held
-from pipeline.desk.student.form import Field, count_carts, fill_experiment, is_marked
+from pipeline.desk.student.form import Answer, Field, count_carts, fill_experiment, is_marked
 from pipeline.ingest.inspect import NO_CLOCK
 from pipeline.submission.load import list_experiments, posix, stated_columns
 from pipeline.submission.models import MOST_EXPERIMENTS
@@ -81,6 +81,17 @@ class FileGroup:
     def to_look_at(self) -> int:
         """How many need a person."""
         return sum(row.needs_a_person for row in self.rows)
+
+    @property
+    def common(self) -> list[tuple[Field, list[int]]]:
+        """The questions that several recordings have, with the numbers of their tables."""
+        same: dict[tuple[str, tuple[Answer, ...]], tuple[Field, list[int]]] = {}
+        for row in self.rows:
+            for field in row.fields:
+                if field.answers and row.index is not None:
+                    question = same.setdefault((field.asked, field.answers), (field, []))
+                    question[1].append(row.index)
+        return [question for question in same.values() if len(question[1]) > 1]
 
 
 def group_rows(rows: Sequence[Row]) -> list[FileGroup]:

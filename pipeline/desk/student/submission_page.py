@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -29,6 +30,7 @@ from pipeline.desk.student.form import (
 from pipeline.desk.student.handin import list_held, list_missing, pack
 from pipeline.desk.student.room import Room, look_around
 from pipeline.desk.student.rows import gather_remarks, group_rows, look_at_all
+from pipeline.desk.typed import read_whole_number
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.processes import Failed
@@ -90,6 +92,30 @@ def save_experiment(ask: Ask) -> Response:
     def change(document: tomlkit.TOMLDocument) -> None:
         write_fields(document, changed)
         clear_marks(document, index, answered)
+
+    return _edit(ask, change, changed, place=_FILES)
+
+
+def answer_together(ask: Ask) -> Response:
+    """Write one answer about held carts into the tables of several recordings."""
+    shown, carts = _read_shown(ask), ask.text("carts")
+    most = len(list_experiments(shown)) - 1
+    numbers = [
+        read_whole_number(str(typed), name="recording", least=0, most=most)
+        for typed in ask.form.getlist("recording")
+    ]
+    changed = [
+        replace(field, value=carts)
+        for number in numbers
+        for field in fill_experiment(shown, number)
+        if field.path.endswith(".carts")
+    ]
+    answered = {number: _list_doubts(ask, shown, number) for number in numbers}
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        write_fields(document, changed)
+        for number, doubts in answered.items():
+            clear_marks(document, number, doubts)
 
     return _edit(ask, change, changed, place=_FILES)
 
