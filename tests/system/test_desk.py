@@ -252,6 +252,30 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
     assert (submission.title, submission.system.springs[0]) == ("typed", False)
 
 
+def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
+    """On a phone; what is settled folds, and what is left comes first."""
+    folder = tmp_path / "team"
+    (folder / "data").mkdir(parents=True)
+    for name, n in (("a", 400), ("b", 420), ("c", 440)):
+        rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(n)]
+        text = "\n".join(["time,input,x1,x2", *rows])
+        (folder / "data" / f"{name}.csv").write_text(text, encoding="utf-8")
+    fill(folder)
+    with DeskServer(folder=folder) as server:
+        window = show(server.url, size=PHONE)
+        assert fits(window)
+        row = window.locator("#row-0")
+        row.get_by_role("button", name="It was free").press("Enter")
+        for name in ("a.csv", "b.csv", "c.csv"):
+            shown = window.locator("tr").filter(has_text=name)
+            expect(shown).to_be_visible(visible=name != "a.csv")  # that one is understood
+        window.get_by_role("button", name="It was held in all 2").press("Enter")
+        expect(window.locator("#files details.kind[open]")).to_have_count(0)
+        assert fits(window)
+    runs = load_submission(folder).experiments
+    assert [run.carts for run in runs] == [(1, 2), (1,), (1,)]
+
+
 def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
     """Zip and report wait and say so; they go on after saving, or on request without it."""
     folder = a_submission(tmp_path / "team")

@@ -186,6 +186,7 @@ def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_pat
         expect(result).to_contain_text("20 points")
         expect(wrong).to_have_count(0)
         window.get_by_label("Off for each day begun").fill("50")
+        window.get_by_label("Students see").press("ArrowDown")
         assert fits(window)
         window.get_by_role("button", name="Show the preview").focus()
         with window.expect_navigation():
@@ -201,7 +202,8 @@ def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_pat
         expect(window.locator(".now .chip")).to_have_text("Saved")
         expect(window.get_by_role("heading", name="Grade graded again with it")).to_be_visible()
         assert fits(window)
-        assert load_rubric(path).late.percent_per_day == 50
+        rubric = load_rubric(path)
+        assert (rubric.late.percent_per_day, rubric.students.see) == (50, "check")
 
 
 def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
