@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.arrays import Array
-from pipeline.estimation.law_of_motion import ForceLeft, forces_left
+from pipeline.estimation.law_of_motion import ForceLeft, Seen, forces_left, see
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Intervention, Record
 
@@ -41,7 +41,8 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     first = {record.id: _first_alike(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]
     carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
-    bursts = [one for cart in carts for one in _bursts(cart, alone)]
+    seen = [one for one in map(see, alone) if one is not None]
+    bursts = [one for cart in carts for one in _bursts(cart, seen)]
     found = [
         replace(one, experiment=name)
         for name, twin in first.items()
@@ -90,8 +91,8 @@ def between(record: Record, interventions: Sequence[Intervention]) -> list[Recor
     return pieces
 
 
-def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
-    forces, size = forces_left(cart, records)
+def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
+    forces, size = forces_left(cart, seen)
     if not forces:
         return []
     shares = [_share(force, size) for force in forces]
@@ -121,7 +122,7 @@ def _bursts(cart: int, records: Sequence[Record]) -> list[Intervention]:
                 )
     driven = {
         record.id: float(record.t[0])
-        for record in records
+        for record in (one.record for one in seen)
         if record.u is not None and np.any(record.u)
     }
     return [one for one in found if not _recurs(one, found, driven)]

@@ -64,6 +64,29 @@ class ForceLeft:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Seen:
+    """Means over windows (n,) of one record, for all carts' laws.
+
+    Attributes
+    ----------
+    x, v, acceleration, span : (carts, n) of the carts that were measured; range of the reading.
+    u, on : (3, n) the input at each of `_LAGS`, and the share of the time that it is not zero.
+    gain : of white noise into the acceleration.
+    """
+
+    record: Record
+    t: Array
+    x: Array
+    v: Array
+    acceleration: Array
+    span: Array
+    u: Array
+    on: Array
+    gain: float
+    jumps: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _Windows:
     """Means over windows (n,) of one record: `x`, `v` (3, n) of the cart between its neighbours."""
 
@@ -93,13 +116,13 @@ class _Windows:
         return np.array([rest, u[0], *self.x, *u, *dampers, *dry]).T
 
 
-def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], float]:
+def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float]:
     """Return the force in each record that one law of a cart does not explain, and its usual size.
 
     Records in which a free neighbour was not measured are left out. The list is empty if the cart
     moves too little to fit the law.
     """
-    cut = [_cut(record, cart) for record in records if cart in record.free]
+    cut = [_between_neighbours(one, cart) for one in seen if cart in one.record.free]
     windows = [one for one in cut if one is not None]
     if not windows:
         return [], 0.0
@@ -137,42 +160,60 @@ def forces_left(cart: int, records: Sequence[Record]) -> tuple[list[ForceLeft], 
     return found, size
 
 
-def _cut(record: Record, cart: int) -> _Windows | None:
-    """Return a record in windows, or None if it is not usable."""
-    neighbours = (cart - 1, cart, cart + 1)
-    if any(c in record.free and c not in record.carts for c in neighbours):
-        return None
+def see(record: Record) -> Seen | None:
+    """Return the means over a record's windows, or None if it is shorter than one."""
     t, interval = record.t, record.sample_time
     # Samples in a window.
     width = max(round(_WINDOW / interval) + 1, 9)
     if width >= t.size:
         return None
     first = np.arange(0, t.size - width + 1, _hop(record))
-    still = np.zeros(t.size)
-    around = np.array([record.position(c) if c in record.carts else still for c in neighbours])
-    y, u = around[1], still if record.u is None else record.u
+    u = np.zeros(t.size) if record.u is None else record.u
     inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
     # Windows; more would need much memory in long recordings.
     parts = np.array_split(first, -(-first.size // 1000))
-    means = np.hstack([_means(t, around, inputs, part[:, None] + np.arange(width))
+    means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
                        for part in parts])  # fmt: skip
-    step = grain(t, y, step=record.encoder_step(cart))
     reach = round(_LAGS[-1] / interval) + 1
     # Of the input's range from one sample to the next.
     jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
     lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
+    x, v, acceleration, span = means[6:].reshape(4, len(record.carts), -1)
+    return Seen(
+        record=record,
+        t=means[0],
+        u=means[1:4],
+        on=means[4],
+        gain=float(np.median(means[5])),
+        x=x,
+        v=v,
+        acceleration=acceleration,
+        span=span,
+        jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
+    )
+
+
+def _between_neighbours(seen: Seen, cart: int) -> _Windows | None:
+    """Return what one cart's law is fitted to, or None if a free neighbour was not measured."""
+    record, neighbours = seen.record, (cart - 1, cart, cart + 1)
+    if any(c in record.free and c not in record.carts for c in neighbours):
+        return None
+    rows = [record.carts.index(c) if c in record.carts else None for c in neighbours]
+    still = np.zeros(seen.t.size)
+    row = record.carts.index(cart)
+    step = grain(record.t, record.position(cart), step=record.encoder_step(cart))
     # Smallest changes in a window: below these the cart rests.
     return _Windows(
         record=record,
-        t=means[0],
-        x=means[1:4],
-        v=means[4:7],
-        acceleration=means[7],
-        u=means[8:11],
-        on=means[11],
-        noise=float(np.median(means[12])) * step / np.sqrt(12.0),
-        moves=means[13] > 3.0 * step,
-        jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
+        t=seen.t,
+        x=np.array([still if i is None else seen.x[i] for i in rows]),
+        v=np.array([still if i is None else seen.v[i] for i in rows]),
+        acceleration=seen.acceleration[row],
+        u=seen.u,
+        on=seen.on,
+        noise=seen.gain * step / np.sqrt(12.0),
+        moves=seen.span[row] > 3.0 * step,
+        jumps=seen.jumps,
     )
 
 
@@ -182,25 +223,26 @@ def _hop(record: Record) -> int:
     return max(1, round(0.01 / record.sample_time))
 
 
-def _means(t: Array, around: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
-    """Return (14, n) means over the windows whose samples are `at` (n, samples).
+def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
+    """Return (6 + 4 carts, n) means over the windows whose samples are `at` (n, samples).
 
-    Time, positions, velocities, acceleration, inputs; the acceleration's gain for white noise, and
-    the range of the reading.
+    Time, inputs, the acceleration's gain for white noise; then of every cart the position, the
+    velocity, the acceleration, and the range of the reading.
     """
     local = t[at]
     w, w1, w2 = window_weights(local)
     s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
     held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
+    readings = [x[at] for x in y]
     return np.array(
         [
             (w * local).sum(1),
-            *((w * x[at]).sum(1) for x in around),
-            *(-(w1 * x[at]).sum(1) for x in around),
-            (w2 * around[1][at]).sum(1),
             *((held * u[at[:, :-1]]).sum(1) for u in inputs),
             np.linalg.norm(w2, axis=1),
-            np.ptp(around[1][at], axis=1),
+            *((w * x).sum(1) for x in readings),
+            *(-(w1 * x).sum(1) for x in readings),
+            *((w2 * x).sum(1) for x in readings),
+            *(np.ptp(x, axis=1) for x in readings),
         ]
     )
 
