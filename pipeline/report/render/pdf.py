@@ -49,9 +49,9 @@ def _source(text: str, choices: Choices) -> dict[str, Any]:
 
 
 def _lay_out(text: str, choices: Choices) -> Pages:
-    found = typst.query(**_source(text, choices), selector="<end>", field="value")
-    bounds, *ends = json.loads(found)
-    return Pages(ends=[End(**end) for end in ends], **bounds)
+    found = typst.query(**_source(text, choices), selector="<pages>", field="value")
+    (pages,) = json.loads(found)
+    return Pages(**pages | {"ends": [End(**end) for end in pages["ends"]]})
 
 
 def missing_characters(text: str) -> str:
