@@ -8,6 +8,7 @@ linear model corrects the set point for the spring, the model with friction corr
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -22,33 +23,38 @@ PERIOD, SECONDS = 0.001, 2.0
 VOLT, CM = 0.0001220703125, 0.00227  # per duty count and encoder count, as the bench says
 
 
-def simulate(fmu: Path, set_point: int, friction: float | None = None) -> float:
-    """Return where the cart rests, in counts, under the bench's controller (docs/protocol.md)."""
-    description = read_model_description(str(fmu))
-    refer = {variable.name: variable.valueReference for variable in description.modelVariables}
-    with TemporaryDirectory() as folder:
-        model = FMU2Slave(
+class Cart:
+    """The model of one cart under the controller of the bench (docs/protocol.md)."""
+
+    def __init__(self, fmu: Path, folder: str) -> None:
+        """Load the FMU, unpacked into a folder."""
+        description = read_model_description(str(fmu))
+        self._refer = {v.name: v.valueReference for v in description.modelVariables}
+        self._fmu = FMU2Slave(
             guid=description.guid,
             unzipDirectory=extract(str(fmu), folder),
             modelIdentifier="model",
             instanceName="cart",
         )
-        model.instantiate()
-        model.setupExperiment()
-        model.enterInitializationMode()
-        if friction is not None:
-            model.setReal([refer["coulomb_friction_1_force"]], [friction])
-        model.exitInitializationMode()
+        self._fmu.instantiate()
+
+    def rest(self, set_point: int, *, friction: bool) -> float:
+        """Return where the cart rests, in counts."""
+        fmu, refer = self._fmu, self._refer
+        fmu.reset()
+        fmu.setupExperiment()
+        fmu.enterInitializationMode()
+        if not friction:
+            fmu.setReal([refer["coulomb_friction_1_force"]], [0.0])
+        fmu.exitInitializationMode()
         x, error = 0.0, 0
         for k in range(round(SECONDS / PERIOD)):
             before, error = error, set_point - round(x / CM)
             duty = KP * error + KD * (error - before) / PERIOD
-            model.setReal([refer["u"]], [VOLT * min(max(duty, -MOST), MOST)])
-            model.doStep(k * PERIOD, PERIOD)
-            (x,) = model.getReal([refer["x1"]])
-        model.terminate()
-        model.freeInstance()
-    return x / CM
+            fmu.setReal([refer["u"]], [VOLT * min(max(duty, -MOST), MOST)])
+            fmu.doStep(k * PERIOD, PERIOD)
+            (x,) = fmu.getReal([refer["x1"]])
+        return x / CM
 
 
 def solve(rests_at: Callable[[int], float]) -> int:
@@ -81,9 +87,13 @@ def read_line(line: serial.SerialBase) -> tuple[int, int]:
 def main(fmu: Path, address: str) -> dict[str, int]:
     """Design both set points, try them on the bench, and return the errors in counts."""
     errors = {}
-    with serial.serial_for_url(address) as line:
-        for name, friction in (("linear", 0.0), ("with friction", None)):
-            set_point = solve(lambda r, friction=friction: simulate(fmu, r, friction))
+    with (
+        serial.serial_for_url(address) as line,
+        TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+    ):
+        cart = Cart(fmu, folder)
+        for name, friction in (("linear", False), ("with friction", True)):
+            set_point = solve(partial(cart.rest, friction=friction))
             errors[name] = try_on_bench(line, set_point) - TARGET
             print(f"{name}: set point {set_point} counts, error {errors[name]:+d} counts")
     return errors

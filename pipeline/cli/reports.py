@@ -323,7 +323,8 @@ def explain(
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))
     clear_model(out)
-    told = [save_model(found.model, analysis, out)] if model else []
+    moved = {row.cart for row in found.by_record}
+    told = [save_model(found.model, analysis, out, free=moved)] if model else []
     render_gap(found, analysis, out, pdf=pdf, progress=progress)
     wrote = _wrote(out, "gap", pdf=pdf)
     return text, [*_unreadable(analysis), terminal_verdict(found), wrote, *told]

@@ -5,7 +5,7 @@ Laws are expressions for `syntax`, with the names of the model: `p.m1`, `x.cart_
 spring, `d` is the stretch and `rate` its velocity.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -195,11 +195,18 @@ class Description:
         return texts + [text for _, text in self.inputs]
 
 
-def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> Description:
+def describe(
+    model: AugmentedChain,
+    *,
+    units: Units,
+    free: Collection[int] | None = None,
+    turned: bool = False,
+) -> Description:
     """Return the content of a model.
 
     Parameters
     ----------
+    free : the carts that may move, default all. Nothing is known of the others.
     turned : whether the recordings count the input the other way.
 
     Raises
@@ -219,17 +226,17 @@ def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> De
     for term in built["play"]:
         gap, _, stiffness, damping = _names(term)
         play = gap, stiffness, damping
-    bodies = _bodies(chain, built)
+    free = sorted(range(1, chain.n + 1) if free is None else free)
     gains = {term.place: f"{_names(term)[0]} * " for term in built["reading"]}
-    step = Parameter("max_step", _longest_step(model), "s", "longest step inside")
+    step = Parameter("max_step", _longest_step(model, free), "s", "longest step inside")
     inputs = sorted(by_law.get(InputLaw, []), key=lambda term: term.effect.key)
     return Description(
         units=units,
         n=chain.n,
-        parameters=(*_parameters(chain, terms, units), step),
-        bodies=bodies,
-        springs=_springs(chain, terms),
-        forces=_forces(terms, driven="motor" if play else "cart_1", n=chain.n),
+        parameters=(*_parameters(chain, terms, units, free), step),
+        bodies=_bodies(chain, built, free),
+        springs=_springs(chain, terms, free),
+        forces=_forces(terms, driven="motor" if play else "cart_1", free=free),
         links=tuple(_link(term) for term in built["hidden mass"]),
         play=play,
         frictions=tuple(
@@ -256,7 +263,7 @@ def describe(model: AugmentedChain, *, units: Units, turned: bool = False) -> De
         delay=_names(built["delay"][0])[0] if built["delay"] else "",
         lag=_names(built["lag"][0])[0] if built["lag"] else "",
         readings=tuple(f"{gains.get(i, '')}x.cart_{i}" for i in range(1, chain.n + 1)),
-        rest=tuple(f"{position + 0.0:.{_DIGITS}g}" for position in rest_positions(model)),
+        rest=tuple(f"{x + 0.0:.{_DIGITS}g}" for x in rest_positions(model, free=free)),
         titles=tuple(_title(term) for term in terms),
         turned=turned,
     )
@@ -302,16 +309,15 @@ def _law(term: EffectTerm, text: str, **quantities: str) -> str:
     return substitute(text, known | dict(zip(symbols, _names(term), strict=True)))
 
 
-def _parameters(chain: Chain, terms: Sequence[EffectTerm], units: Units) -> list[Parameter]:
-    carts = range(1, chain.n + 1)
-    springs = {j for j, k in enumerate(chain.k, start=1) if k != 0.0}
-    springs |= {term.place for term in terms if term.effect.place == "spring"}
+def _parameters(
+    chain: Chain, terms: Sequence[EffectTerm], units: Units, free: Sequence[int]
+) -> list[Parameter]:
     return [
-        *(Parameter(f"m{i}", chain.m[i - 1], units.mass, f"mass of cart {i}") for i in carts),
-        *(Parameter(f"c{i}", chain.c[i - 1], units.damping, f"damping of cart {i}") for i in carts),
+        *(Parameter(f"m{i}", chain.m[i - 1], units.mass, f"mass of cart {i}") for i in free),
+        *(Parameter(f"c{i}", chain.c[i - 1], units.damping, f"damping of cart {i}") for i in free),
         *(
             Parameter(f"k{j}", chain.k[j - 1], units.stiffness, f"spring {_between(j, chain.n)}")
-            for j in sorted(springs)
+            for j in _acting_springs(chain, terms, free)
         ),
         *(
             Parameter(
@@ -326,15 +332,27 @@ def _parameters(chain: Chain, terms: Sequence[EffectTerm], units: Units) -> list
     ]
 
 
+def _acting_springs(chain: Chain, terms: Sequence[EffectTerm], free: Sequence[int]) -> list[int]:
+    """Return the springs at a free cart."""
+    changed = {term.place for term in terms if term.effect.place == "spring"}
+    there = (j for j, k in enumerate(chain.k, start=1) if k != 0.0 or j in changed)
+    return [j for j in there if {j - 1, j} & {*free}]
+
+
 def _between(j: int, n: int) -> str:
     ends = ["the left wall", *(f"cart {i}" for i in range(1, n + 1)), "the right wall"]
     alone = " (of two springs, their sum)" if n == 1 else ""
     return f"{j}, from {ends[j - 1]} to {ends[j]}{alone}"
 
 
-def _bodies(chain: Chain, built: Mapping[str, list[EffectTerm]]) -> tuple[Body, ...]:
+def _bodies(
+    chain: Chain, built: Mapping[str, list[EffectTerm]], free: Sequence[int]
+) -> tuple[Body, ...]:
     carts = [
-        Body(f"cart_{i}", f"cart {i}", f"{i}", f"p.m{i}", i - 1) for i in range(1, chain.n + 1)
+        Body(f"cart_{i}", f"cart {i}", f"{i}", f"p.m{i}", i - 1)
+        if i in free
+        else Body(f"cart_{i}", f"cart {i}, held as in all recordings", f"{i}", "inf", i - 1)
+        for i in range(1, chain.n + 1)
     ]
     others = []
     for term in built["play"]:
@@ -348,12 +366,12 @@ def _bodies(chain: Chain, built: Mapping[str, list[EffectTerm]]) -> tuple[Body, 
     return (*carts, *others)
 
 
-def _springs(chain: Chain, terms: Sequence[EffectTerm]) -> tuple[SpringTension, ...]:
+def _springs(
+    chain: Chain, terms: Sequence[EffectTerm], free: Sequence[int]
+) -> tuple[SpringTension, ...]:
     springs = []
-    for j in range(1, chain.n + 2):
+    for j in _acting_springs(chain, terms, free):
         here = [t for t in terms if t.effect.place == "spring" and t.place == j]
-        if chain.k[j - 1] == 0.0 and not here:
-            continue
         left, right = (f"cart_{i}" if 1 <= i <= chain.n else "" for i in (j - 1, j))
         parts = [Force("", f"p.k{j} * d")]
         for term in here:
@@ -377,8 +395,8 @@ def _difference(letter: str, left: str, right: str) -> str:
     return f"{letter}.{right} - {letter}.{left}"
 
 
-def _forces(terms: Sequence[EffectTerm], *, driven: str, n: int) -> tuple[Force, ...]:
-    forces = [Force("", f"-p.c{i} * v.cart_{i}", f"cart_{i}") for i in range(1, n + 1)]
+def _forces(terms: Sequence[EffectTerm], *, driven: str, free: Sequence[int]) -> tuple[Force, ...]:
+    forces = [Force("", f"-p.c{i} * v.cart_{i}", f"cart_{i}") for i in free]
     for term in terms:
         law, body = term.effect.law, f"cart_{term.place or 1}"
         if term.effect.place == "spring":
@@ -403,12 +421,12 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
     return hidden, Force(_title(term), force, cart)
 
 
-def _longest_step(model: AugmentedChain) -> float:
+def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
     """Return the longest step in s: a twentieth of a radian of the fastest oscillation.
 
     In a contact it is a tenth. Our own simulator, of higher order, takes steps four times as long.
     """
-    step = 0.25 * SteppedBench(model).shortest_step
+    step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart
     for i, mass in enumerate(model.chain.m):
         holds, _, pace = settling(cart, i, 1.0)

@@ -1,5 +1,6 @@
 """A model saved for other programs: `model.fmu`, `model.c` with its header, and `model.m`."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 from pipeline.errors import DataError
@@ -13,15 +14,17 @@ from pipeline.results import Analysis
 FILES = ("model.fmu", "model.c", "model.h", "model.m")
 
 
-def save_model(model: AugmentedChain, analysis: Analysis, out: Path) -> str:
-    """Write a model into the folder `out`; return a sentence about it.
+def save_model(
+    model: AugmentedChain, analysis: Analysis, out: Path, *, free: Collection[int]
+) -> str:
+    """Write a model with its free carts into the folder `out`; return a sentence about it.
 
     A model that needs future inputs is not written; the sentence says why.
     """
     driven = [record.input_scale for record in analysis.records if record.u is not None]
     turned = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
     try:
-        description = describe(model, units=analysis.bench.units, turned=turned)
+        description = describe(model, units=analysis.bench.units, free=free, turned=turned)
     except DataError as error:
         return f"no model was written: {error}"
     whole, compiled = fmu(description)

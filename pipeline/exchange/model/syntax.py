@@ -16,6 +16,9 @@ _FORMS = (
 # The functions of a law, and `pow` for powers that have no operator.
 _MATH = {name: name for name in ("abs", "min", "max", "exp", "sin", "cos", "sign", "pow")}
 
+_IN_C = {"π": "PI", "inf": "INFINITY"}
+_IN_MATLAB = {"π": "pi", "inf": "Inf"}
+
 
 def substitute(text: str, symbols: Symbols) -> str:
     """Replace symbols of an expression by names or expressions."""
@@ -71,8 +74,8 @@ def _not_known(node: ast.AST) -> ValueError:
 class _Printer(ast.NodeTransformer):
     """The part common to both languages; refuses every form that laws do not have."""
 
-    def __init__(self, functions: Mapping[str, str], *, pi: str) -> None:
-        self._functions, self._pi = functions, pi
+    def __init__(self, functions: Mapping[str, str], constants: Mapping[str, str]) -> None:
+        self._functions, self._constants = functions, constants
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         if not isinstance(node, _FORMS):
@@ -80,7 +83,7 @@ class _Printer(ast.NodeTransformer):
         return super().generic_visit(node)
 
     def visit_Name(self, node: ast.Name) -> ast.expr:
-        return ast.Name(self._pi) if node.id == "π" else node
+        return ast.Name(self._constants.get(node.id, node.id))
 
     def visit_Constant(self, node: ast.Constant) -> ast.expr:
         if not isinstance(node.value, int | float):
@@ -108,7 +111,7 @@ class _Printer(ast.NodeTransformer):
 
 class _C(_Printer):
     def __init__(self) -> None:
-        super().__init__(_MATH | {"abs": "fabs", "min": "fmin", "max": "fmax"}, pi="PI")
+        super().__init__(_MATH | {"abs": "fabs", "min": "fmin", "max": "fmax"}, _IN_C)
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:
         of = ast.unparse(node.value)
@@ -126,7 +129,7 @@ class _C(_Printer):
 
 class _Matlab(_Printer):
     def __init__(self, bodies: Sequence[str], bristles: Sequence[str]) -> None:
-        super().__init__(_MATH | {"pow": "power"}, pi="pi")
+        super().__init__(_MATH | {"pow": "power"}, _IN_MATLAB)
         self._order = {"x": bodies, "v": bodies, "z": bristles}
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.expr:

@@ -44,7 +44,7 @@ def test_friction_is_compensated_on_the_virtual_bench(tmp_path):
     A cart rests within the last count, and the noise of the encoder is another.
     """
     model = AugmentedChain(chain=HIDDEN.chain, terms=HIDDEN.effects)
-    save_model(model, analysed("one-cart"), tmp_path)
+    save_model(model, analysed("one-cart"), tmp_path, free=(1,))
     with running_bench() as address:
         errors = main(tmp_path / "model.fmu", address)
     assert abs(errors["with friction"]) <= 2

@@ -36,7 +36,7 @@ def analysis() -> Analysis:
 def test_the_files_are_saved_and_cleared(analysis, tmp_path):
     """All four files are written and later removed; other files stay."""
     (tmp_path / "model.slx").write_text("mine")
-    said = save_model(with_effect("coulomb_friction"), analysis, tmp_path)
+    said = save_model(with_effect("coulomb_friction"), analysis, tmp_path, free=(1,))
     assert all((tmp_path / name).stat().st_size > 1000 for name in FILES)
     assert "model.fmu" in said
     clear_model(tmp_path)
@@ -45,7 +45,7 @@ def test_the_files_are_saved_and_cleared(analysis, tmp_path):
 
 def test_a_drive_that_leads_its_log_is_refused_in_a_sentence(analysis, tmp_path):
     """It would need future inputs: nothing is written, and the sentence says why."""
-    said = save_model(with_effect("input_delay", delay=-0.01), analysis, tmp_path)
+    said = save_model(with_effect("input_delay", delay=-0.01), analysis, tmp_path, free=(1,))
     assert said.startswith("no model was written: the drive leads its log")
     assert not [*tmp_path.iterdir()]
 
@@ -58,7 +58,7 @@ def test_the_recordings_sign_is_told(analysis, tmp_path):
     }
     for turned, records in other_way.items():
         model = with_effect("coulomb_friction")
-        save_model(model, replace(analysis, records=tuple(records)), tmp_path)
+        save_model(model, replace(analysis, records=tuple(records)), tmp_path, free=(1,))
         texts = [(tmp_path / name).read_text(encoding="ascii") for name in ("model.h", "model.m")]
         texts.append(next(v.description for v in read(tmp_path) if v.name == "u"))
         assert all(("the other way" in text) == turned for text in texts)
@@ -74,7 +74,7 @@ def test_a_unit_stays_a_word(unit, analysis, tmp_path):
     """No unit of a submission can end a comment or break the description."""
     units = Units(position=unit, input=unit)
     bench = replace(analysis.bench, units=units)
-    save_model(with_effect("cubic_spring"), replace(analysis, bench=bench), tmp_path)
+    save_model(with_effect("cubic_spring"), replace(analysis, bench=bench), tmp_path, free=(1,))
     (tmp_path / "c").mkdir()
     CompiledModel(describe(with_effect("cubic_spring"), units=units), tmp_path / "c")
     assert validate_fmu(str(tmp_path / "model.fmu")) == []
