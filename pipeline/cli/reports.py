@@ -323,8 +323,11 @@ def explain(
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))
     clear_model(out)
-    moved = {row.cart for row in found.by_record}
-    told = [save_model(found.model, analysis, out, free=moved)] if model else []
+    told = []
+    if model:
+        unseen = {i for r in analysis.records for i in r.free if i not in r.carts}
+        free = unseen | {row.cart for row in found.by_record}
+        told.append(save_model(found.model, analysis, out, free=free))
     render_gap(found, analysis, out, pdf=pdf, progress=progress)
     wrote = _wrote(out, "gap", pdf=pdf)
     return text, [*_unreadable(analysis), terminal_verdict(found), wrote, *told]
