@@ -17,7 +17,7 @@ from starlette.routing import Route
 
 from pipeline.desk.ask import Ask, Desk, plain_error, prepare_pages
 from pipeline.desk.bench import bench_page
-from pipeline.desk.doors import PAGE_HEADERS, ProxyDoor, SecretDoor, limit_bodies
+from pipeline.desk.doors import PAGE_HEADERS, JupyterDoor, ProxyDoor, SecretDoor, limit_bodies
 from pipeline.desk.grades import (
     class_actions,
     class_table,
@@ -40,7 +40,7 @@ from pipeline.desk.student import (
 from pipeline.desk.users import User, read_users
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.intake.unpack import HAND_IN
-from pipeline.web.guard import Guard
+from pipeline.web.guard import Door, Guard
 from pipeline.web.server import Served
 
 Handler = Callable[[Ask], Any]  # a Response, or one that is awaited
@@ -177,6 +177,7 @@ class DeskServer:
     folder : to begin with, of the person at this computer.
     port : to serve at; 0: a free one.
     host, users : of a lab server: the address to listen at, and the file that says who may what.
+    jupyter : the secret of the Jupyter server that starts the desk and passes requests on.
 
     Attributes
     ----------
@@ -190,6 +191,7 @@ class DeskServer:
         port: int = 0,
         host: str = "127.0.0.1",
         users: Path | None = None,
+        jupyter: str = "",
     ) -> None:
         listed = read_users(users) if users else None
         owner = User(name="", role="owner")
@@ -202,9 +204,12 @@ class DeskServer:
                 "with --port, or an IPv4 address of this computer with --host"
             ) from None
         port = listener.getsockname()[1]
+        self.url = f"http://{host}:{port}/"
+        door: Door
         if listed:
-            door: SecretDoor | ProxyDoor = ProxyDoor(*listed)
-            self.url = f"http://{host}:{port}/"
+            door = ProxyDoor(*listed)
+        elif jupyter:
+            door = JupyterDoor(owner, secret=jupyter)
         else:
             door = SecretDoor(owner, port=port, start=start)
             self.url = f"http://127.0.0.1:{port}/{door.secret}/"

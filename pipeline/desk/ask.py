@@ -1,5 +1,6 @@
 """One request: of whom, for which place, how it is answered; and what outlives requests."""
 
+import re
 import secrets
 from collections import OrderedDict
 from collections.abc import Callable
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import escape
 from starlette.datastructures import FormData, QueryParams
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
@@ -229,7 +231,13 @@ class Ask:
             "said": lambda place="": self.desk.said.pop(self._room(place), []),  # once
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
+        if prefix := self.request.scope.get("prefix"):
+            text = _ADDRESS.sub(lambda found: f'{found[1]}="{escape(prefix)}/', text)
         return HTMLResponse(self.user.told(text), status_code=status)
+
+    def go(self, to: str) -> Response:
+        """Return what has htmx open another page; a proxy adds its prefix to plain ways on only."""
+        return Response(headers={"HX-Redirect": self.request.scope.get("prefix", "") + to})
 
     def back(self, to: str, *said: str | Said, place: str = "") -> Response:
         """Return to a page, which says this once: at its head, or at a place that it has."""
@@ -237,6 +245,12 @@ class Ask:
             lines = [Said(one) if isinstance(one, str) else one for one in said]
             self.desk.said.setdefault(self._room(place), []).extend(lines)
         return RedirectResponse(to, status_code=303)
+
+
+# An address in a page that we wrote. Texts of others have no quotation marks there.
+_ADDRESS = re.compile(
+    r'\b(href|src|action|formaction|hx-get|hx-post|data-events|data-page)="/(?!/)'
+)
 
 
 @cache

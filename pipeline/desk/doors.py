@@ -13,7 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.desk.users import Proxy, User
-from pipeline.web.guard import HEADERS, list_own_names, refuse
+from pipeline.web.guard import HEADERS, find_site, list_own_names, refuse
 from pipeline.web.server import let_in
 
 PAGE_HEADERS = {
@@ -23,6 +23,7 @@ PAGE_HEADERS = {
     "frame-ancestors 'none'",
     "Referrer-Policy": "same-origin",  # a form says where it is from only where the page may tell
 }
+JUPYTER_SECRET = "X-Cartlab-Secret"
 MOST_FORM = 2_000_000  # bytes of a request that is no upload
 
 
@@ -36,12 +37,16 @@ class SecretDoor:
     arrivals = False  # the cookie does not come along
 
     def __init__(self, user: User, *, port: int, start: str) -> None:
-        self.sites = list_own_names(port)
+        self._sites = list_own_names(port)
         self.secret = secrets.token_urlsafe(24)
         self._user, self._session, self._opened = user, secrets.token_urlsafe(24), False
         self._start = start
         self._cookie = f"cartlab-{port}"  # cookies do not tell ports apart
         self._sent = re.compile(rf"\b{self._cookie}=([\w-]+)".encode())
+
+    def site(self, headers: Headers) -> str:
+        """Return by which of its own addresses the request asks."""
+        return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
         """Return who asks, or the answer to who may not."""
@@ -70,8 +75,12 @@ class ProxyDoor:
     arrivals = True  # from the page of a login, or of a course
 
     def __init__(self, proxy: Proxy, users: Mapping[str, User]) -> None:
-        self.sites = frozenset([proxy.site])
+        self._sites = frozenset([proxy.site])
         self._proxy, self._users = proxy, users
+
+    def site(self, headers: Headers) -> str:
+        """Return by which of its own addresses the request asks."""
+        return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
         """Return who asks, or the answer to who may not."""
@@ -85,6 +94,30 @@ class ProxyDoor:
         if len(names) != 1 or not listed:
             return refuse("you are not on the list of this desk; ask your instructor")
         return {"user": self._users[listed[0]]}
+
+
+class JupyterDoor:
+    """For a person's own Jupyter server, which passes on what this person asks, and the secret.
+
+    The addresses of the desk then begin with a prefix, which Jupyter takes away and names.
+    """
+
+    arrivals = True  # from the page of a login
+
+    def __init__(self, user: User, *, secret: str) -> None:
+        self._user, self._secret = user, secret
+
+    def site(self, headers: Headers) -> str:
+        """Return the name by which Jupyter lets itself be asked; another page has another."""
+        scheme = headers.get("origin", "").partition("://")[0] or "http"
+        return f"{scheme}://{headers.get('host', '')}"
+
+    def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
+        """Return who asks, or the answer to who may not."""
+        sent = headers.getlist(JUPYTER_SECRET)
+        if len(sent) != 1 or not _is_same(sent[0].encode("latin-1"), self._secret):
+            return refuse("open the desk from the launcher of Jupyter")
+        return {"user": self._user, "prefix": headers.get("x-forwarded-prefix", "").rstrip("/")}
 
 
 def _read_name(name: str) -> Iterator[str]:

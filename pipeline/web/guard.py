@@ -23,9 +23,8 @@ HEADERS: Mapping[str, str] = {
 class Door(Protocol):
     """Knows who may come in."""
 
-    @property
-    def sites(self) -> Collection[str]:
-        """Scheme, name and port of the addresses that lead here."""
+    def site(self, headers: Headers) -> str:
+        """Return scheme, name and port by which a request asks; "" if they do not lead here."""
         ...
 
     @property
@@ -82,14 +81,19 @@ def list_own_names(port: int) -> frozenset[str]:
     return frozenset(f"http://{host}:{port}" for host in ("127.0.0.1", "localhost"))
 
 
+def find_site(sites: Collection[str], headers: Headers) -> str:
+    """Return the one of some addresses by which a request asks; "" if it is none of them."""
+    host = headers.get("host", "")
+    return next((site for site in sites if site.partition("://")[2] == host), "")
+
+
 def _find_refusal(headers: Headers, method: str, door: Door) -> str:
     """Return why a request is not one of our own pages' or of a person; "" where it is.
 
     Names that lead here from elsewhere have another Host; other pages have another Origin, and
     browsers say Sec-Fetch-Site of what they were made to ask.
     """
-    host, origin = headers.get("host", ""), headers.get("origin")
-    site = next((site for site in door.sites if site.partition("://")[2] == host), "")
+    origin, site = headers.get("origin"), door.site(headers)
     if not site:
         return "ask by the address that cartlab printed"
     if origin != site and (origin is not None or method != "GET"):

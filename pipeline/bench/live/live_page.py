@@ -26,7 +26,7 @@ from starlette.types import Scope
 from pipeline.bench.live.live_state import FRAME, LiveState, ShownSession
 from pipeline.errors import HardwareError
 from pipeline.resources import TEMPLATES
-from pipeline.web.guard import Guard, list_own_names, refuse
+from pipeline.web.guard import Guard, find_site, list_own_names, refuse
 from pipeline.web.server import Served
 
 _LARGEST_ANSWER = 200  # largest body of a button's request, bytes
@@ -165,8 +165,12 @@ class _SecretPath:
     arrivals = False
 
     def __init__(self, secret: str, *, port: int) -> None:
-        self.sites = list_own_names(port)
+        self._sites = list_own_names(port)
         self._secret = f"{secret}/"  # relative links of the page start at the slash
+
+    def site(self, headers: Headers) -> str:
+        """Return by which name of this computer the request asks."""
+        return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
         """Return the rest of the path."""

@@ -32,5 +32,5 @@ def _is_busy(ask: Ask) -> bool:
 def _lead_to(ask: Ask, address: str) -> Response:
     """Lead to a page of another frame: htmx, which fetches pages by itself, opens it whole."""
     if ask.request.headers.get("hx-request"):
-        return Response(headers={"HX-Redirect": address})
+        return ask.go(address)
     return RedirectResponse(address, status_code=303)
