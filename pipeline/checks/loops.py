@@ -16,6 +16,7 @@ from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 # Of the coefficients of a loop's polynomial, relative to their binomials. Rounding leaves 1e-13 of
 # them on realistic plants; gains of another program up to 1e-8.
 _SAME_LOOP = 1e-6
+_LAST_DIGIT = 12  # smaller differences are rounding, which depends on the linear algebra library
 
 
 def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
@@ -46,7 +47,7 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
         ours, wanted, level = _loops(chain, design)
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
         return _check("skip", None, "so extreme a plant cannot be verified")
-    value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))))
+    value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
     if not np.isfinite(value):
         return _check("fail", None, "the designed loop has no finite polynomial: do not run it")
     if value > _SAME_LOOP:

@@ -188,10 +188,16 @@ def remove(
         list[str], typer.Argument(metavar="TEAM…", help="Submissions, or one author of each.")
     ],
     assignment: Lab = None,
+    erase: Annotated[
+        bool, typer.Option("--erase", help="Delete all that is kept about them, for good.")
+    ] = False,
 ) -> None:
-    """Take submissions off the class list; their history stays."""
+    """Take submissions off the class list; their history stays, unless --erase deletes it."""
     from pipeline.grading.publish.anonymous import meant
 
+    if erase:
+        _erase(grades, teams, assignment)
+        return
     with _changing(grades, assignment) as book:
         names = {meant(book, team): team for team in teams}
         by_hand = [team for name, team in names.items() if book.entry(name).overrides]
@@ -199,6 +205,18 @@ def remove(
     say(f"no longer in the class: {', '.join(gone)}")
     if by_hand:
         say(f"with points given by hand, which count no more: {', '.join(by_hand)}")
+
+
+def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
+    """Delete submissions; the pages follow, and exports, which had them, are deleted."""
+    from pipeline.grading.publish.export import remove_exports
+
+    with _changing(grades, assignment) as book:
+        gone = book.erase(teams)
+    say(f"erased: {', '.join(gone)}")
+    if (folder := Path(grades)).is_dir() and (files := remove_exports(folder)):
+        say(f"deleted, as they had them too: {len(files)} exported files; export again")
+    say("not erased: the submitted folders, backups, and files that you copied elsewhere")
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from pipeline.errors import ConfigError
 from pipeline.grading.grade import read_grade
 from pipeline.grading.gradebook.changes import points_changes, rubric_changes
 from pipeline.grading.gradebook.class_lines import Line, class_frame
+from pipeline.grading.gradebook.erase import erase_rows
 from pipeline.grading.gradebook.history import Event, read_events
 from pipeline.grading.gradebook.override import HandPoints, WantedPoints
 from pipeline.grading.gradebook.rows import (
@@ -297,6 +298,19 @@ class Gradebook:
                 at=self._at(),
                 rubric=last.rubric,
             )
+        return list(gone.values())
+
+    def erase(self, teams: Sequence[str]) -> list[str]:
+        """Delete submissions with all that ever happened to them, and return their names.
+
+        Raises
+        ------
+        ConfigError : there is no such submission, or several; the database's user may not delete.
+        """
+        with self._database.erasing() as connection:
+            found = [self._find_ever(connection, team) for team in teams]
+            gone = {row.submission_id: row.name for row in found}
+            erase_rows(connection, gone)
         return list(gone.values())
 
     def override(

@@ -249,24 +249,28 @@ event.listen(
         f"$$ BEGIN RAISE EXCEPTION '{_REFUSE}'; END $$"
     ).execute_if(dialect="postgresql"),
 )
+
+
+def _locks(table: Table) -> dict[str, tuple[str, ...]]:
+    """Return, for each kind of database, what makes a table one that is only added to."""
+    name = table.name
+    return {
+        "sqlite": tuple(
+            f"CREATE TRIGGER {name}_no_{verb.lower()} BEFORE {verb} ON {name} "
+            f"BEGIN SELECT RAISE(ABORT, '{_REFUSE}'); END"
+            for verb in ("UPDATE", "DELETE")
+        ),
+        "postgresql": (
+            f"CREATE TRIGGER {name}_append_only BEFORE UPDATE OR DELETE OR TRUNCATE "
+            f"ON {name} EXECUTE FUNCTION cartlab_append_only()",
+        ),
+    }
+
+
 for _table in metadata.sorted_tables:
-    for _verb in ("UPDATE", "DELETE"):
-        event.listen(
-            _table,
-            "after_create",
-            DDL(
-                f"CREATE TRIGGER {_table.name}_no_{_verb.lower()} BEFORE {_verb} ON {_table.name} "
-                f"BEGIN SELECT RAISE(ABORT, '{_REFUSE}'); END"
-            ).execute_if(dialect="sqlite"),
-        )
-    event.listen(
-        _table,
-        "after_create",
-        DDL(
-            f"CREATE TRIGGER {_table.name}_append_only BEFORE UPDATE OR DELETE OR TRUNCATE "
-            f"ON {_table.name} EXECUTE FUNCTION cartlab_append_only()"
-        ).execute_if(dialect="postgresql"),
-    )
+    for _dialect, _made in _locks(_table).items():
+        for _lock in _made:
+            event.listen(_table, "after_create", DDL(_lock).execute_if(dialect=_dialect))
 
 
 class Database:
@@ -326,6 +330,25 @@ class Database:
         with self.writing() as connection:
             _take_turns(connection)
             yield connection
+
+    @contextmanager
+    def erasing(self) -> Iterator[Connection]:
+        """Delete and update, with nobody else who writes; then leave no trace in the file."""
+        with self.changing() as connection:
+            sqlite = connection.dialect.name == "sqlite"
+            for table in metadata.sorted_tables:
+                for lock in _locks(table)[connection.dialect.name]:
+                    name = lock.split()[2]
+                    of = "" if sqlite else f" ON {table.name}"
+                    connection.execute(DDL(f"DROP TRIGGER IF EXISTS {name}{of}"))
+            yield connection
+            for table in metadata.sorted_tables:
+                for lock in _locks(table)[connection.dialect.name]:
+                    connection.execute(DDL(lock))
+        tables = ", ".join(table.name for table in metadata.sorted_tables)
+        alone = self._engine.execution_options(isolation_level="AUTOCOMMIT")
+        with self._translated(), alone.connect() as connection:
+            connection.exec_driver_sql("VACUUM" if sqlite else f"VACUUM FULL {tables}")
 
     def close(self) -> None:
         """Let go of the connections."""
@@ -415,12 +438,16 @@ def _keep_private(file: Path) -> None:
 def _prepare_sqlite(connection, _record) -> None:
     connection.isolation_level = None  # we begin transactions ourselves, DDL included
     connection.execute("PRAGMA foreign_keys = ON")
+    connection.execute("PRAGMA secure_delete = ON")  # what was erased is overwritten
     connection.execute("PRAGMA synchronous = FULL")  # what was put outlives a power cut
 
 
 def _begin_sqlite(connection: Connection) -> None:
     """Take the write lock at once: two that read and then both write would wait for each other."""
-    writes = connection.get_execution_options().get("writes", False)
+    options = connection.get_execution_options()
+    if options.get("isolation_level") == "AUTOCOMMIT":
+        return
+    writes = options.get("writes", False)
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 

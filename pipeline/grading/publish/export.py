@@ -194,3 +194,15 @@ def _write_results(entries: Iterable[Entry], folder: Path, *, rubric: Rubric) ->
         write_file(own / "results.json", text)
         files.append(own / "results.json")
     return files
+
+
+def remove_exports(folder: Path) -> list[Path]:
+    """Remove what earlier exports wrote into the folder of a class, and return these files."""
+    tables = [folder / f"{platform}.csv" for platform in FORMS]
+    results = (folder / "gradescope").glob("*/results.json")
+    there = [file for file in (*tables, *results) if file.is_file()]
+    for file in there:
+        file.unlink()
+        if file.name == "results.json" and not any(file.parent.iterdir()):
+            file.parent.rmdir()
+    return there

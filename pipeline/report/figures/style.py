@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import takewhile
+from math import fsum
 from typing import Any
 
 import matplotlib
@@ -87,18 +88,19 @@ def panels(
     top = 0.26 + (_LIFT if titled else 0.0)  # for a legend
     gap = 0.24 if titled else 0.13 if share_x else 0.53
     column_gap = 0.13 if share_y else 0.5
-    height = sum(heights) + gap * (len(heights) - 1) + top + bottom
+    # Sums that round once: from Python 3.12 on `sum` does, and before it did at every step.
+    height = fsum(heights) + gap * (len(heights) - 1) + top + bottom
     width = (WIDTH - left - right - column_gap * (columns - 1)) / columns
     figure = Figure(figsize=(WIDTH, height))
     grid = figure.add_gridspec(
         len(heights),
         columns,
-        height_ratios=heights,
+        height_ratios=[round(1000 * one) for one in heights],
         left=left / WIDTH,
         right=1 - right / WIDTH,
         top=1 - top / height,
         bottom=bottom / height,
-        hspace=gap * len(heights) / sum(heights),
+        hspace=gap * len(heights) / fsum(heights),
         wspace=column_gap / width,
     )
     axes: list[Axes] = []

@@ -23,7 +23,13 @@ def place(request, tmp_path):
     if request.param == "sqlite":
         yield str(tmp_path)
         return
-    url = request.getfixturevalue("server")
+    yield request.getfixturevalue("place_in_postgresql")
+
+
+@pytest.fixture
+def place_in_postgresql(server):
+    """An empty database; what a test put there is removed."""
+    url = server
     yield url
     engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
     with engine.begin() as connection:

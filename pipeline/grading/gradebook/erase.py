@@ -1,0 +1,42 @@
+"""Erase submissions for good: every row about them, and their names in the flags of others."""
+
+import json
+import re
+from collections.abc import Mapping
+
+from sqlalchemy import Connection, delete, select, update
+
+from pipeline.grading.gradebook.schema import (
+    entries,
+    figures,
+    findings,
+    gradings,
+    looks,
+    overrides,
+    request_events,
+    submissions,
+)
+
+NOBODY = "an erased submission"
+
+
+def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
+    """Delete all rows about submissions, given by number and name.
+
+    The flag of a team that shared recordings with one of them stays, without its name.
+    """
+    numbers = list(gone)
+    graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))
+    for table in (looks, figures, findings):
+        connection.execute(delete(table).where(table.c.grading_id.in_(graded)))
+    for table in (entries, overrides, request_events, gradings):
+        connection.execute(delete(table).where(table.c.submission_id.in_(numbers)))
+    connection.execute(delete(submissions).where(submissions.c.id.in_(numbers)))
+    flagged = select(entries.c.batch_id, entries.c.position, entries.c.shared)
+    names = "|".join(re.escape(json.dumps(name)[1:-1]) for name in gone.values())
+    any_name = re.compile(rf"(?<![\w-])(?:{names})(?![\w-])")
+    for row in connection.execute(flagged.where(entries.c.shared != "")).all():
+        where = (entries.c.batch_id == row.batch_id) & (entries.c.position == row.position)
+        told = any_name.sub(NOBODY, row.shared)
+        if told != row.shared:
+            connection.execute(update(entries).where(where).values(shared=told))

@@ -1,0 +1,137 @@
+"""What is erased leaves nothing behind, and a backup brings a gradebook back."""
+
+import sqlite3
+import subprocess
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from sqlalchemy import create_engine, text
+from sqlalchemy.exc import DBAPIError
+
+from pipeline.grading.gradebook.book import Gradebook
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.grading.gradebook.schema import FILE
+from pipeline.grading.gradings import Batch
+from pipeline.grading.publish.export import export
+from pipeline.grading.publish.outputs import write_outputs
+from tests.helpers.commandline import cartlab_here
+from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
+
+GONE, KEPT = "zebra-çelik", "team-2"
+TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a number, what was typed
+
+
+def _fill(place: str, *, folder: Path | None = None) -> None:
+    """Grade two teams that share a recording; one is asked about, changed by hand, looked at."""
+    with RequestBook(place, create=True, assignment="lab") as book:
+        gone = make_grade(GONE, share=0.5)
+        first = gone.criteria[0].model_copy(update={"found": {"omega_1": 31.41592}})
+        gone = gone.model_copy(update={"criteria": (first, *gone.criteria[1:])})
+        figure = ("fit.svg", "<svg><text>31.41592 quagga</text></svg>")
+        for grade, more in ((gone, {"figures": (figure,), "findings": "31.41592"}),
+                            (make_grade(KEPT), {})):  # fmt: skip
+            book.put(make_outcome(grade, **more))
+        keys = (f"key of {GONE}", f"key of {KEPT}")
+        shared = {KEPT: shared_flag(GONE), GONE: shared_flag(KEPT)}
+        book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
+        book.release(by="Ada", released=True)
+        book.ask(GONE, first.id, why="quagga: it is right", by="s-zebra")
+        book.mark(GONE, by="Ada", seen=True)
+        book.override(GONE, gone.criteria[1].id, 1, why="quagga", by="Ada")
+        book.finish(Batch(keys=keys, shared=shared), rubric=two_cart_rubric())
+        if folder:
+            write_outputs(book, folder)
+            for platform in ("canvas", "moodle", "gradescope"):
+                export(book, platform, folder)
+
+
+def _found(content: bytes) -> list[str]:
+    return [trace for trace in TRACES if trace.encode() in content]
+
+
+def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
+    """Every file of the folder, the database's free pages included, is searched."""
+    folder = tmp_path / "grades"
+    folder.mkdir()
+    _fill(str(folder), folder=folder)
+    before = {
+        path.name for path in folder.rglob("*") if path.is_file() and _found(path.read_bytes())
+    }
+    assert {"canvas.csv", "class.html", "grades.csv", "grade.json", "results.json", FILE} <= before
+
+    done = cartlab_here("remove", folder, GONE, "--erase")
+
+    assert done.returncode == 0
+    assert "export again" in done.stderr
+    left = {path: _found(path.read_bytes()) for path in folder.rglob("*") if path.is_file()}
+    assert {path: found for path, found in left.items() if found} == {}
+    assert not [path for path in folder.rglob("*") if "zebra" in path.name]
+    with Gradebook(folder) as book:
+        assert [one.submission for one in book.entries()] == [KEPT]
+        flag = book.entry(KEPT).grade.flags[0]
+        assert flag.message == "The recording of step-1 stands in an erased submission too."
+    with closing(sqlite3.connect(folder / FILE)) as connection:
+        with pytest.raises(sqlite3.IntegrityError, match="only added to"):
+            connection.execute("DELETE FROM gradings")
+        assert connection.execute("PRAGMA freelist_count").fetchone() == (0,)
+
+
+def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
+    """A dump of the whole database is searched, and so are the files of its tables."""
+    url = place_in_postgresql
+    _fill(url)
+    assert set(_found(_dump(url))) == {"zebra", "s-zebra", "31.41592", "quagga"}
+
+    assert cartlab_here("remove", url, GONE, "--erase").returncode == 0
+
+    assert _found(_dump(url)) == []
+    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.connect() as connection:
+        connection.execution_options(isolation_level="AUTOCOMMIT").execute(text("CHECKPOINT"))
+        with pytest.raises(DBAPIError, match="only added to"):
+            connection.execute(text("DELETE FROM gradings"))
+    engine.dispose()
+    tables = Path(url.partition("host=")[2], "data", "base").rglob("*")
+    assert [path for path in tables if path.is_file() and _found(path.read_bytes())] == []
+
+
+def test_a_backup_of_a_file_is_the_same_gradebook(tmp_path):
+    """SQLite's own copy, made while the gradebook is open, has the same history."""
+    _fill(str(tmp_path))
+    copy = tmp_path / "copy.sqlite"
+    with Gradebook(tmp_path) as book:
+        with closing(sqlite3.connect(tmp_path / FILE)) as own, closing(sqlite3.connect(copy)) as to:
+            own.backup(to)  # as `sqlite3 gradebook.sqlite ".backup copy.sqlite"` does
+        with Gradebook(copy) as restored:
+            assert list(restored.entries()) == list(book.entries())
+            assert restored.history(GONE) == book.history(GONE)
+            restored.override(KEPT, two_cart_rubric().criteria[0].id, 1, why="new", by="Ada")
+
+
+def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql):
+    """`pg_dump` and `psql` bring back rows, and the rule that rows are only added."""
+    url = place_in_postgresql
+    _fill(url)
+    with Gradebook(url) as book:
+        entries, history = list(book.entries()), book.history(GONE)
+    dumped = _dump(url)
+    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.begin() as connection:
+        connection.execute(text("DROP SCHEMA public CASCADE"))
+
+    psql = ["psql", "--quiet", "--set=ON_ERROR_STOP=1", url]
+    subprocess.run(psql, input=dumped, check=True, stdout=subprocess.DEVNULL)
+
+    with Gradebook(url) as book:
+        assert (list(book.entries()), book.history(GONE)) == (entries, history)
+        book.override(KEPT, two_cart_rubric().criteria[0].id, 1, why="new", by="Ada")
+    with engine.connect() as connection, pytest.raises(DBAPIError, match="only added to"):
+        connection.execute(text("DELETE FROM overrides"))
+    engine.dispose()
+
+
+def _dump(url: str) -> bytes:
+    return subprocess.run(
+        ["pg_dump", "--schema=public", url], check=True, stdout=subprocess.PIPE
+    ).stdout
