@@ -1,7 +1,7 @@
 """The `cartlab` command: parse, call one function, write, exit code.
 
-The commands are loaded when the first is run, so that Ctrl-C while they load ends it quietly. What
-is imported here is there before anybody can press it.
+The commands are loaded when the first one runs, so that Ctrl-C during loading ends it quietly. What
+is imported here is loaded before anybody can press Ctrl-C.
 """
 
 import sys
@@ -25,8 +25,13 @@ def __getattr__(name: str) -> object:
 def main() -> None:
     """Run the command line."""
     try:
+        from pipeline.garbage import collect_seldom
+        from pipeline.threads import one_thread
+
+        collect_seldom()
+        one_thread()
         from pipeline.cli.commands import run
 
         run()
-    except KeyboardInterrupt:  # nothing has begun yet, or it has been said what became of it
+    except KeyboardInterrupt:  # nothing has begun yet, or the message is out
         sys.exit(INTERRUPTED)

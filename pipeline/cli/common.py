@@ -20,8 +20,6 @@ from typer.exceptions import TyperException
 from pipeline import __version__
 from pipeline.cli.stopping import ctrl_c_says
 from pipeline.errors import PipelineError, lacks_room, lies_in_the_file
-from pipeline.garbage import collect_seldom
-from pipeline.threads import one_thread
 from pipeline.words.progress import Progress
 
 app = typer.Typer(
@@ -51,8 +49,6 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 def run() -> None:
     """Run the command line; an error that a person can act on is one line and exit status 2."""
-    collect_seldom()
-    one_thread()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # a console of few letters shows the others as \u…
             stream.reconfigure(errors="backslashreplace")
