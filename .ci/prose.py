@@ -14,7 +14,7 @@ import re
 import sys
 import tokenize
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -39,6 +39,9 @@ RULES = {
     r"\b(?:is|are|was|were) (?:not )?to be (?!able)\w+|\bthere to (?:see|read)\b": "'must be'",
 }
 FOUND = [(re.compile(pattern), advice) for pattern, advice in RULES.items()]
+# Where a docstring goes on with another paragraph, or with the next entry of a numpydoc section.
+ENTRY = re.compile(r"\n\s*\n|\n\s*-{4,}\s*\n|\n(?=\s*[\w`][^:\n]{0,60} : )")
+INLINE = "a|abbr|b|code|em|i|kbd|label|mark|small|span|strong|sub|sup|time|var"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,33 +84,39 @@ def _strings(source: str) -> Iterator[tuple[int, str]]:
             text = node.value if id(node) not in pieces else ""
         elif isinstance(node, ast.JoinedStr):
             text = "".join(p.value if isinstance(p, ast.Constant) else "X" for p in node.values)
-        if len(text.split()) >= MESSAGE:
-            yield node.lineno, text
+        for part in ENTRY.split(text):
+            if len(part.split()) >= MESSAGE:
+                yield node.lineno, part
 
 
 def _comments(source: str) -> Iterator[tuple[int, str]]:
-    """Yield the comments; those on lines that follow one another are one text."""
+    """Yield the comments; whole lines of comment that follow one another are one text."""
     first, last, block = 0, -1, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type != tokenize.COMMENT:
             continue
         line, text = token.start[0], token.string.lstrip("# ")
-        if line == last + 1:
+        alone = not token.line[: token.start[1]].strip()
+        if alone and line == last + 1:
             block += " " + text
         else:
             yield first, block
             first, block = line, text
-        last = line
+        last = line if alone else -1
     yield first, block
 
 
 def _paragraphs(raw: str, *, marked_up: bool) -> Iterator[tuple[int, str]]:
-    def blank(found: re.Match[str]) -> str:
-        return " X " + "\n" * found[0].count("\n")
+    """Yield the paragraphs of Markdown or of a page, in which any other tag ends a paragraph."""
 
-    raw = re.sub(r"(?s)```.*?```", blank, raw)
+    def by(word: str) -> Callable[[re.Match[str]], str]:
+        return lambda found: word + "\n" * found[0].count("\n")
+
+    raw = re.sub(r"(?s)```.*?```", by(" X "), raw)
     if marked_up:
-        raw = re.sub(r"(?s)<(style|script)\b.*?</\1>|\{[%#{].*?[%#}]\}|<[^>]+>", blank, raw)
+        raw = re.sub(r"(?s)\{\{.*?\}\}", by("X"), raw)
+        raw = re.sub(rf"(?s)</?(?:{INLINE})\b[^>]*>", by(""), raw)
+        raw = re.sub(r"(?s)<(style|script)\b.*?</\1>|\{%.*?%\}|\{#.*?#\}|<[^>]+>", by("\n\n"), raw)
     line = 1
     for part in re.split(r"(\n\s*\n|\n(?=\s*(?:[-*|#]|\d+\.)))", raw):
         yield line, part
