@@ -42,7 +42,7 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
     found = (
         "and the noise explain the data."
         if fit.explains_data
-        else "leave more than the noise; look where model and measurement part."
+        else "leave more than the noise; look where model and measurement differ."
     )
     return [
         Check(

@@ -1,6 +1,6 @@
 """The results of an analysis as pandas tables, their columns named as in `results.json`.
 
-A column's unit, where it has one, stands in `frame.attrs["units"]`.
+A column's unit, if it has one, is in `frame.attrs["units"]`.
 """
 
 from collections.abc import Mapping, Sequence

@@ -270,7 +270,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 
     Raises
     ------
-    DataError : there are none, as the fit is to a table.
+    DataError : the fit is to a table, without records.
     """
     kinds = ("sine",) if fit.method == "bode_fit" else ("step", "sweep")
     out = {one.experiment for one in analysis.left_out}

@@ -59,7 +59,7 @@ class MadePlan:
     Attributes
     ----------
     said : what was written, in one sentence.
-    trouble : why the data could not be used; "": they were, or there are none.
+    trouble : why the data could not be used; "": they were used, or no data exist.
     """
 
     plan: Plan
@@ -69,7 +69,7 @@ class MadePlan:
 
 
 def current_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Return the plan of a submission, or a proposal if it has none."""
+    """Return the plan of a submission, or a proposal if the file is missing."""
     there = plan_path(submission).exists()
     return load_plan(submission) if there else propose_plan(submission, bench=bench)
 

@@ -24,8 +24,8 @@ AS_REPEATS = 1.1
 BIC_DROP, SAME_LAW = 20.0, 6.0
 # The largest error of a named model, in units of the noise or of the difference of repeats. It is
 # wide for contacts, whose law is only approximate. Nine of ten names leave at most 1.02 times the
-# noise. A name that leaves more than FURTHER without a contact is often half of the truth, and a
-# note says so.
+# noise. A named model without a contact whose error exceeds FURTHER is often half of the truth, and
+# a note says so.
 ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
 SURE = 3.0  # standard errors from zero: a nearer effect is not named
 PARTIAL_GAIN = 0.9  # of the error, when too much is left for a name: a tenth is worth reporting

@@ -195,7 +195,7 @@ def _decays_between(pieces: Sequence[Record], *, cart: int) -> list[LogDecrement
 
     Raises
     ------
-    DataError : there is none.
+    DataError : no piece shows a decay.
     """
     if not pieces:
         raise DataError("a force that was not measured acts on a cart throughout")

@@ -74,7 +74,7 @@ def find_springs(submission: Submission) -> Springs:
     steps = tuple(one for one in submission.experiments if one.kind == "step")
     try:
         records = read_data(submission.model_copy(update={"experiments": steps})).records
-    except SubmissionError:  # there is none, or none can be read
+    except SubmissionError:  # no file exists, or no file can be read
         records = ()
     return decide_springs(records, n=submission.system.carts)
 

@@ -8,7 +8,7 @@ _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over
 
 
 def encoder_step(x: Array) -> float:
-    """Return the step of which all values are multiples, 0 if there is none.
+    """Return the step of which all values are multiples, 0 without such a step.
 
     The smallest distances between levels are one step; the step is refined by a line through all
     levels, which must lie on it.

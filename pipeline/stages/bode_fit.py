@@ -234,7 +234,7 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
 
 
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
-    """Fit again with the relative error that explains the misfit; 0 if none is needed."""
+    """Fit again with the relative error that explains the misfit; 0 if not needed."""
     excess = fitted.chi_square_per_dof - 1
     # Standard deviations of χ² above its mean: by chance once in a thousand.
     if data.from_table or excess <= 3.1 * np.sqrt(2 / fitted.dof):

@@ -209,8 +209,9 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     """Estimate resonances, nulls and gains from the measured magnitudes, as the paper does.
 
     The resonances are the peaks shared by the carts. A first mode too damped to peak is found from
-    the fall of the last cart's response above the others. If fewer than n are found, none is named,
-    as it is unknown which one is missing. Nulls of cart 1 give omega_x and omega_y (three carts),
+    the fall of the last cart's response above the others. If fewer than n are found, they get no
+    names, as it is unknown which one is missing. Nulls of cart 1 give omega_x and omega_y (three
+    carts),
     those of the last but one the last cart's own frequency. Gains are the lowest-frequency
     magnitudes. Dampings of modes and nulls are assumed.
     """

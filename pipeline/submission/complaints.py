@@ -19,7 +19,7 @@ _LONGEST_QUOTE = 60  # characters shown of a found value
 MOST_TOLD = 20  # faults listed for a file; finding the nearest valid key takes a while
 _MOST_KNOWN = 40  # valid values listed
 
-# What a value should have been, by pydantic's name for the error.
+# Expected values, by pydantic's name for the error.
 _EXPECTED = {
     "string_type": "text in quotes",
     "int_type": "a whole number",
@@ -59,7 +59,7 @@ def _summary(value: dict | tuple | list) -> str:
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
-    """Return "; did you mean …?", or all valid values if none is near and there are few."""
+    """Return "; did you mean …?", or all valid values if they are few and no near one exists."""
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"

@@ -31,7 +31,7 @@ def submission_text(folder: Path) -> str:
 
     Raises
     ------
-    SubmissionError : there is none that can be read.
+    SubmissionError : no readable file.
     """
     where = f"{folder.resolve().name}/{NAME}"
     if (problem := outside(folder, NAME)) is not None:

@@ -1,6 +1,6 @@
 """The tables of `submission.toml`, as validated models.
 
-The title and the description of a key are what the form of the desk says of it.
+The title and the description of a key appear in the form of the desk.
 """
 
 from decimal import Decimal
@@ -15,7 +15,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 # A line on any page; pages and PDF readers fail at texts of a hundred thousand letters.
 Line = Annotated[str, Field(max_length=200)]
-# Units stand in the titles of figures, which scripts read.
+# Units appear in the titles of figures, which scripts read.
 Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
 MOST_CARTS = 4
 MOST_EXPERIMENTS = 1_000  # every stage and every comparison goes through them
@@ -76,7 +76,7 @@ class PositionScale(TomlTable):
 
 
 class System(TomlTable):
-    """The carts and springs on the bench; springs not stated are all there.
+    """The carts and springs on the bench; springs that are not stated all exist.
 
     `columns` (role to heading or number) are those of every recording that has them.
     """
@@ -96,19 +96,19 @@ class System(TomlTable):
 
     @model_validator(mode="after")
     def _all_springs(self) -> "System":
-        """Fill in `springs` where they are left out; that nobody stated them stays known."""
+        """Fill in `springs` where they are left out; it stays known that nobody stated them."""
         if not self.states_springs:
             object.__setattr__(self, "springs", (True,) * (self.carts + 1))
         return self
 
     @property
     def states_springs(self) -> bool:
-        """Whether the springs were stated: else all were taken to be there."""
+        """Whether the springs were stated; else all are assumed."""
         return "springs" in self.model_fields_set
 
     @property
     def bench(self) -> Bench:
-        """The bench that it states."""
+        """The stated bench."""
         units = Units(position=self.position.unit, input=self.input.unit)
         return Bench(springs=self.springs, units=units, sign=self.input.sign)
 
@@ -235,7 +235,7 @@ class ReportedFeedback(TomlTable):
 
 
 class Reported(TomlTable):
-    """What the students claim; numbers keep the digits as typed."""
+    """The students' reported numbers, with the digits as typed."""
 
     initial: dict[str, TypedNumber] = {}
     final: dict[str, TypedNumber] = {}
@@ -244,13 +244,13 @@ class Reported(TomlTable):
 
 
 class Students(TomlTable):
-    """What students see of what is computed: the report, or only which of their numbers are off."""
+    """The results that students see: the report, or only which of their numbers are off."""
 
     see: Literal["report", "check"] = "report"
 
 
 class Submission(TomlTable):
-    """A validated submission; `folder` is where it lies."""
+    """A validated submission; `folder` is its place."""
 
     version: Literal[1]
     title: Line = Field(

@@ -13,7 +13,7 @@ _NOTES = """\
 <!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
 
      `cartlab report` asks what your data raise, say about zeta_b. Answer under a heading of that
-     name; the answer then stands beside the question:
+     name; the answer then appears beside the question:
 
      ## zeta_b
      The decay saw …
@@ -27,7 +27,7 @@ def new_submission(folder: Path, *, carts: int) -> None:
 
     Raises
     ------
-    ConfigError : the folder holds something already, or there cannot be so many carts.
+    ConfigError : the folder is not empty, or the number of carts is too large.
     """
     if not 1 <= carts <= MOST_CARTS:
         raise ConfigError(f"carts: expected 1 to {MOST_CARTS}, found {carts}")
@@ -38,9 +38,9 @@ def new_submission(folder: Path, *, carts: int) -> None:
 
 
 def write_templates(folder: Path, *, carts: int) -> None:
-    """Write what `new_submission` does into a folder where only recordings may be yet.
+    """Write the files of `new_submission` into a folder that may already hold recordings.
 
-    `submission.toml` and `notes.md` that are there stay as they are.
+    `submission.toml` and `notes.md` that exist stay as they are.
     """
     import jinja2  # costs 50 ms, and only a new submission needs it
 

@@ -1,4 +1,4 @@
-"""Read files that people typed; what is wrong with TOML is told by what stands in the line."""
+"""Read files that people typed; a mistake in TOML is explained by the content of its line."""
 
 import re
 import tomllib
@@ -17,14 +17,14 @@ from pipeline.submission.complaints import Location, dotted, quote, takes_number
 from pipeline.submission.models import Submission
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
-_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are looked at, and shown
+_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and shown
 _LARGEST = 30  # powers of ten: beyond any physical number in any unit, yet safe to multiply
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Slip:
-    """What people type that TOML refuses; see templates/toml_slips.toml."""
+    """A mistake of typing that TOML refuses; see templates/toml_slips.toml."""
 
     words: str
     parser: str = ""
@@ -59,7 +59,7 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
 
 
 def decoded(raw: bytes, *, where: str, limit: int, error: type[PipelineError]) -> str:
-    """Return what `read_text` does of a file that holds `raw`."""
+    """Return the result of `read_text` for a file that holds `raw`."""
     if len(raw) > limit:
         raise error(_too_large(where, len(raw), limit))
     try:
@@ -119,7 +119,7 @@ def parse_toml(
 
 
 def at_line(where: str, line: int, what: str) -> str:
-    """Return what is wrong with a line of a file, or with all of it where the line is 0."""
+    """Return the fault of a line of a file, or of the whole file if the line is 0."""
     return f"{where} line {line}: {what}" if line else f"{where}: {what}"
 
 
@@ -129,7 +129,7 @@ def read_toml(
     as_typed: bool = False,
     root: type[BaseModel] = Submission,
 ) -> Toml:
-    """Read what can be read of TOML that somebody typed: a slip hides nothing in other lines."""
+    """Read the valid lines of TOML that somebody typed: a slip hides nothing in other lines."""
     for key in re.finditer(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*", text):
         if key.group().count(".") > 30:  # tomllib's time grows with the square of a key's depth
             line = text.count("\n", 0, key.start()) + 1
@@ -148,7 +148,7 @@ def read_toml(
             line = int(at[1]) if at else len(lines)
             shown = typed[line - 1].strip()
             slip = _find_slip(shown, _AT.sub("", message))
-            # The rest of a list or text whose first line is gone is no mistake of its own.
+            # The rest of a list or text whose first line is spoilt is not a second mistake.
             begins = re.match(r"\s*(#|\[|[\w\"'.-]+\s*=)", typed[line - 1])
             if line != emptied + 1 or begins:
                 words = _explain_slip(slip, shown, root)
@@ -168,11 +168,11 @@ def read_toml(
 
 
 class UnusableNumber(Exception):
-    """A number that nothing can be reckoned with; its text says why.
+    """A number that cannot be computed with; its text says why.
 
     Attributes
     ----------
-    at : where it stands.
+    at : its place.
     """
 
     def __init__(self, at: Location, why: str) -> None:
@@ -181,7 +181,7 @@ class UnusableNumber(Exception):
 
 
 def check_number(value: float | Decimal, at: Location) -> None:
-    """Refuse a number of a size that no quantity has, or with digits that no instrument gives.
+    """Refuse a number of an impossible size, or with more digits than any instrument gives.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
     number = value if isinstance(value, int) else Decimal(value)
     if isinstance(number, Decimal) and not number.is_finite():
         raise UnusableNumber(at, f"expected a finite number, found {number}")
-    # Nothing is worked out before the exponent is known to be small: some take for ever.
+    # Nothing is computed before the exponent is known to be small: large ones take for ever.
     sound = (
         number.bit_length() <= 100 and abs(number) < 10**_LARGEST
         if isinstance(number, int)
@@ -213,7 +213,7 @@ def _decimal(text: str) -> Decimal:
 
 
 def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
-    """Return a document with floats for its decimals; what can be no float is a slip, and 1."""
+    """Return a document with floats for its decimals; one too large is a slip, replaced by 1."""
     if isinstance(value, dict):
         return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}
     if isinstance(value, list):
@@ -235,7 +235,7 @@ def _long_number(text: str) -> int:
 
 
 def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int]:
-    """Return the first and last line that a slip, found at `line`, takes with it."""
+    """Return the first and last line spoilt by a slip found at `line`."""
     if slip.code == "unclosed_list":
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
@@ -247,7 +247,7 @@ def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int
 
 
 def _find_slip(line: str, message: str) -> _Slip:
-    """Return what is wrong with a line, by what it looks like, else by what the parser says."""
+    """Return the fault of a line, from its form, else from the parser's message."""
     for slip in _slips():
         if slip.parser and re.fullmatch(slip.parser, message):
             return slip
@@ -257,7 +257,7 @@ def _find_slip(line: str, message: str) -> _Slip:
 
 
 def _explain_slip(slip: _Slip, line: str, root: type[BaseModel]) -> str:
-    """Return what is wrong, with ": write …" and the line as it should be where that is known."""
+    """Return what is wrong, with ": write …" and the corrected line if it is known."""
     line = line[:_LONGEST_LINE]
     key = line.partition("=")[0].strip()
     if slip.code == "unquoted_text" and takes_numbers(key, root):
@@ -280,5 +280,5 @@ def _slips() -> tuple[_Slip, ...]:
 
 
 def backslash_words() -> str:
-    """Return what is said of a backslash in quotes."""
+    """Return the sentence about a backslash in quotes."""
     return next(slip.words for slip in _slips() if slip.code == "backslash")

@@ -1,4 +1,4 @@
-"""Write tables of a TOML file; whoever edits one that a person wrote takes `submission.edit`."""
+"""Write tables of a TOML file; to edit a file that a person wrote, use `submission.edit`."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -7,7 +7,7 @@ from pipeline.submission.toml_file import Value
 
 
 class TypedNumber(str):
-    """A number as a person typed it: its digits stand in the file as they are."""
+    """A number as a person typed it: its digits are kept in the file."""
 
 
 def toml_section(heading: str, entries: Mapping[str, Value]) -> str:

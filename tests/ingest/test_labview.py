@@ -130,7 +130,7 @@ BAD_LVM = {
     "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), r"ends behind the header"),
     "unknown X": (GOOD.replace("X_Columns\tOne", "X_Columns\tTwo"), r"X_Columns is 'two'"),
     "infinite": (GOOD.replace("0.030000", "inf"), r"line 22: 'time' is not a finite number"),
-    "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), r"the heading 'x1' stands twice"),
+    "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), r"the heading 'x1' appears twice"),
     "wide": (
         lvm({f"c{i}": TIME for i in range(70)}), r"more than 64 columns",
     ),

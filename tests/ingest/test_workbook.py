@@ -217,7 +217,7 @@ BAD = {
     "huge": (changed(C7=1e60), r"row 7: 'x1' is too large"),
     "mean": (changed(A42="mean", B42=0.5), r"cell A42: 'time' is no number: 'mean'"),
     "marker": (changed(A30="here", B30=None, C30=None), r"cell A30: 'time' is no number: 'here'"),
-    "twice": (changed(C1="input"), r"row 1: the heading 'input' stands twice"),
+    "twice": (changed(C1="input"), r"row 1: the heading 'input' appears twice"),
     "no headings": (sheet(lambda ws: [ws.append(r) for r in ROWS]), r"no sheet has a row of head"),
     "nothing": (sheet(lambda ws: None), r"no sheet has a row of headings .*'Sheet'"),
     "two tables": (

@@ -85,7 +85,7 @@ def test_where_the_package_cannot_be_written_the_users_cache_is_used(package):
 
 
 def test_the_folders_name_covers_each_file_that_a_compiled_function_may_hold():
-    """What a file with compiled functions imports is in its own room or among the shared files."""
+    """A file with compiled functions imports only from its own room or the shared files."""
     types_only = ROOT / "pipeline/arrays.py"
     rooms = set()
     for path in (ROOT / "pipeline").rglob("*.py"):

@@ -314,7 +314,7 @@ BAD_DATA = {
         "\n".join(good_rows() * 2) + "\n",
         r"line 42: a second heading: two records pasted together",
     ),
-    "heading twice": ("time,x1,x1\n0,1,2\n1,2,3\n", r"line 1: the heading 'x1' stands twice"),
+    "heading twice": ("time,x1,x1\n0,1,2\n1,2,3\n", r"line 1: the heading 'x1' appears twice"),
     "no time": ("\n".join(r.split(",", 1)[1] for r in good_rows()), r"no time column"),
     "no position": (
         "\n".join(",".join(r.split(",")[:2]) for r in good_rows()),

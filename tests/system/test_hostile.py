@@ -138,7 +138,7 @@ def test_every_hand_in_has_its_row_and_its_reason(graded):
     assert [o.reason for o in outcomes if o and (o.detail or not o.settled)] == []
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="what a descriptor is of is told by Linux")
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux says which file a descriptor belongs to")
 def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
     """It writes only into its own folder, connects to nobody, and starts only Python."""
     base, _, _ = graded

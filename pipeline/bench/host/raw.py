@@ -160,7 +160,7 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 
 
 def known_commands(folder: Path) -> frozenset[str]:
-    """Return the bench's extensions at the latest recording; the chirp if there is none."""
+    """Return the bench's extensions at the latest recording; the chirp for a stock bench."""
     for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
         try:
             return read_raw(path).header.bench.commands

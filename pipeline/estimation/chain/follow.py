@@ -123,7 +123,8 @@ def find_misread(
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        # The largest residual of a record that counts the other way; a long delay leaves more.
+        # The largest residual of a record that counts the other way; that of a long delay is
+        # larger.
         if held and held.share <= (min(least, 0.02) if misread.legal else least):
             found, least = misread, held.share
     return found
@@ -170,7 +171,7 @@ def _weights(window: FitWindow, modes: Modes) -> Array:
 
 
 def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
-    """Describe the mistake that needs about these factors on the columns; None if none is known.
+    """Describe the mistake that needs about these factors on the columns; None if it is unknown.
 
     A unit applies to the whole file: one cart near its null may move too little by any factor.
     """

@@ -1,8 +1,8 @@
 """Chain and fit vector: what the frequency-domain and the time-domain fit share.
 
 A fit moves a vector theta: log m, log c and log k, so that no step leaves the physical range and
-all entries are of order one. The spring wall-1 alone enters as it is, because it may well be zero
-(the paper's plants have none) where the far wall holds the carts.
+all entries are of order one. Only the spring wall-1 enters linearly: it may be zero, as in the
+paper's plants, if the far wall holds the carts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.results import Estimate
 from pipeline.set_up import Bench
 
-# Damping ratios to begin with, where none is measured:
+# Initial damping ratios if they are not measured:
 START_ZETA = 0.05  # of each cart alone: what a cart on bearings has
 ASSUMED_ZETA = 0.1  # of a mode or a null: the usual guess of the paper
 _FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
@@ -127,7 +127,7 @@ class Parametrisation:
 
     @cached_property
     def orders(self) -> NDArray[np.intp]:
-        """Power of s (n_p,) a parameter stands at: 2 for a mass, 1 a damper, 0 a spring."""
+        """Power of s (n_p,) with each parameter: 2 for a mass, 1 for a damper, 0 for a spring."""
         return np.array(["kcm".index(symbol) for symbol, _ in self.places])
 
     @cached_property
@@ -240,7 +240,7 @@ def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
         )
     n = bench.n
     unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(bench.stiff, dtype=float))
-    modes = np.sort(np.abs(unit.poles))[::2]  # each resonance stands twice, with its conjugate
+    modes = np.sort(np.abs(unit.poles))[::2]  # each resonance appears twice, with its conjugate
     stretch = np.exp(
         np.mean(np.log(np.sort(omegas))) - np.mean(np.log(modes[modes > 0][: len(omegas)]))
     )

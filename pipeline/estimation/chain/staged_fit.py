@@ -49,7 +49,7 @@ def fit_stage_by_stage(
     ----------
     measured : by cart; a cart that is missing keeps the start.
     initial : named parameters to start from, as far as there are any.
-    like : a chain that stands in for those there are not.
+    like : a chain that replaces missing ones.
     """
     known = {**like.parameters(), **initial}
     gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])

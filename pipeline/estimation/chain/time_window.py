@@ -29,7 +29,7 @@ class FitWindow:
     carts, free : as in `Record`; the held carts are gone from both.
     stated_sigma : (p,) standard error of a position, by encoder step and local noise.
     sigma : (p,) standard error to weigh with; at least the stated one.
-    step : (p,) of the encoders, position units; 0 where none is known.
+    step : (p,) of the encoders, position units; 0 if unknown.
     at_rest : True where the carts start at rest, else position and speed at t = 0 are unknown.
     shared : (p,) of the readings before the input begins, the variance of the error they have in
         common over sigma²: what an encoder rounds off while nothing moves is one error.
@@ -52,7 +52,7 @@ class FitWindow:
 
     @property
     def n_resting(self) -> int:
-        """How many samples there are before the input begins; 0 where none does."""
+        """Number of samples before the input begins; 0 without an input."""
         if self.drive_u is None or not np.any(self.drive_u):
             return 0
         return int(np.searchsorted(self.t, self.drive_t[np.flatnonzero(self.drive_u)[0]]))

@@ -22,7 +22,7 @@ _SMALLEST_SWING = 8.0
 _BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points attributed to the hand, if enough others remain
 _MIN_SAMPLES = 12
 # Extended backwards, a fit may be off by this many of its own residuals. A share of the amplitude
-# is added while it rests on the smaller swings only, or if it leaves more than noise anyway.
+# is added while it rests on the smaller swings only, or if its residual exceeds the noise anyway.
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0)
 _REAL_SHARE = 0.15
@@ -155,7 +155,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
     def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
-        """Fit with dry friction if the viscous fit leaves more than noise."""
+        """Fit with dry friction if the residual of the viscous fit exceeds the noise."""
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
         friction = None

@@ -43,7 +43,7 @@ def choose_recording(
     commands : the extensions of the protocol that the bench knows.
     """
     named = gap is None or gap.verdict in SETTLED
-    # A name that leaves more than noise is still one of its contenders.
+    # A named model whose error exceeds the noise is still one of several contenders.
     settled = gap is None or (named and not gap.contenders)
     end = "" if named else WORDS.text("undecided")
     decides = gap and gap.proposal

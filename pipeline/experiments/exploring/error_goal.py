@@ -39,7 +39,7 @@ def read_error_goal(text: str) -> ErrorGoal:
 
     Raises
     ------
-    ConfigError : it has none of these forms.
+    ConfigError : it has another form.
     """
     before, _, after = text.partition("%")
     *name, share = before.split() or [""]
@@ -57,7 +57,7 @@ def read_time(text: str) -> float:
 
     Raises
     ------
-    ConfigError : it has none of these forms.
+    ConfigError : it has another form.
     """
     number = text.strip().rstrip("minsech ")
     unit = text.strip()[len(number) :].strip()

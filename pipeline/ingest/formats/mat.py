@@ -74,7 +74,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
 
     Raises
     ------
-    SubmissionError : there is none, or its parts do not go together.
+    SubmissionError : no variable is a recording, or its parts do not fit together.
     """
     signals = [v for v in variables if v.values is not None and v.samples > 1]
     if not signals:

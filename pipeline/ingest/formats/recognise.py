@@ -29,7 +29,7 @@ FORM_TITLES = {
     "tdms": "National Instruments .tdms",
     "lvm": "LabVIEW measurement file (.lvm)",
 }
-# What recognises a file, and reads it; all others are text.
+# Function that recognises a form, and one that reads it; all others are text.
 _READERS = (
     (is_mat, read_mat),
     (is_workbook, read_workbook),

@@ -148,7 +148,7 @@ def make_table(
     cut: str | None,
     notes: Sequence[str] = (),
 ) -> FileTable:
-    """Return rows as the columns of a file; `typed` is the first row, as it stands there."""
+    """Return rows as the columns of a file; `typed` is the first row as written."""
     values = np.ascontiguousarray(rows.values.T)
     whole = tuple(
         "." not in field and "," not in field and bool((column == np.round(column)).all())
@@ -171,7 +171,7 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
 
     Raises
     ------
-    SubmissionError : too many, too long, or one stands twice; begins with `place`.
+    SubmissionError : too many, too long, or duplicates; begins with `place`.
     """
     if len(names) > MOST_COLUMNS:
         raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
@@ -184,7 +184,7 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
     seen: set[str] = set()
     for name in clean:
         if name.casefold() in seen:
-            raise SubmissionError(f"{place}: the heading {name[:40]!r} stands twice")
+            raise SubmissionError(f"{place}: the heading {name[:40]!r} appears twice")
         seen.add(name.casefold())
     return clean
 
@@ -279,7 +279,7 @@ class _Layout:
 
 def _delimited(text: str, source: str) -> FileTable:
     """Read a heading and rows; the delimiter and the decimal mark are found."""
-    # A spreadsheet leaves rows of nothing but delimiters after its last.
+    # A spreadsheet writes rows of empty cells after its last.
     numbered = enumerate(text.split("\n"), start=1)
     lines = [(i, line) for i, line in numbered if line.strip().strip(' \t;,"')]
     start = 0

@@ -1,4 +1,4 @@
-"""What is erased leaves nothing behind, and a backup brings a gradebook back."""
+"""An erased submission leaves no trace, and a backup restores a gradebook."""
 
 import sqlite3
 import subprocess

@@ -38,7 +38,7 @@ def jit(function: Callable[..., Any]) -> Any:
 def inlined(function: Callable[..., Any]) -> Any:
     """Compile a function into those that call it.
 
-    In the machine's code, where it is fast; in that of Python it would be typed at every call anew.
+    In the machine's code, where it is fast; in Python it would be typed at every call.
     """
     return _compiled(function, forceinline=True)
 

@@ -203,7 +203,7 @@ def _steps(tables, bodies, refine):
 
     … its presliding part, and where there are smooth forces.
     """
-    # Sums, of which flags are made: numba compiles a function anew for every constant flag.
+    # Sums, from which flags are made: numba would compile a function for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
     s, n, N, motor = bodies.s, bodies.n, bodies.N, bodies.motor
     for i in range(N):
@@ -331,7 +331,7 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
                 upon = t[sample] + (sub + 1) * whole
                 h = whole
                 if (dry and s[V, driven] == 0.0) or now > upon - whole + _INSTANT:
-                    # What friction holds is to feel the whole of it until the input jumps.
+                    # A cart held by friction feels all of it until the input jumps.
                     h = _edge(run, delay, now, upon, at) - now
                 upto, upto2, at = _integral(run, now + h - delay, at)
                 mean = (upto - past) / h

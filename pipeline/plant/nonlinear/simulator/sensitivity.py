@@ -31,7 +31,7 @@ from pipeline.plant.nonlinear.simulator.state import (
     TURNED, V, X, Z, stretch,
 )  # fmt: skip
 
-# What a lane is the derivative with respect to: the table's own number, of a cart or a spring; the
+# The variable of a lane's derivative: the table's own number, of a cart or a spring; the
 # factor on a cart's dry friction; or its start (from n on, that of the hidden mass on it).
 BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range(6)
 _BLOCK = 4  # lanes that a processor takes at once: the last axis
@@ -86,7 +86,7 @@ def carry(tables, bodies, push, lanes, whole, step):
             _add(T, N + i, s[BEFORE, i] - s[D2, i], 3 * N)
             s[TURNED, i] = 0.0
         if s[GRIP, i] == 0.0:
-            _add(T, N + i, -1.0, N + i)  # a cart that is held, also one gripped anew, has no speed
+            _add(T, N + i, -1.0, N + i)  # a held cart, even one just gripped, has no speed
         changed = changed or s[GRIP, i] != phi[2 * N, N + i]
         s[HALF_X, i] = s[X, i] + 0.5 * step * (s[V, i] + 0.25 * step * s[D2, i])
         s[HALF_V, i] = s[V, i] + 0.5 * step * s[D2, i]
@@ -262,7 +262,7 @@ def meet(T, bodies, body, other, stiffness, damping):
 
 @jit
 def restart(bodies, lanes, shot, free):
-    """Let the sensitivities begin anew where a shot does."""
+    """Restart the sensitivities where a shot begins."""
     n, N, motor, parent, T, of = (
         bodies.n, bodies.N, bodies.motor, bodies.parent, lanes.T, lanes.of
     )  # fmt: skip
