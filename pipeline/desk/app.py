@@ -116,6 +116,7 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/student/{n:int}/compare", "GET", plots_page.show),
     ("/student/{n:int}/compare", "POST", plots_page.make),
     ("/student/{n:int}/answer", "POST", report_page.answer),
+    ("/student/{n:int}/state-signs", "POST", report_page.state_signs),
     ("/student/{n:int}/check", "GET", check_page.show),
     ("/student/{n:int}/check", "POST", check_page.begin),
     ("/student/{n:int}/hand-in", "GET", submission_page.show_hand_in),

@@ -15,7 +15,7 @@ from pipeline.submission.toml_file import read_text
 ASKED = "questions.json"  # beside the report: what it asks, assumed, found, and is made of
 NOTES = "notes.md"
 NOTHING_TOLD: Mapping[str, Any] = {
-    "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "",
+    "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
 }  # fmt: skip
 PLOTS = "report/compare.html"
 PLOTS_OF = "report/plots.json"  # what the plots are made of
@@ -35,10 +35,18 @@ def stat_sources(folder: Path) -> dict[str, list[int]]:
 
 
 def find_state(folder: Path) -> str:
-    """Return "none", "current", or "older" than what it is made of."""
+    """Return "none", "current", "answered" or "older" than what it is made of.
+
+    "answered": only the answers in `notes.md` are newer, on which no number depends.
+    """
     if outside(folder, "report/report.html") is not None:
         return "none"
-    return "current" if _read_asked(folder).get("made_of") == stat_sources(folder) else "older"
+    made_of, now = _read_asked(folder).get("made_of"), stat_sources(folder)
+    if made_of == now:
+        return "current"
+    if not isinstance(made_of, dict):
+        return "older"
+    return "answered" if {**made_of, NOTES: 0} == {**now, NOTES: 0} else "older"
 
 
 def plots_are_current(folder: Path) -> bool:
@@ -58,8 +66,9 @@ def read_told(folder: Path) -> dict[str, Any]:
             "contradicted": _pick_assumptions(read.get("contradicted", [])),
             "failed": [str(one) for one in read["failed"]],
             "changes": str(read["changes"]),
+            "turned": {str(run): int(sign) for run, sign in read.get("turned", {}).items()},
         }
-    except (KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, ValueError, AttributeError):
         return dict(NOTHING_TOLD)
 
 

@@ -132,6 +132,9 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             ],
             "changes": with_symbols(changes_line(changes)) if changes else "",
             "failed": [with_symbols(check.message) for check in analysis.failed_checks],
+            "turned": {
+                one.id: 1 if one.input_scale > 0 else -1 for one in analysis.records if one.turned
+            },
             "unreadable": dict(analysis.unreadable),
             "made_of": made_of,
         }

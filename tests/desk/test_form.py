@@ -76,8 +76,10 @@ def test_every_kind_of_field_goes_there_and_back():
         "reported.feedback.gains": "[1, 2, 3.0, 4]",
     }  # fmt: skip
     loop = next(path for path in fields(WHOLE) if path.endswith("controller.type"))
-    given |= {loop: "pid", loop.replace("type", "kp"): "0.05"}
-    new = changed(WHOLE, **given)
+    gain = loop.replace("type", "kp")
+    assert gain not in fields(WHOLE)
+    given |= {loop: "pid", gain: "0.05"}
+    new = changed(changed(WHOLE, **{loop: "pid"}), **given)
     for path, value in given.items():
         assert fields(new)[path].value.replace(",", "").split() == (
             value.strip("[]").replace(",", "").split()
@@ -94,6 +96,28 @@ def test_every_kind_of_field_goes_there_and_back():
     empty = changed(gone, **dict.fromkeys(given, ""))
     assert "A" not in tomllib.loads(empty)["reported"]["state_space"]
     assert "columns" not in tomllib.loads(empty)["system"]
+
+
+@pytest.mark.parametrize(
+    ("table", "keys"),
+    [
+        ('kind = "decay"', ""),
+        ('kind = "sine"', "frequency"),
+        ('kind = "step"\nfrequency = 2', "frequency"),  # what is wrong in the file can be mended
+        ('kind = "closed_loop"', "controlled_cart reference controller.type"),
+        (
+            'kind = "closed_loop"\ncontroller = { type = "pid", gains = [1] }',
+            "controlled_cart reference controller.type controller.gains controller.kp "
+            "controller.ki controller.kd controller.scale controller.cart",
+        ),
+    ],
+)
+def test_a_row_has_the_fields_of_its_kind_only(table, keys):
+    """And of its controller; others only where the file states them."""
+    shown = fill_experiment(read_document(f"[[experiments]]\n{table}\n"), 0)
+    found = {field.path.removeprefix("experiments.0.") for field in shown}
+    always = {"kind", "carts", "window", "note", "columns", "sample_rate"}
+    assert found - always == set(keys.split())
 
 
 def test_comments_outlive_every_change(tmp_path):

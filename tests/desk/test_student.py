@@ -22,6 +22,7 @@ from pipeline.desk.jobs import WorkerPool
 from pipeline.desk.last_report import stat_sources
 from pipeline.desk.student import files as uploads
 from pipeline.desk.student.files import take_uploads
+from pipeline.desk.tasks import make_report
 from pipeline.errors import SubmissionError
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.ingest.formats.recognise import parse_table
@@ -30,6 +31,7 @@ from pipeline.processes import Failed
 from pipeline.submission import load_submission
 from pipeline.submission.edit import edit_submission
 from pipeline.submission.load import NAME
+from pipeline.words.progress import silent
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
 from tests.helpers.recordings import xlsx
 from tests.helpers.waiting import PATIENCE, started, until
@@ -322,7 +324,8 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
         (folder / "gap").mkdir()
         (folder / "gap" / "gap.json").write_text("{}", encoding="utf-8")
     for page in (visitor.get(HERE).text, visitor.get(HERE + "hand-in").text):
-        assert ("The report is out of date" in page) == (change != "nothing")
+        assert ("The report is out of date" in page) == (change not in ("nothing", "answer"))
+        assert ("our answers are newer than the report" in page) == (change == "answer")
     assert ("report/report.pdf" in zipped(visitor).namelist()) == (change == "nothing")
 
 
@@ -363,7 +366,9 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
         ("system.springs", ", wall-1: there (no step tells)"),
         ("system.input.sign", ": -1 (all steps go down)"),
     ]
-    (folder / "notes.md").write_text("# Discussion\n", encoding="utf-8")
+    (folder / "notes.md").write_text("# Discussion\n", encoding="utf-8")  # no number depends on it
+    assert "system.springs" in visitor.get(HERE + "hand-in").text
+    os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
     assert page.count("No report of these files says it.") == 2
@@ -843,6 +848,85 @@ def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
     assert visitor.post(HERE + "save", seen=page.value("seen"), answer=answer).status == 303
     assert load_submission(folder).system.input.sign == -1
     assert "Turn the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
+
+
+def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
+    """Beside the question of a real report; only in those runs, and also once it is answered."""
+    folder = a_submission(tmp_path / "team")
+
+    def bare(document):
+        del document["system"]["input"]
+
+    runs = edit_submission(folder, bare).experiments
+    turned = next(run for run in runs if run.kind == "step")
+    rows = (folder / turned.file).read_text(encoding="utf-8").splitlines()
+    place = rows[0].split(",").index("input")
+    logged = [row.split(",") for row in rows[1:]]
+    for row in logged:
+        row[place] = f"{-float(row[place])!r}"
+    text = "\n".join([rows[0], *map(",".join, logged)])
+    (folder / turned.file).write_text(text, encoding="utf-8")
+    make_report(str(folder), progress=silent)
+    with DeskServer(folder=folder) as server:
+        visitor = Visitor.of(server.url)
+        page = visitor.get(HERE + "questions")
+        visitor.post(HERE + "answer", id="sign", answer="The plug.", seen=page.value("seen"))
+        page = visitor.get(HERE + "questions").text
+        assert f"State the sign -1 in {turned.id}</button>" in page
+        seen = re.findall(r'name="seen" value="(\w+)"><p class="answers">', page)[0]
+        assert visitor.post(HERE + "state-signs", seen="0" * 64).status == 409
+        assert visitor.post(HERE + "state-signs", seen=seen).status == 303
+        assert "State the sign" not in visitor.get(HERE + "questions").text
+    signs = {run.id: run.input and run.input.sign for run in load_submission(folder).experiments}
+    assert {id_: sign for id_, sign in signs.items() if sign} == {turned.id: -1}
+
+
+def test_remarks_that_differ_in_a_number_are_said_once(room):
+    """Of several logs with rounded time stamps, with the least and the most."""
+    visitor, _ = room
+    for name, interval in (("a", 0.0103), ("b", 0.0104), ("c", 0.0105)):
+        rows = [f"{round(i * interval, 3)},{i // 50},{i % 99 * 7}" for i in range(400)]
+        text = "\n".join(["time,input,x1", *rows])
+        visitor.upload(HERE + "files", [(f"{name}.csv", text.encode())])
+    page = visitor.get(HERE).text
+    assert "1 remark on several files" in page
+    assert page.count("were straightened") == 1
+    assert "one sample every 10.3 to 10.5 ms" in page
+
+
+def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
+    """One line asks; frequency is asked of dwells only."""
+    visitor, folder = filled
+    runs = load_submission(folder).experiments
+    kinds = [run.kind for run in runs]
+    place = kinds.index("step")
+    page, path = visitor.get(HERE), f"experiments.{place}.kind"
+    assert f'id="loop-{place}"' not in page.text
+    seen = page.value("seen")
+    visitor.post(HERE + f"experiments/{place}", seen=seen, **{path: "closed_loop"})
+    page = visitor.get(HERE)
+    assert f'id="loop-{place}"><summary>What controller ran?' in page.text
+    path = f"experiments.{place}.controller.type"
+    assert f"experiments.{place}.controller.kp" not in page.text
+    visitor.post(HERE + f"experiments/{place}", seen=page.value("seen"), **{path: "pid"})
+    page = visitor.get(HERE).text
+    assert f'id="loop-{place}" open><summary>What controller ran?' in page
+    assert f"experiments.{place}.controller.kp" in page
+    assert f"experiments.{place}.controller.gains" not in page
+    dwells = {str(i) for i, kind in enumerate(kinds) if kind == "sine"}
+    assert set(re.findall(r'name="experiments\.(\d+)\.frequency"', page)) == dwells
+
+
+def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
+    """With a report of the files as they are, that is to hand in; the doubt stays in sight."""
+    visitor, folder = filled
+    (folder / "data" / "bad.csv").write_bytes(b"time,input,x1\n0,0,0\n")
+    assert "Look at it</a>" in visitor.get(HERE).text
+    ask_for(folder)
+    shown = visitor.get(HERE).text.partition('class="now')[2].partition("</section>")[0]
+    assert 'class="main" data-of-saved>Hand in</button>' in shown
+    assert "1 file needs you" in shown
+    assert "Look at 1 file</a>" in shown
 
 
 def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):

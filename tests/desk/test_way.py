@@ -22,6 +22,26 @@ READY = Facts(recordings=33, sound=True, report="current", questions=3)
         (Facts(recordings=33, sound=True, making=True), "done done none none none", "report"),
         (Facts(recordings=33, sound=True, report="older"), "done done old done none", "report"),
         (
+            Facts(recordings=33, to_look_at=1, sound=True, report="current"),
+            "needs done done done needs",
+            "hand-in",
+        ),
+        (
+            Facts(recordings=33, to_look_at=1, sound=True, report="answered", unanswered=1),
+            "needs done done needs none",
+            "questions",
+        ),
+        (
+            Facts(recordings=33, to_look_at=1, sound=True, report="older"),
+            "needs done old done none",
+            "files",
+        ),
+        (
+            Facts(recordings=33, to_look_at=1, sound=True, check=("done", "all agree")),
+            "needs done done needs",
+            "hand-in",
+        ),
+        (
             Facts(recordings=33, sound=True, report="current", questions=3, unanswered=1),
             "done done done needs none",
             "questions",
@@ -40,7 +60,7 @@ READY = Facts(recordings=33, sound=True, report="current", questions=3)
     ],
 )
 def test_each_step_follows_from_the_facts(facts, states, following):
-    """Done, needs you, out of date, or not yet; the first step not done is next."""
+    """The first step not done is next; a file in doubt holds up no report that is there."""
     steps = find_steps(facts)
     assert " ".join(step.state for step in steps) == states
     assert next_step(steps).key == following

@@ -118,6 +118,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         until(lambda: "bumped" in (folder / NAME).read_text(encoding="utf-8"))
         expect(row).to_be_visible()  # what was unfolded stays so
         expect(window.locator("#files").get_by_text("Saved.")).to_be_visible()
+        window.get_by_text("What controller ran?").click()
         window.get_by_label("Controller", exact=True).select_option("state_feedback")
         expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
         expect(window.get_by_label("Prefilter").first).to_be_visible()  # nothing folds over it

@@ -21,7 +21,7 @@ from pipeline.names import parameter_names, read_name
 from pipeline.set_up import Units
 from pipeline.submission import Submission
 from pipeline.submission.edit import comment_text, toml_item
-from pipeline.submission.load import InvalidSubmission, spring_names
+from pipeline.submission.load import InvalidSubmission, list_experiments, spring_names
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.text import symbol_text
 
@@ -54,6 +54,9 @@ _OF_LOOP = (
     "controlled_cart", "reference", "controller.type", "controller.gains", "controller.prefilter",
     "controller.kp", "controller.ki", "controller.kd", "controller.scale", "controller.cart",
 )  # fmt: skip
+_OF_CONTROLLER = {
+    "state_feedback": ("gains", "prefilter"), "pid": ("kp", "ki", "kd", "scale", "cart"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,12 +151,34 @@ def fill_form(document: Mapping[str, Any]) -> list[Group]:
 
 
 def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
-    """Return the fields of one experiment, filled in from its table."""
+    """Return the fields of one experiment, filled in from its table.
+
+    They are those of its kind and its controller; others only where the file states them.
+    """
     table = f"experiments.{index}"
-    is_loop = _find(document, f"{table}.kind") == "closed_loop"
+    kind = _find(document, f"{table}.kind")
+    chosen = _find(document, f"{table}.controller.type")
+    of_type = [f"controller.{key}" for key in _OF_CONTROLLER.get(str(chosen), ())]
+    used = {*_OF_EXPERIMENT, *_OF_LOOP[:3], *of_type} - ({"frequency"} if kind != "sine" else set())
     first, rest = _OF_EXPERIMENT[:2], _OF_EXPERIMENT[2:]
-    keys = (*first, *_OF_LOOP, *rest) if is_loop else _OF_EXPERIMENT
-    return _fill([_describe_field(f"{table}.{key}") for key in keys], document)
+    keys = (*first, *_OF_LOOP, *rest) if kind == "closed_loop" else _OF_EXPERIMENT
+    fields = _fill([_describe_field(f"{table}.{key}") for key in keys], document)
+    return tuple(f for f, key in zip(fields, keys, strict=True) if key in used or f.value)
+
+
+def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[Field]:
+    """Return the signs of the input, by experiment, that its table does not state, as typed."""
+    return [
+        replace(_describe_field(path), value=f"{signs[table['id']]:d}")
+        for index, table in enumerate(list_experiments(document))
+        for path in [f"experiments.{index}.input.sign"]
+        if table.get("id") in signs and _find(document, path) is None
+    ]
+
+
+def is_of_loop(field: Field) -> bool:
+    """Return whether a field of an experiment says what controller ran."""
+    return field.path.split(".", 2)[2] in _OF_LOOP
 
 
 def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list[Field]:

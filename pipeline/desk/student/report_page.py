@@ -2,17 +2,20 @@
 
 from collections.abc import Mapping
 
+import tomlkit
 from starlette.responses import Response
 
 from pipeline.desk.ask import Ask
 from pipeline.desk.last_report import NOTES, read_notes, read_told
-from pipeline.desk.student.room import look_around
+from pipeline.desk.student.form import read_document, sign_fields, write_fields
+from pipeline.desk.student.room import Room, look_around
 from pipeline.errors import SubmissionError
 from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.report.sections.answers import with_answer, written_answer
-from pipeline.submission.edit import text_digest
-from pipeline.submission.load import MAX_NOTES_BYTES, outside
+from pipeline.submission.edit import Outdated, edit_submission, text_digest
+from pipeline.submission.load import MAX_NOTES_BYTES, list_experiments, outside
+from pipeline.words.numbers import abridge
 
 
 def show(ask: Ask) -> Response:
@@ -60,37 +63,67 @@ def answer(ask: Ask) -> Response:
     return ask.back(f"{ask.here}questions#{place}", "Written into notes.md.", place=place)
 
 
+def state_signs(ask: Ask) -> Response:
+    """Write into the tables of the runs that were turned which sign their input has."""
+    signs = read_told(ask.folder())["turned"]
+
+    def change(document: tomlkit.TOMLDocument) -> None:
+        write_fields(document, sign_fields(document, signs))
+
+    try:
+        edit_submission(ask.folder(), change, seen=ask.text("seen") or "nothing")
+    except SubmissionError as error:
+        return _show_questions(ask, status=409 if isinstance(error, Outdated) else 422, said=error)
+    return ask.back(f"{ask.here}questions#question-sign", "Saved.", place="question-sign")
+
+
 def _show_questions(
-    ask: Ask, *, status: int = 200, refused: Mapping[str, tuple[str, str]] = {}
+    ask: Ask,
+    *,
+    status: int = 200,
+    refused: Mapping[str, tuple[str, str]] = {},
+    said: SubmissionError | None = None,
 ) -> Response:
     """Show the questions.
 
     Parameters
     ----------
     refused : by question, an answer as it was typed, and why it was not written.
+    said : why a sign was not written.
     """
-    folder = ask.folder()
-    said = read_told(folder)
-    problems, notes = [why for _, why in refused.values()], ""
+    folder, room = ask.folder(), look_around(ask)
+    told = read_told(folder)
+    problems, notes = [*(why for _, why in refused.values()), *([str(said)] if said else [])], ""
     try:
         notes = read_notes(folder)
     except SubmissionError as error:
         problems = [str(error)]
-    questions, known = [], [one["id"] for one in said["questions"]]
+    questions, known = [], [one["id"] for one in told["questions"]]
     others = [
         {"id": id_, "section": "", "text": f"Answer to {id_}"}
         for id_ in refused
         if id_ not in known
     ]
-    for one in [*said["questions"], *others]:
+    for one in [*told["questions"], *others]:
         words, why = refused.get(one["id"]) or (written_answer(notes, one["id"]), "")
         questions.append({**one, "answer": words, "wrong": why})
     return ask.page(
         "questions",
         status=status,
         title=f"Questions to {folder.name}",
-        room=look_around(ask),
+        room=room,
         questions=questions,
+        signs=_list_signs(room),
         problems=problems,
         seen=text_digest(notes),
     )
+
+
+def _list_signs(room: Room) -> str:
+    """Return the signs that one click states, with their runs; "" if there are none to state."""
+    document, signs = read_document(room.text), room.told["turned"]
+    tables = list_experiments(document)
+    open_: dict[str, list[str]] = {}
+    for field in sign_fields(document, signs):
+        open_.setdefault(field.value, []).append(tables[int(field.path.split(".")[1])]["id"])
+    return "; ".join(f"{sign} in {abridge(runs)}" for sign, runs in open_.items())

@@ -85,7 +85,7 @@ def look_around(
         shown,
         fractions=[row.file for row in rows if row.look["fractions"]],
         doubts=doubts,
-        told=told if report == "current" else last_report.NOTHING_TOLD,
+        told=told if report in ("current", "answered") else last_report.NOTHING_TOLD,
     )
     by_path = {field.path: field for field in asked}
     rows = [replace(row, fields=tuple(by_path[f.path] for f in row.fields)) for row in rows]

@@ -1,5 +1,6 @@
 """The recordings of a submission as rows, grouped by kind: each with what needs a person."""
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +9,14 @@ from typing import Any
 
 from pipeline.desk.ask import NOTHING_KNOWN, Ask
 from pipeline.desk.student.doubts import ask_held
-from pipeline.desk.student.form import Answer, Field, count_carts, fill_experiment, is_marked
+from pipeline.desk.student.form import (
+    Answer,
+    Field,
+    count_carts,
+    fill_experiment,
+    is_marked,
+    is_of_loop,
+)
 from pipeline.ingest.inspect import NO_CLOCK
 from pipeline.submission.load import list_experiments, posix, stated_columns
 from pipeline.submission.models import MOST_EXPERIMENTS
@@ -24,6 +32,9 @@ _KINDS = (
     ("closed_loop", "Closed loop"),
     ("bode", "Tables of ratios"),
 )
+
+# What differs from file to file in remarks that say the same.
+_MEASURED = re.compile(r"\d+(?:\.\d+)?(?= (?:ms|pieces)\b)")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +68,11 @@ class Row:
         stated = next((f.value for f in self.fields if f.path.endswith(".frequency")), "")
         found = self.look["frequency"]
         return stated or (f"{found:.3g}" if found and self.kind == "sine" else "")
+
+    @property
+    def of_loop(self) -> list[Field]:
+        """The fields that say what controller ran."""
+        return [field for field in self.fields if is_of_loop(field)]
 
     @property
     def is_recording(self) -> bool:
@@ -207,11 +223,24 @@ def _question(
 
 
 def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
-    """Return what there is to say of many files, each with its sentence that names them."""
-    told = [(row.file, said) for row in rows for said in row.remarks]
-    times = Counter(said for _, said in told)
-    many = [said for said, number in times.items() if number >= 3]  # said once, for all of them
-    return {
-        said: by_note((file.removeprefix("data/"), one) for file, one in told if one == said)[0]
-        for said in many
-    }
+    """Return what there is to say of many files, each with its sentence that names them.
+
+    Remarks that differ only in their numbers of ms or pieces share a sentence, with least and most.
+    """
+    told = [(row.file.removeprefix("data/"), said) for row in rows for said in row.remarks]
+    times = Counter(_MEASURED.sub("#", said) for _, said in told)
+    sentences = {}
+    for pattern in (one for one, number in times.items() if number >= 3):
+        alike = [(file, said) for file, said in told if _MEASURED.sub("#", said) == pattern]
+        whole = _span_numbers([said for _, said in alike])
+        (sentence,) = by_note((file, whole) for file, _ in alike)
+        sentences |= {said: sentence for _, said in alike}
+    return sentences
+
+
+def _span_numbers(said: Sequence[str]) -> str:
+    """Return remarks that differ only in numbers as one."""
+    columns = zip(*(_MEASURED.findall(one) for one in said), strict=True)
+    ends = [(min(column, key=float), max(column, key=float)) for column in columns]
+    spans = iter([low if low == high else f"{low} to {high}" for low, high in ends])
+    return _MEASURED.sub(lambda _: next(spans), said[0])

@@ -17,7 +17,7 @@ class Facts:
     recordings : how many there are; to_look_at : how many files need a person.
     missing : groups of the set-up that lack something.
     sound : whether `submission.toml` is there and valid.
-    report : "none", "current", or "older" than what it is made of.
+    report : "none", "current", "answered" or "older"; see `find_state` of the last report.
     making : whether it is being made.
     questions, unanswered : of the last report.
     handed : whether the zip, as it is now, was downloaded.
@@ -64,6 +64,8 @@ def _report(facts: Facts) -> Stands:
         return "none", "being made"
     if facts.report == "current":
         return "done", "done"
+    if facts.report == "answered":
+        return "done", "done but for answers"
     if facts.report == "older":
         return "old", "out of date"
     ready = all(find(facts)[0] == "done" for find in (_files, _set_up))
@@ -82,9 +84,14 @@ def _check(facts: Facts) -> Stands:
     return facts.check or ("none", "not yet")
 
 
+def _has_result(facts: Facts) -> bool:
+    """Return whether the files as they are gave a report or agree: doubts then hold up nobody."""
+    return (_check if facts.check else _report)(facts)[0] == "done"
+
+
 def _hand_in(facts: Facts) -> Stands:
-    shown = (_check,) if facts.check else (_report, _questions)
-    if any(find(facts)[0] != "done" for find in (_files, _set_up, *shown)):
+    steps = (_set_up,) if facts.check else (_set_up, _questions)
+    if not _has_result(facts) or any(find(facts)[0] != "done" for find in steps):
         return "none", "not yet"
     return ("done", "downloaded") if facts.handed else ("needs", "ready")
 
@@ -115,5 +122,10 @@ def find_steps(facts: Facts) -> tuple[Step, ...]:
 
 
 def next_step(steps: Sequence[Step]) -> Step:
-    """Return the first step that is not done; the last where all are."""
-    return next((step for step in steps if step.state != "done"), steps[-1])
+    """Return the first step that is not done; the last where all are.
+
+    Files that need a person hold up nobody once there is a report of them, or a check that agrees.
+    """
+    has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
+    open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]
+    return open_[0] if open_ else steps[-1]
