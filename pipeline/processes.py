@@ -123,6 +123,20 @@ class Supervisor:
                 raise Failed(answer["failed"])
             return answer["done"]
 
+    @property
+    def runs(self) -> bool:
+        """Whether a process is there for the next task."""
+        return self._process is not None and self._process.runs
+
+    def start(self, stop: threading.Event) -> None:
+        """Start the process before a task needs it; `stop` as for `do`.
+
+        Raises
+        ------
+        Ended, OSError : as for `do`.
+        """
+        self._ready(stop)
+
     def close(self) -> None:
         """End the process; the next task starts another."""
         process, self._process = self._process, None

@@ -217,6 +217,8 @@ class DeskServer:
         self._desk = Desk()
         clear_scratch()
         prepare_pages()
+        if listed and any(user.folders for user in listed[1].values()):
+            self._desk.workers.start()
         limited = limit_bodies(application(self._desk), uploads=HAND_IN.total)
         self._served = Served(Guard(limited, door, headers=PAGE_HEADERS), listener)
 

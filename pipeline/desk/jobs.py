@@ -5,7 +5,7 @@ import queue
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -143,13 +143,16 @@ class WorkerPool:
 
     The tasks of a folder are done one after the other: who has a slow file waits for it, and with
     them who looks at the same folder.
+
+    A process that was used up, or that a file ended, is replaced at once: nobody waits a second for
+    the next one to start.
     """
 
     def __init__(self) -> None:
         self._free: queue.LifoQueue[Supervisor] = queue.LifoQueue()
+        self._closed = threading.Event()
         for _ in range(_HANDS):
             self._free.put(_worker())
-        self._closed = threading.Event()
         self._lock = threading.Lock()
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
 
@@ -168,7 +171,25 @@ class WorkerPool:
                     raise Failed("the desk is ending")
                 return process.do((task, given), limit=180.0, stop=self._closed)
             finally:
-                self._free.put(process)
+                if process.runs or self._closed.is_set():
+                    self._free.put(process)
+                else:
+                    self._replace(process)
+
+    def start(self) -> None:
+        """Start all processes in the background, for a desk at which many will soon ask."""
+        for _ in range(_HANDS):
+            self._replace(self._free.get())
+
+    def _replace(self, process: Supervisor) -> None:
+        threading.Thread(target=self._start, args=(process,), daemon=True).start()
+
+    def _start(self, process: Supervisor) -> None:
+        try:
+            with suppress(Failed, OSError):  # then the next task tries again, and says why not
+                process.start(self._closed)
+        finally:
+            self._free.put(process)
 
     @contextmanager
     def _turn(self, folder: str | None) -> Iterator[None]:

@@ -187,6 +187,24 @@ def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
     workers.close()
 
 
+def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, monkeypatch):
+    """No page waits until another has started."""
+    monkeypatch.setattr("pipeline.processes._TASKS_EACH", 1)
+    workers = WorkerPool()
+    assert workers.do("list_files", folder=str(tmp_path)) == []
+    until(lambda: any(hand.runs for hand in list(workers._free.queue)), "another process")
+    workers.close()
+
+
+def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
+    """All of them are started in the background."""
+    workers = WorkerPool()
+    workers.start()
+    until(lambda: [hand.runs for hand in list(workers._free.queue)] == [True] * _HANDS)
+    assert workers.do("list_files", folder=str(tmp_path)) == []
+    workers.close()
+
+
 @pytest.mark.parametrize(
     ("module", "line"),
     [

@@ -119,10 +119,14 @@ class WorkerHere:
     One task at a time; it is waited for, not killed.
     """
 
+    runs = True
     _turn = threading.Lock()
 
     def __init__(self, module: str, **_: object) -> None:
         pass
+
+    def start(self, stop: threading.Event) -> None:
+        """Do nothing: there is no process to start."""
 
     def do(self, task: Any, *, tell: Progress = silent, **_: object) -> Any:
         """Do a task that arrives and returns as JSON."""

@@ -1,5 +1,6 @@
 """Record, identify, look for the gap, choose, record, until all is known or time is up."""
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -116,6 +117,7 @@ class Exploration:
         self._begin()
         self._look()
         while (recording := self._take_turn()) is not None:
+            gc.collect()  # a turn leaves figures and searches, which are cycles with large arrays
             self._try_out(recording)
         return tuple(self.turns)
 
@@ -219,6 +221,8 @@ class Exploration:
             said=self.lost + said,
             gap=gap,
         )
+        if self.turns:
+            self.turns[-1] = self.turns[-1].without_other_traces()
         self.turns.append(turn)
         self.made = ()
         write_diary(self.turns, self.analysis, self.folder, wanted=self.goal.error)

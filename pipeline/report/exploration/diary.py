@@ -1,7 +1,7 @@
 """`exploration.html`: what is known, then how it came to be known, turn by turn."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,8 @@ class Turn:
     left, floor : what the model leaves of the motion, and what noise alone would.
     reached : all that was asked for is known, and what else acts has a name or is not there.
     said : what is known, what is doubted and why the next recording is made, in one sentence.
-    gap : as it was looked for at that turn; None where it could not be.
+    gap : as it was looked for at that turn; None where it could not be. Of an earlier turn it has
+        the one trace that the diary shows.
     """
 
     seconds: float
@@ -63,6 +64,18 @@ class Turn:
     reached: bool
     said: str
     gap: Gap | None = None
+
+    def without_other_traces(self) -> "Turn":
+        """Return the turn with no more traces than its part of the diary shows.
+
+        Each turn's gap has the traces of all runs so far: kept, they would grow with the square of
+        the number of turns.
+        """
+        if self.gap is None:
+            return self
+        shown = deciding_trace(self.gap, self.recorded)
+        kept = replace(self.gap, traces=(shown,) if shown else (), left_forces=())
+        return replace(self, gap=kept)
 
 
 def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:

@@ -113,6 +113,15 @@ def test_an_exploration_leaves_an_ordinary_submission_and_its_diary(explored):
         assert f"{turn.seconds:.0f} s" in diary
 
 
+def test_an_exploration_keeps_no_trace_that_its_diary_does_not_show(explored):
+    """Earlier turns keep the one run of their picture; the last one has all runs."""
+    folder, turns, _, _ = explored
+    *earlier, last = [turn.gap for turn in turns]
+    assert earlier
+    assert [len(gap.traces) for gap in earlier] == [1] * len(earlier)
+    assert len(last.traces) == len(load_submission(folder).experiments)
+
+
 @pytest.fixture
 def no_gap(monkeypatch):
     """Only the carts are identified, if the gap does not matter or cannot be searched."""
