@@ -25,12 +25,13 @@ def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ())
             lines.append(f" {mark} {recording.id:{wide}}  {what_words(recording, submission)}")
     limits, system = plan.limits, submission.system
     left = [recording for recording in plan.recordings if recording.id not in done]
+    who = "the others" if done else "they"
     return "\n".join(
         [
             *lines,
             f"{count(len(plan.recordings), 'recording')}, {len(done)} done"
             + (f", {len(new)} new (+); " if new else "; ")
-            + (f"the others take {time_words(session_time(left))}" if left else "nothing to do"),
+            + (f"{who} take {time_words(session_time(left))}" if left else "nothing to do"),
             f"limits: {limits.input:g} {system.input.unit}, "
             f"{limits.travel:g} {system.position.unit} from the zero",
         ]

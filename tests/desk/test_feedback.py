@@ -185,6 +185,8 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     queue = ta.get(QUEUE)
     assert "see page 3" in queue.text
     assert "s4 asked" in queue.text
+    assert "ω₁ is off." in queue.text  # what is asked about
+    assert "0.85 of 1 point</h3>" in queue.text
     assert f"{ROOM}team?of=team-04&criterion=laws#chosen" in unescape(queue.text)
     sent = fields(queue)
     done = ta.post(QUEUE, do="answer", points="0.5", text="Page 3\nis right.", **sent)

@@ -908,6 +908,7 @@ def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
     assert f'id="loop-{place}"><summary>What controller ran?' in page.text
     path = f"experiments.{place}.controller.type"
     assert f"experiments.{place}.controller.kp" not in page.text
+    assert f'id="more-{place}"><summary>' in page.text  # nothing else of it is asked
     visitor.post(HERE + f"experiments/{place}", seen=page.value("seen"), **{path: "pid"})
     page = visitor.get(HERE).text
     assert f'id="loop-{place}" open><summary>What controller ran?' in page

@@ -460,7 +460,7 @@ def test_the_command_writes_shows_and_extends(monkeypatch, capsys, tmp_path):
     out, err = capsys.readouterr()
     assert "hold cart 2, cart 1 free:" in out
     assert "all carts free:" in out
-    assert "7 recordings, 0 done; the others take 1 min 59 s" in out
+    assert "7 recordings, 0 done; they take 1 min 59 s" in out
     assert "check its [limits]" in err
     raw = (tmp_path / "bench" / "plan.toml").read_bytes()
 

@@ -17,10 +17,11 @@ from pipeline.grading.gradebook.open_book import Conflict
 from pipeline.grading.gradebook.override import read_points
 from pipeline.grading.gradebook.request_book import Queued
 from pipeline.grading.gradebook.requests import MOST_LETTERS, RequestRefused
+from pipeline.grading.publish.feedback import sentence
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.words import points_text
 from pipeline.words.numbers import NOTHING
-from pipeline.words.text import capital
+from pipeline.words.text import capital, with_symbols
 
 
 def show(ask: Ask) -> Response:
@@ -100,6 +101,7 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
         "title": _find_title(rubric, request.criterion),
         "points": points_text(own.points) if own else NOTHING,
         "out_of": points_text(asked.points) if asked else NOTHING,
+        "said": with_symbols(sentence(own.message)) if own else "",
         "address": f"{ask.here}team?{urlencode(place)}#chosen",
         "steps": describe_steps(request.events, **hidden),
         "state": request.state,

@@ -75,6 +75,11 @@ class Row:
         return [field for field in self.fields if is_of_loop(field)]
 
     @property
+    def lacks_controller(self) -> bool:
+        """Whether it is a closed loop, and what controller ran is not said."""
+        return _lacks_controller(self.fields)
+
+    @property
     def is_recording(self) -> bool:
         """Whether the file is a recording; an essay or an empty file is not."""
         return self.index is not None or bool(self.look["format"])
@@ -181,7 +186,7 @@ def _describe(
     )
     problems = [*look["unusable"]] if look["format"] else ["it cannot be read"]
     problems += [f"state {need} below" for need in look["needs"] if need not in table]
-    if any(field.path.endswith("controller.type") and not field.value for field in fields):
+    if _lacks_controller(fields):
         problems.append("say what controller ran")
     known = {said for cart, said in look["still"].items() if int(cart) not in carts}
     known.update(problems)
@@ -196,6 +201,10 @@ def _describe(
         problems=tuple(problems),
         remarks=tuple(one for one in look["remarks"] if one not in known),
     )
+
+
+def _lacks_controller(fields: Sequence[Field]) -> bool:
+    return any(field.path.endswith("controller.type") and not field.value for field in fields)
 
 
 def _free_carts(document: Mapping[str, Any], table: Mapping[str, Any]) -> list[int]:
