@@ -47,12 +47,15 @@ def test_every_text_export_is_recognised(real_data):
 
 
 def test_the_servo_exports_are_recognised(real_data):
-    """Plain text and a MATLAB script; the effort of one hits the amplifier's limit."""
+    """A MATLAB script and plain text: a loop at the amplifier's limit, a sweep in open loop.
+
+    In the sweep "Commanded Pos" is the effort in percent of a volt, logged a moment apart.
+    """
     script = inspect_file(real_data / "ecp220-servo" / "raw_data_cl_step1.m")
     assert (script.samples, script.kind) == (451, "closed_loop")
     assert "the input is clipped at 4.884" in script.problems
     plain = inspect_file(real_data / "ecp220-servo" / "raw_data_freq.txt")
-    assert (plain.samples, plain.kind) == (1370, "closed_loop")
+    assert (plain.samples, plain.kind) == (1370, "sweep")
 
 
 def test_the_signs_of_the_real_bench_are_found(real_data, tmp_path):
