@@ -96,7 +96,10 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
             if later:
                 let_go = piece.u is None or not np.any(piece.u)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
-            runs.append(make_run(piece, n=n, in_motion=later))
+            run = make_run(piece, n=n, in_motion=later)
+            # A cart that waits for a hand at rest shows nothing.
+            if piece.kind != "decay" or _last_away(run):
+                runs.append(run)
     return runs
 
 
@@ -179,10 +182,14 @@ def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], l
 
 def _last_motion(run: GapRun) -> int:
     """Return the number of samples up to the last motion of a run."""
+    return max(_last_away(run) or run.t.size, run.t.size // 2)
+
+
+def _last_away(run: GapRun) -> int:
+    """Return the number of samples until all carts stay where they end; 0 if they never move."""
     step = run.sigma * np.sqrt(12.0)
     away = np.abs(run.y - run.y[:, -1:]) > _LEAST_MOTION * step[:, None]
-    last = int(np.flatnonzero(away.any(axis=0))[-1]) + 1 if away.any() else run.t.size
-    return max(last, run.t.size // 2)
+    return int(np.flatnonzero(away.any(axis=0))[-1]) + 1 if away.any() else 0
 
 
 def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:

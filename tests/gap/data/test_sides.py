@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 
 from pipeline.errors import DataError
+from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import investigate
 from pipeline.gap.types import read_gap
 from pipeline.json_files import json_text
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
-from pipeline.results import LeftOut
+from pipeline.results import Intervention, LeftOut
 from pipeline.submission import load_submission
 from pipeline.workflow import analyse
 from tests.helpers.time_records import decay_record, step_record
@@ -68,6 +69,25 @@ def test_a_gap_file_of_before_is_still_read(analysis):
     document = json.loads(json_text(investigate(analysis, progress=lambda text: None)))
     del document["left_out"]
     assert read_gap(json.dumps(document)).left_out == ()
+
+
+def test_a_cart_that_waits_for_a_hand_is_no_run():
+    """A cart creeps by some steps, a hand pulls it: only the decay after the hand is a run."""
+    decay = decay_record(CHAIN, free=(1,), rng=np.random.default_rng(6))
+    wait = np.arange(int(2.0 / decay.sample_time)) * decay.sample_time
+    steps = np.interp(wait, [0.06, 0.2, 0.7, 1.9], [17, 3, 3, 0])
+    settling = decay.resolution[0] * np.rint(steps)
+    record = replace(
+        decay,
+        t=np.arange(wait.size + decay.t.size) * decay.sample_time,
+        y=np.concatenate((decay.y[0, 0] + settling, decay.y[0]))[None],
+    )
+    # The hand pulls from 2.0 s on and lets go at 3.5 s.
+    hand = Intervention(experiment=record.id, cart=1, start=2.0, end=3.6)
+
+    (run,) = prepare([record], springs=(True, True), interventions=[hand], notes=[])
+
+    assert run.t[0] > hand.end
 
 
 def test_nothing_left_is_an_error_that_says_why(analysis):
