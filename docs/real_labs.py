@@ -70,9 +70,8 @@ def write_one(folder: Path) -> None:
 
 def write_day(folder: Path) -> None:
     """Write the submission of one day: cart 2 by hand, several times in a recording."""
-    runs = dict.fromkeys(
-        ("14-Feb-2025_09_22_43.txt", "14-Feb-2025_09_44_21.txt"), 'kind = "decay"\ncarts = [2]'
-    )
+    files = ("14-Feb-2025_09_22_43.txt", "14-Feb-2025_09_44_21.txt")
+    runs = {file: 'kind = "decay"\ncarts = [2]' for file in files}
     write_lab(folder, "ecp210-2025", "carts = 2\nsprings = [true, true, false]", runs)
 
 
@@ -173,9 +172,12 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         if row.final is not None:
             number = with_unit(row.final.value, row.final.std, row.unit)
             yield f"| {with_symbols(row.name)} | {number} |"
-    if not analysis.rows:  # the report needs a run in open loop, the search does not
-        for parameter, std in gap.chain_std.items():
-            yield f"| {parameter} | {with_unit(getattr(gap.chain, parameter), std, '')} |"
+    driven = any(record.u is not None and np.any(record.u) for record in analysis.records)
+    if analysis.fit is None and driven:
+        # The report needs a run in open loop, the search does not.
+        chain, units = gap.chain, gap.chain.units
+        yield f"| mass | {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)} |"
+        yield f"| damping | {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)} |"
     rubbed = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
