@@ -872,11 +872,11 @@ def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
         page = visitor.get(HERE + "questions")
         visitor.post(HERE + "answer", id="sign", answer="The plug.", seen=page.value("seen"))
         page = visitor.get(HERE + "questions").text
-        assert f"State the sign -1 in {turned.id}</button>" in page
+        assert f"State sign = -1 in {turned.id}</button>" in page
         seen = re.findall(r'name="seen" value="(\w+)"><p class="answers">', page)[0]
         assert visitor.post(HERE + "state-signs", seen="0" * 64).status == 409
         assert visitor.post(HERE + "state-signs", seen=seen).status == 303
-        assert "State the sign" not in visitor.get(HERE + "questions").text
+        assert "State sign" not in visitor.get(HERE + "questions").text
     signs = {run.id: run.input and run.input.sign for run in load_submission(folder).experiments}
     assert {id_: sign for id_, sign in signs.items() if sign} == {turned.id: -1}
 

@@ -65,7 +65,7 @@ def _report(facts: Facts) -> Stands:
     if facts.report == "current":
         return "done", "done"
     if facts.report == "answered":
-        return "done", "done but for answers"
+        return "done", "answers newer"
     if facts.report == "older":
         return "old", "out of date"
     ready = all(find(facts)[0] == "done" for find in (_files, _set_up))
