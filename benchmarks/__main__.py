@@ -1,21 +1,21 @@
-"""Measure cartlab, and what people use in its place, on this machine; write `benchmarks/README.md`.
+"""Compare cartlab with other tools on this machine; write the pages `README.md` and `own.md`.
 
     python -m benchmarks [NAME…] [--quick] [--out PAGE.md]
 
-Without a name all are made; the sections of the others stay as they are. `--quick` makes small ones
-that show only that everything runs: they go to stdout, or where `--out` says, never into the page.
+Without a name it runs all of them; with names, the other sections stay as they are. `--quick` runs
+small versions that only show that everything works: they are printed, or written to `--out`.
 
-A benchmark is a module of this folder whose name stands in `BENCHMARKS`, which is the order of the
-page. It has
+A benchmark is a module of this folder whose name is in `PAGES`, in the order of its page. The
+module has four names.
 
     TITLE = "…"             heading of its section
-    WORDS = "…"             what is compared, on which data (Markdown)
-    TOOLS = ("pysindy",)    distributions whose versions are printed, whether installed or not
+    WORDS = "…"             the question, and the data (Markdown)
+    TOOLS = ("pysindy",)    distributions whose versions are printed
     def tables(*, quick: bool) -> list[Table]
 
-`benchmarks/page.py` has `Table`, and what its cells are made with: `spread` (median and quartiles),
-`share`, `missing` (the row of a tool that is not installed). Times are of the processor
-(`time.process_time`), as a machine may have other work. Quick, one takes seconds.
+`benchmarks/page.py` has `Table`, and helpers for its cells: `spread` (median and quartiles),
+`share`, `missing` (the row of a tool that is not installed). Times are processor times
+(`time.process_time`), because a machine may have other work.
 """
 
 import argparse
@@ -29,31 +29,26 @@ os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 from benchmarks.page import section, write_page
 
-PAGE = Path(__file__).with_name("README.md")
-BENCHMARKS = (
-    "bode",
-    "gap_tools",
-    "silverbox",
-    "emps",
-    "grading",
-    "report",
-    "feedback",
-    "time_fit",
-    "time_stages",
-)
+# The comparisons, and what cartlab promises of its own results.
+PAGES = {
+    "README.md": ("bode", "gap_tools", "silverbox", "emps", "friction", "grading", "report"),
+    "own.md": ("feedback", "time_fit", "time_stages"),
+}
+BENCHMARKS = tuple(name for names in PAGES.values() for name in names)
+FOLDER = Path(__file__).parent
 
 
 def main() -> None:
-    """Make the sections asked for."""
+    """Make the sections that the user names."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(BENCHMARKS))
-    parser.add_argument("--quick", action="store_true", help="small, to see that all runs")
-    parser.add_argument("--out", type=Path, metavar="PAGE", help="another page than README.md")
+    parser.add_argument("--quick", action="store_true", help="small, to test that it runs")
+    parser.add_argument("--out", type=Path, metavar="PAGE", help="write to this page instead")
     asked = parser.parse_args()
     if strange := sorted(set(asked.names) - set(BENCHMARKS)):
-        parser.error(f"no benchmark {', '.join(strange)}; there are {', '.join(BENCHMARKS)}")
-    page = asked.out or (None if asked.quick else PAGE)
+        parser.error(f"no benchmark {', '.join(strange)}; choose from {', '.join(BENCHMARKS)}")
     for name in asked.names or BENCHMARKS:
+        page = asked.out or (None if asked.quick else page_of(name))
         module = import_module(f"benchmarks.{name}")
         began = _spent()
         tables = module.tables(quick=asked.quick)
@@ -67,8 +62,13 @@ def main() -> None:
         print(f"{name}: {seconds:.0f} s of the processor", file=sys.stderr)
 
 
+def page_of(name: str) -> Path:
+    """Return the page that has a benchmark's section."""
+    return next(FOLDER / page for page, names in PAGES.items() if name in names)
+
+
 def _spent() -> float:
-    """Return the seconds of the processor so far, of programs started and ended too."""
+    """Return the processor seconds so far, including those of finished child processes."""
     return sum(os.times()[:4])
 
 

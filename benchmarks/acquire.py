@@ -1,8 +1,8 @@
-"""How well acquisition holds: speed, faults, limits, a host that is killed.
+"""How reliable acquisition is: speed, faults, limits, a killed host.
 
     python -m benchmarks.acquire [--minutes 10] [--faulty-seconds 30] [--stops 20] [--kills 100]
 
-Each part runs against `cartlab emulate` in a process of its own; 0 leaves a part out.
+Each part talks to its own `cartlab emulate`. The number 0 skips a part.
 """
 
 import argparse

@@ -1,7 +1,7 @@
-"""Other ways to a nonlinear model of one cart: records in, a model that runs freely out.
+"""Other tools for a nonlinear model of one cart: records in, a model that runs freely out.
 
-Each tries the settings its documentation offers and keeps those with the least free-run error on
-the records to choose by, the sparser of nearly equal ones.
+Each tries the settings that its documentation offers. The smallest model among those with nearly
+the least free-run error on the held-out records is kept.
 """
 
 import contextlib
@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
 
 from pipeline.arrays import Array
 
@@ -39,7 +40,7 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """What was learnt: a free run of a part, every how many samples it speaks, and its words."""
+    """A learnt model: its free run of a part, one value every `every` samples, and its words."""
 
     run: Callable[[Part], Array]
     every: int
@@ -140,7 +141,7 @@ def sindy(parts: Sequence[Part], *, windows: Sequence[int] = (5, 7, 11, 15)) -> 
                 differentiation_method=smooth,
             )
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # a threshold that leaves nothing
+                warnings.simplefilter("ignore")  # a threshold above every term
                 model.fit(
                     states, t=[part.dt * np.arange(part.y.size) for part in parts],
                     u=[held[:, None] for held in u],
@@ -318,8 +319,99 @@ def _regressors(u: Array, y: Array, lag: int) -> Array:
 
 
 _NEURONS, _EPOCHS = 8, 2000
+
+# ------------------------------------------------------------------------ jax-sysid
+
+
+def recurrent(
+    parts: Sequence[Part],
+    *,
+    thinnings: Sequence[int] = (4,),
+    lassos: Sequence[float] = (1e-4, 1e-3),
+) -> Iterator[Model]:
+    """Learn a recurrent network by jax-sysid: group lasso on its states, Adam, then L-BFGS."""
+    jax, models = import_module("jax"), import_module("jax_sysid.models")
+    jnp = jax.numpy
+
+    def step(x: Any, u: Any, params: Any) -> Any:
+        A, B, _, W1, W2, b, W3 = params
+        return A @ x + B @ u + W3 @ jnp.tanh(W1 @ x + W2 @ u + b)
+
+    def read(x: Any, u: Any, params: Any) -> Any:
+        return params[2] @ x
+
+    def by_state(params: Any, x0: Any) -> Any:
+        """Return the sum over the states of the norm of all weights that touch a state."""
+        A, B, C, W1, _, _, W3 = params
+        own = jnp.concatenate([A, A.T, B, C.T, W1.T, W3], axis=1)
+        return jnp.sum(jnp.sqrt(jnp.sum(own**2, axis=1) + 1e-12))
+
+    for every, lasso in itertools.product(thinnings, lassos):
+        thinned = [_thinned(part, every) for part in parts]
+        u_size = float(np.std(np.concatenate([u for u, _ in thinned]))) or 1.0
+        y_size = float(np.std(np.concatenate([y for _, y in thinned])))
+        rng = np.random.default_rng(0)
+        model = models.Model(STATES, 1, 1, state_fcn=step, output_fcn=read)
+        model.init(
+            params=[
+                0.5 * np.eye(STATES),
+                *(0.1 * rng.standard_normal(size) for size in ((STATES, 1), (1, STATES))),
+                *(0.5 * rng.standard_normal((CELLS, width)) for width in (STATES, 1)),
+                np.zeros(CELLS),
+                0.1 * rng.standard_normal((STATES, CELLS)),
+            ]
+        )
+        model.loss(rho_x0=1e-4, rho_th=1e-4, tau_g=lasso, group_lasso_fcn=by_state)
+        model.optimization(adam_epochs=ADAM, lbfgs_epochs=LBFGS, iprint=-1)
+        with contextlib.redirect_stdout(io.StringIO()):
+            model.fit(
+                [y[:, None] / y_size for _, y in thinned],
+                [u[:, None] / u_size for u, _ in thinned],
+            )
+        weights = [np.asarray(array, dtype=float) for array in model.params]
+
+        def run(
+            part: Part,
+            weights: Sequence[Array] = weights,
+            every: int = every,
+            scales: tuple[float, float] = (u_size, y_size),
+        ) -> Array:
+            u, y = _thinned(part, every)
+            u, y, known = u / scales[0], y / scales[1], max(STATES, -(-part.first // every))
+            near = [*weights[2].ravel(), 1e-2]  # the state of least size that reads the start
+
+            def off(x0: Array) -> Array:
+                return _recurrent(weights, x0, u[:known]) - y[:known]
+
+            start = np.array(near[:-1]) * y[0] / float(np.sum(np.square(near)))
+            x0 = least_squares(off, start, x_scale="jac", max_nfev=50).x
+            return scales[1] * _recurrent(weights, x0, u)
+
+        left = int(np.sum(np.abs(weights[2]).ravel() > _GONE))
+        count = sum(array.size for array in weights)
+        yield Model(run=run, every=every, words=f"{count} weights, {left} of {STATES} states read")
+
+
+def _recurrent(weights: Sequence[Array], x0: Array, u: Array) -> Array:
+    """Return the network's free run from a state."""
+    A, B, C, W1, W2, b, W3 = weights
+    x, out = x0, np.zeros(u.size)
+    drive, push = W2[:, 0], B[:, 0]
+    for k, now in enumerate(u.tolist()):
+        out[k] = C[0] @ x
+        x = np.clip(
+            A @ x + push * now + W3 @ np.tanh(W1 @ x + drive * now + b), -_SATURATED, _SATURATED
+        )
+    return out
+
+
+STATES, CELLS = 4, 6
+ADAM, LBFGS = 1000, 1000  # as its documentation has them
+_GONE = 1e-3  # a weight below it counts as removed by the lasso
+_SATURATED = 1000.0  # jax-sysid limits states there, while it learns too
 TOOLS: tuple[tuple[str, str, Callable[..., Iterator[Model]]], ...] = (
     ("PySINDy", "pysindy", sindy),
     ("SysIdentPy, FROLS", "sysidentpy", frols),
     ("scikit-learn, MLP NARX", "scikit-learn", network),
+    ("jax-sysid, RNN", "jax-sysid", recurrent),
 )

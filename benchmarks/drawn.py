@@ -1,4 +1,4 @@
-"""Benches drawn by chance, with what is hidden in them; rows that a study keeps as they come."""
+"""Random benches with hidden effects, and the rows that a study keeps as they come."""
 
 import argparse
 import json
@@ -57,7 +57,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         if effect.only_rest or effect.key in _UNSEEN or not places:
             continue
         place = places[int(rng.integers(len(places)))]
-        # A limit or a stop is where it is: nearer is more, further is none.
+        # The size of a limit or a stop is its place: a nearer one does more.
         mine = sizes if effect.parameters[0].neutral is not None else USUAL
         term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
@@ -67,7 +67,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 
 
 def counted(effect: Effect, place: int, value: float) -> Named:
-    """Return an effect as it counts: two that provably cannot be told apart count as one.
+    """Return an effect as it counts: two that are provably indistinguishable count as one.
 
     Of sensors only ratios show, whichever has a scale of its own; a lag much shorter than a tick of
     the bench is a delay.
@@ -96,8 +96,8 @@ def acted(drawn: Drawn, submission: Submission) -> list[list]:
 def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm:
     """Return the effect with its first parameter, and what goes with it, at a share of the usual.
 
-    Of what it differs by from doing nothing. Two of dry friction's grow together: a static force
-    below the sliding one is none.
+    The share is of the difference from no effect. Both forces of dry friction grow together,
+    because a static force below the sliding one is impossible.
     """
     values = default_values(effect, chain, place=place, travel=1.0)
     forces = [p.name for p in effect.parameters if p.unit == "input"] or [effect.names[0]]

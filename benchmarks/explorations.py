@@ -1,11 +1,11 @@
-"""Benches that investigate themselves: what they say is there, how surely, in what time.
+"""Benches that investigate themselves: effects named, errors stated and time needed.
 
     python -m benchmarks.explorations [--count 100] [--minutes 60]
 
-Each bench is drawn by chance, one to three carts with none, one or two hidden effects, on the
-emulator's carts, encoders and controller, tick by tick and without a line. `cartlab explore` asks
-for 1 % of everything, in ten minutes at most; it is told which springs there are. A study that was
-stopped goes on where it left off.
+Each random bench has one to three carts and up to two hidden effects. It uses the carts, encoders
+and controller of the emulator, tick by tick, without a serial line. `cartlab explore` knows which
+springs are present and aims at 1 % of everything within ten minutes. A stopped study continues
+where it stopped.
 """
 
 import os
@@ -37,7 +37,7 @@ SCALE = "sensor_gain"
 
 
 def run(seed: int) -> dict:
-    """Explore one bench; return what was said, and whether it is so."""
+    """Explore one bench; return its verdict and the truth."""
     drawn = draw(seed, effects=seed % 3)
     bench = VirtualBench(drawn.bench, seed=seed)
     began = time.process_time()
@@ -99,7 +99,7 @@ def off(gap: dict, drawn: Drawn) -> dict[str, float]:
     terms = {(term.effect.key, term.place): term for term in drawn.bench.effects}
     named = {named_of(effect) for effect in gap.get("effects", ())}
     if any(key == SCALE and (key, place) not in named for key, place in terms):
-        return {}  # with another sensor's scale the whole chain is another, which moves alike
+        return {}  # with another sensor's scale another chain moves in the same way
     if chain.n == 1:  # its two springs act as one
         chain = replace(chain, k=np.array([chain.k.sum(), 0.0]))
     for letter in "mck":

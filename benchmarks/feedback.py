@@ -1,10 +1,8 @@
-"""How good and how forgiving the designed controllers are, and what processor time they take."""
-
-import time
+"""How good the designed controllers are, also on a plant that is not quite the modelled one."""
 
 import numpy as np
 
-from benchmarks.page import Table, significant, spread
+from benchmarks.page import Table, significant
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.linear.step_response import overshoot_percent, settling_time
@@ -15,14 +13,11 @@ from pipeline.submission import Design
 
 TITLE = "State feedback"
 WORDS = """
-For every cart of the presets and both methods, a 1 cm step to be followed with at most 10 %
-overshoot and within 1 s: the nominal step, then the worst of so many plants whose masses and
-springs are up to 3 % and whose dampings up to 30 % off, with the controller's observer none the
-wiser. Nothing else is compared: this is what the designs promise and keep.
+**Do the designs keep their promise on a bench that differs from its model?** Each design must
+follow a 1 cm step with at most 10 % overshoot and settle within 1 s.
 """
-TOOLS = ("control",)
+TOOLS = ()
 N_PLANTS = 60
-N_TIMED = 20
 
 
 def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
@@ -67,17 +62,13 @@ def on_other_plants(
 
 
 def tables(*, quick: bool) -> list[Table]:
-    plants, timed = (4, 2) if quick else (N_PLANTS, N_TIMED)
+    plants = 4 if quick else N_PLANTS
     methods: tuple[Method, ...] = ("lqr", "poles")
     rows = []
     for name, chain in list(PRESETS.items())[: 1 if quick else None]:
         for cart in range(1, chain.n + 1):
             for method in methods:
-                times, result = [], design(chain, cart, method)
-                for _ in range(timed):
-                    start = time.process_time()
-                    design(chain, cart, method)
-                    times.append(1e3 * (time.process_time() - start))
+                result = design(chain, cart, method)
                 unstable, worst = on_other_plants(chain, result, plants=plants)
                 nominal = (
                     result.overshoot_percent,
@@ -85,10 +76,17 @@ def tables(*, quick: bool) -> list[Table]:
                     result.peak_input,
                 )
                 rows.append(
-                    [name, str(cart), method, spread(times)]
+                    [name, str(cart), method]
                     + [significant(value) for value in nominal]
                     + [f"{unstable} of {plants}", *(significant(value) for value in worst)]
                 )
-    head = ["plant", "cart", "method", "ms of a core", "overshoot %", "settling s", "peak V"]
+    head = ["plant", "cart", "method", "overshoot %", "settling s", "peak V"]
     head += ["unstable", "worst: overshoot %", "settling s", "level %"]
-    return [Table(title="Designs, and the same on other plants", head=head, rows=rows)]
+    title = "On the modelled plant, and the worst of other plants"
+    return [Table(title=title, head=head, rows=rows, note=_NOTE.format(plants=plants))]
+
+
+_NOTE = """
+The other {plants} plants have masses and springs up to 3 % off and dampings up to 30 % off; the
+controller and its observer keep the model. "Level" is the error of the final position.
+"""

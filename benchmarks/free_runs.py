@@ -1,4 +1,4 @@
-"""Records, models and free runs alike for all tools: who learns from what, who is judged how."""
+"""The same records and the same error measure for all tools that learn models."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -58,7 +58,7 @@ def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
 def ours(model: AugmentedChain, gap: Gap, *, springs: tuple[bool, ...]) -> Model:
     """Return cartlab's model as one that runs freely: nothing is fitted to the record.
 
-    Where the encoder reads nothing is learnt from the training records as well.
+    The zero of the encoder is also learnt from the training records.
     """
     of = start_at(model, springs=springs)
     zero = np.array([np.mean([trace.zero for trace in gap.traces if not trace.held_out])])
@@ -91,9 +91,12 @@ def others(
     *,
     settings: Mapping[str, dict[str, tuple[int, ...]]] | None = None,
 ) -> Iterator[tuple[str, Answer]]:
-    """Yield what each other tool that is installed learns, and chooses by the second records."""
+    """Yield each installed tool's model, chosen by the second records.
+
+    With `settings`, only the tools named there run.
+    """
     for name, tool, learn in TOOLS:
-        if installed(tool):
+        if installed(tool) and (settings is None or name in settings):
             began = time.process_time()
             model = best(learn(training, **(settings or {}).get(name, {})), choosing)
             seconds = time.process_time() - began

@@ -111,7 +111,7 @@ def outcome(truth: list, found: list, listed: set, verdict: str, baseline: float
     if found == truth:
         return "ambiguous, right first" if verdict == "ambiguous" else "exact"
     if not found:
-        # Sensor gains a linear chain can absorb leave nothing to find.
+        # A sensor gain that a linear chain can absorb is not counted as hidden.
         invisible = all(effect == "sensor_gain" for effect, _ in truth)
         return "equivalent" if invisible and baseline < 1.1 else "missed"
     missing, extra = set(map(tuple, truth)) - set(found), set(found) - set(map(tuple, truth))

@@ -1,4 +1,4 @@
-"""Write `benchmarks/gap.md`: what the gap workflow gets right, how fast, and real rigs in pictures.
+"""Write `benchmarks/gap.md`: success rates and times of the gap workflow, and real rigs.
 
     python benchmarks/gap_page.py RESULTS.jsonl… [--rig FOLDER]
 
@@ -109,7 +109,7 @@ def _bounds(right: int, of: int) -> str:
 
 
 def confusion_of(rows: Sequence[dict]) -> str:
-    """Return what was said of each single effect, and of which of two something was missed."""
+    """Return the answers about each single effect."""
     out = []
     singles = [row for row in rows if row["suite"] in ("singles", "small", "wide")]
     for key in sorted({row["truth"][0][0] for row in singles}):
@@ -239,9 +239,9 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
     repeats = f", repeats differ by {gap.repeatability:.2%}" if gap.repeatability else ""
     lines = [
         f"### {rig.words[0].upper()}{rig.words[1:]}\n",
-        f"Verdict **{gap.verdict}**: {gap.baseline:.2%} of the motion on runs not seen with the "
-        f"linear model, {gap.final:.2%} with the effects (noise {gap.noise_floor:.2%}{repeats}); "
-        f"{cpu:.0f} s of one core.\n",
+        f"Verdict **{gap.verdict}**: {gap.baseline:.2%} of the motion on held-out runs with "
+        f"the linear model, {gap.final:.2%} with the effects "
+        f"(noise {gap.noise_floor:.2%}{repeats}); {cpu:.0f} s of one core.\n",
         *(f"{note[0].upper()}{note[1:]}.\n" for note in gap.notes),
         *_hands(gap),
     ]
@@ -261,8 +261,8 @@ def explain_rig(rig: Rig, tell: Callable[[str], None]) -> str:
         lines += [
             f"{number}. **{_named(found.effect.key)}{where}** ({values}): "
             f"{found.nrmse_before:.2%} → {found.nrmse_after:.2%}\n",
-            f"   ![Run {trace.experiment}, cart {trace.cart}: measured, the linear model, the one "
-            f"with {number} effect{'s' * (number > 1)}, what each leaves](figures/{file})\n",
+            f"   ![Run {trace.experiment}, cart {trace.cart}: measured, linear model, model "
+            f"with {number} effect{'s' * (number > 1)}, remaining errors](figures/{file})\n",
         ]
     return "\n".join(lines)
 
@@ -272,7 +272,7 @@ def _hands(gap: Gap) -> list[str]:
     if not gap.interventions:
         return []
     times = (f"{one.experiment} {one.start:.2f} to {one.end:.2f} s" for one in gap.interventions)
-    return [f"A hand, in no fit and no error: {', '.join(times)}.\n"]
+    return [f"Left out, because a hand moved the cart: {', '.join(times)}.\n"]
 
 
 def _steps(gap: Gap, rig: Rig) -> Iterator[tuple[Study, Hypothesis, Hypothesis]]:

@@ -1,9 +1,9 @@
-"""A class to grade: what a batch of it costs, which disguised copies it finds, what kills do to it.
+"""A class to grade: the cost of a batch, disguised copies that it finds, and the effect of kills.
 
     python -m benchmarks.grading_batch [--kills 300]
 
-kills -9 at random moments, then compares with a run left alone; all of it on a copy of the code, as
-a grade belongs to the code that made it. The tables are part of `benchmarks/grading.py`.
+kills -9 at random moments, then compares with an undisturbed run. It works on a copy of the code,
+because a grade belongs to the code that made it. The tables are part of `benchmarks/grading.py`.
 """
 
 import argparse
@@ -103,18 +103,16 @@ def grade(
     out: Path,
     *,
     preset: str,
-    jobs: int = 1,
-    cluster: str | None = None,
     figures: bool = False,
 ) -> Cost:
-    """Grade a class, all files written."""
+    """Grade a class with one worker, all files written."""
     costs: list[Cost] = []
     with measured(costs):
         grade_class(
             [folder],
             rubric_file=Path(preset),
             out=out,
-            options=Options(jobs=jobs, cluster=cluster, figures=figures),
+            options=Options(jobs=1, figures=figures),
         )
     return costs[0]
 
@@ -217,10 +215,10 @@ def copies(base: Path, *, teams: int) -> Table:
         head=["disguise", "all of them", *(f"one {kind}" for kind in COPIED_KINDS)],
         rows=rows,
         note=f"""
-{teams} honest teams on one bench of two carts, every third with friction hidden in it: {false}
-false pairs of {pairs}. Then copies of {min(teams - 1, 20)} of them, all recordings or one among six
-of another team's own, in a class of {min(teams, IN_CLASS + 2)}. Noise is in encoder counts, added
-to what was read.
+{teams} honest teams on one bench of two carts, a third of them with hidden friction: {false} of
+{pairs} pairs were flagged. Then {min(teams - 1, 20)} of them are copied, in a class of
+{min(teams, IN_CLASS + 2)}: all recordings, or one among six of the copying team's own. Noise is
+added in encoder counts.
 """,
     )
 

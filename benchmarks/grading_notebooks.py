@@ -55,7 +55,7 @@ def _hertz(reported: Numbers) -> None:
         table["omega_n"] /= 2 * math.pi
 
 
-# What a team gets wrong, and the flag that names it.
+# Each mistake with the flag that names it.
 SLIPS: dict[str, Callable[[Numbers], None]] = {
     "hz_for_rad_s": _hertz,
     "log10_for_ln": _times("initial", zeta=math.log10(math.e)),
@@ -67,9 +67,9 @@ SLIPS: dict[str, Callable[[Numbers], None]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Graded:
-    """What one tool made of the class: its cost, and who lost points or was told why.
+    """One tool's result for the class: its cost, teams that lost points, and mistakes it named.
 
-    `named` has, by team, the codes of its flags; a tool without any has none.
+    `named` has the codes of each team's flags; it is empty for a tool without flags.
     """
 
     cost: Cost
@@ -108,7 +108,7 @@ def _change(file: Path, slip: Callable[[Numbers], None]) -> None:
 
 def cartlab(folder: Path, base: Path) -> Graded:
     """Grade as `cartlab grade --jobs 1` does, with feedback and its figures."""
-    cost = grade(folder, base / "cartlab", preset=PRESET, jobs=1, figures=True)
+    cost = grade(folder, base / "cartlab", preset=PRESET, figures=True)
     lost, named = set(), {}
     with Gradebook(base / "cartlab") as book:
         for entry in book.entries():

@@ -1,11 +1,11 @@
-"""What chosen experiments bring: their error as promised and as it came, and the time they take.
+"""The benefit of chosen experiments: predicted error, true error and bench time.
 
     python benchmarks/next_experiment.py [--seeds 4] [--dwells 24] [--next 1]
 
-Each bench is a preset on the emulator's carts, encoders and controller, tick by tick and without a
-line. It records two steps and a sweep, then what `cartlab plan --next` chooses; beside it as many
-dwells at evenly spaced logarithms of frequency as the paper has, from which the carts are fitted
-alone. Writes the table and the figure of `benchmarks/next.md`.
+Each bench is a preset with the carts, encoders and controller of the emulator, tick by tick,
+without a serial line. It records two steps and a sweep, then the experiment that `cartlab plan
+--next` chooses. For comparison it records as many log-spaced dwells as the paper, and the carts are
+fitted to these alone. Writes the table and the figure of `benchmarks/next.md`.
 """
 
 import argparse

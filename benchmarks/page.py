@@ -1,7 +1,7 @@
-"""The page of the benchmarks: what a table is, what stands below it, how one section is made anew.
+"""The page of the benchmarks: its tables, the notes below them, and how one section is replaced.
 
-The page is its own store: each section stands between two comments, and a run writes only those of
-the benchmarks it made, with the machine and the versions they were made on.
+The page is its own store. Each section is between two comments; a run replaces only the sections
+that it made, and notes the machine and the versions.
 """
 
 import os
@@ -32,13 +32,13 @@ _HEAD = "# Benchmarks\n"
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table of the page, a figure below it, and what a sceptic has to know of both.
+    """A table of the page, the figure below it, and the method.
 
     Attributes
     ----------
-    rows : cells as text; a row of `missing` where another tool is not installed.
-    note : how each tool was used, and what it does well: Markdown, below the table.
-    picture : draws the figure, inside the style of the reports.
+    rows : cells as text; a row of `missing` for a tool that is not installed.
+    note : strengths of the other tools, and how each was used: Markdown, below the table.
+    picture : draws the figure, in the style of the reports.
     """
 
     title: str
@@ -49,7 +49,7 @@ class Table:
 
 
 def installed(tool: str) -> bool:
-    """Tell whether a distribution is there."""
+    """Return whether a distribution is installed."""
     return version(tool) != NOT_INSTALLED
 
 
@@ -78,7 +78,7 @@ def spread(values: Iterable[float] | Array, *, digits: int = 2) -> str:
 
 
 def significant(value: float, *, digits: int = 2) -> str:
-    """Return a number to some significant digits, without an exponent where it can do without."""
+    """Return a number to some significant digits, with an exponent only for extreme values."""
     if not np.isfinite(value) or value == 0 or not 1e-4 < abs(value) < 1e6:
         return f"{value:.{digits}g}"
     places = max(0, digits - 1 - int(np.floor(np.log10(abs(value)))))
@@ -86,12 +86,12 @@ def significant(value: float, *, digits: int = 2) -> str:
 
 
 def share(hits: int, of: int) -> str:
-    """Return a share with what it is of."""
+    """Return a share with its two counts."""
     return f"{100 * hits / of:.0f} % ({hits} of {of})" if of else "–"
 
 
 def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> None:
-    """Write the sections made in place of those the page had; leave the others and the head."""
+    """Replace the sections that were made; leave the others and the head."""
     text = page.read_text(encoding="utf-8") if page.exists() else _HEAD
     sections = {found[1]: found[0] for found in _SECTION.finditer(text)} | made
     head = _SECTION.split(text, maxsplit=1)[0].rstrip() + "\n"
@@ -131,7 +131,7 @@ def markdown(table: Table) -> str:
 
 
 def machine() -> str:
-    """Return what a time depends on, and nothing that tells whose machine it is."""
+    """Return the facts of the machine that a time depends on, without its name."""
     memory = psutil.virtual_memory().total / 1e9
     return (
         f"{os.cpu_count()} cores ({platform.machine()}), {memory:.0f} GB, {platform.system()}, "

@@ -25,10 +25,9 @@ from pipeline.submission.models import MOST_EXPERIMENTS
 
 TITLE = "Report"
 WORDS = """
-`cartlab report` as a command of its own each time, start and imports included: seconds of the
-processor of all its processes; the clock has in it whatever else the machine did at the time.
-"First" has no compiled Python files and no font list of matplotlib, as after an installation from
-source; a package manager compiles when it installs.
+**How long does a report take?** Each is a `cartlab report` command of its own, start and imports
+included. "First" is the first after an installation from source: no compiled Python files and no
+font list of matplotlib.
 """
 TOOLS = ("matplotlib", "typst", "nbconvert", "quarto-cli")
 EVERY = ("one-cart", "two-cart", "three-cart")
@@ -147,7 +146,7 @@ def by_records(base: Path, *, records: Sequence[int]) -> Table:
             for n, cost in zip(records, costs, strict=True)
         ],
         note=f"""
-One cart; steps, decays and dwells of many sessions on one bench, as many as a submission may have.
+One cart; steps, decays and dwells of many sessions on one bench, up to the limit of a submission.
 {said}
 """,
         picture=picture if len(records) > 1 else None,
@@ -216,13 +215,11 @@ def documents(base: Path, *, runs: int) -> Table:
         head=["document", "s of a core", "s on the clock", "MB"],
         rows=rows,
         note="""
-`benchmarks/lab_document.py`: the decays, steps, dwells, frequency response with a fit and the
-closed loop of `submissions/one-cart`, drawn with matplotlib, some forty lines. It checks nothing,
-has no errors, tables or words, designs no controller, and is of this bench alone; what it says is
-its author's to decide, which is what such documents are for. `nbconvert --execute` runs the cells
-in a Jupyter kernel; Quarto does the same and then has pandoc set the page (quarto-cli fetches its
-program from GitHub when it is installed, which not every machine may). MB are of the largest
-process.
+**Others are better** if you want your own words: a document says what its author writes. The one
+here (`benchmarks/lab_document.py`, some forty lines) draws the decays, steps, dwells, frequency
+response with a fit and closed loop of `submissions/one-cart`. It has no checks, standard errors or
+controller design. nbconvert runs it in a Jupyter kernel; Quarto also sets the page with pandoc (its
+installation downloads a program). MB are of the largest process.
 """,
     )
 

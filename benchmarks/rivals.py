@@ -1,11 +1,11 @@
-"""What one proposed experiment decides: hidden effects that the first records leave in dispute.
+"""How often one proposed experiment settles which hidden effect acts.
 
     python -m benchmarks.rivals [--count 480] [--minutes 60]
 
-Each bench is drawn by chance with one or two small hidden effects and records one sweep, with which
-`cartlab explore` begins. Where the verdict is "ambiguous" or "partial", it records what
-`cartlab gap` proposes, looks again, and once more where it is still in dispute. The others end
-there. All are told which springs there are. A study that was stopped goes on where it left off.
+Each random bench has one or two small hidden effects and records one sweep, as `cartlab explore`
+does first. If the verdict is "ambiguous" or "partial", it records the experiment that `cartlab gap`
+proposes and looks again, at most twice. The program knows which springs are present. A stopped
+study continues where it stopped.
 """
 
 import os

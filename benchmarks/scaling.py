@@ -1,4 +1,4 @@
-"""From one class to a million hand-ins: costs measured here, a cluster simulated with them.
+"""From one class to a million submissions: measured costs and a simulated cluster.
 
     python -m benchmarks.scaling measure [--teams 6]    # some minutes; keeps scaling.json
     python -m benchmarks.scaling page                   # simulates, writes benchmarks/scaling.md
@@ -71,9 +71,9 @@ def measure(*, teams: int) -> dict[str, Any]:
         # What the one client process does for each: hash, hand on, store, compare, write.
         write_class(base / "few", teams, preset=PRESETS[0])
         write_class(base / "many", 4 * teams, preset=PRESETS[0])
-        grade(base / "few", base / "first", preset=PRESETS[0], jobs=1)  # loads what is needed
+        grade(base / "few", base / "first", preset=PRESETS[0])  # loads what is needed
         few, many = (
-            grade(base / name, base / f"out-{name}", preset=PRESETS[0], jobs=1).parent
+            grade(base / name, base / f"out-{name}", preset=PRESETS[0]).parent
             for name in ("few", "many")
         )
         costs["client"] = round((many - few) / (3 * teams), 4)
@@ -111,8 +111,8 @@ class Cluster:
 
     Attributes
     ----------
-    loss : of each machine; what it was grading is done by another, and it is back after `repair`.
-    hang : share of hand-ins that run into the time limit, and are then a row with its reason.
+    loss : of each machine; another machine repeats its work, and it is back after `repair`.
+    hang : share of submissions that reach the time limit; each becomes a row with its reason.
     """
 
     machines: int

@@ -1,6 +1,7 @@
 """The page of the benchmarks: making one section keeps the others, and quick runs work."""
 
 import sys
+from importlib import import_module
 
 import pytest
 from matplotlib.figure import Figure
@@ -64,13 +65,26 @@ def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
 @pytest.mark.parametrize("name", CHEAP)
 def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
     """`--quick` prints its tables on stdout only."""
-    before = command.PAGE.read_bytes()
+    page = command.page_of(name)
+    before = page.read_bytes()
     monkeypatch.setattr(sys, "argv", ["benchmarks", name, "--quick"])
 
     command.main()
 
     assert f"<!-- {name} -->" in capsys.readouterr().out
-    assert command.PAGE.read_bytes() == before
+    assert page.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", command.BENCHMARKS)
+def test_a_stored_section_has_the_words_of_its_module(name):
+    """The page and the module are edited together: title, question and tools are the same."""
+    module = import_module(f"benchmarks.{name}")
+
+    text = command.page_of(name).read_text(encoding="utf-8")
+
+    stored = text.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
+    assert stored.strip().startswith(f"## {module.TITLE}\n\n{module.WORDS.strip()}\n")
+    assert all(f"{tool} " in stored for tool in module.TOOLS)
 
 
 def test_an_unknown_name_is_refused(monkeypatch):

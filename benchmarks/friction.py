@@ -1,0 +1,110 @@
+"""Which laws of friction a servo and a cart need: one step of a ladder of laws after the other.
+
+The search of `cartlab gap` runs once for each step, with the laws of that step alone.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from benchmarks.emps import FILES, SPRINGS, emps_record
+from benchmarks.free_runs import left_out, percent, words_of
+from benchmarks.page import Table
+from pipeline.gap.explain import explain_gap
+from pipeline.gap.types import Gap
+from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
+from pipeline.results import Record
+from pipeline.set_up import Bench, Units
+from tests.helpers.places import REAL_DATA
+from tests.helpers.ucsd import ecp_record
+
+TITLE = "Which friction laws a servo needs"
+WORDS = """
+**Which laws of friction are worth having?** Robot simulators mostly have Coulomb and viscous
+friction alone. M. Duclusaud, G. Passault, V. Padois, O. Ly, *Extended Friction Models for the
+Physics Simulation of Servo Actuators*, [arXiv 2410.08650](https://arxiv.org/abs/2410.08650)
+([their code](https://github.com/Rhoban/bam)) climb a ladder of six models, M1 to M6, on four
+servos. Here is the part of that ladder that exists without an outer load, on two real axes.
+"""
+TOOLS = ()
+COULOMB = ("coulomb_friction",)
+STRIBECK = (*COULOMB, "stiction")
+LADDER = (
+    ("M1: Coulomb", COULOMB),
+    ("M2: M1 + Stribeck", STRIBECK),
+    ("M3: M1 + load", (*COULOMB, "load_friction")),
+    ("M4: Stribeck + load", (*STRIBECK, "load_friction")),
+    ("M4 + drag (speed squared)", (*STRIBECK, "load_friction", "quadratic_drag")),
+    ("M2 + presliding (Dahl)", (*STRIBECK, "presliding_friction")),
+)
+WHOLE = "cartlab, whole catalogue"
+# A constant force is no friction, but on an axis without a spring every step needs one.
+ALWAYS = ("force_offset",)
+CART = "DOF1_en1_input1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Axis:
+    """A real axis: its records and which springs it has."""
+
+    words: str
+    records: Sequence[Record]
+    bench: Bench
+
+
+def axes() -> Iterator[Axis]:
+    """Yield the axes whose recordings are on this machine."""
+    if (REAL_DATA / "emps" / FILES["train"]).exists():
+        yield Axis(
+            words="EMPS, training record",
+            records=[emps_record("train")],
+            bench=Bench(springs=SPRINGS, units=Units(position="m", input="V")),
+        )
+    folder = REAL_DATA / "ecp210-ucsd"
+    if folder.is_dir():
+        files = [folder / f"{CART}_test{i}.csv" for i in range(1, 6)]
+        yield Axis(
+            words="a cart of an ECP 210, five steps",
+            records=[ecp_record(file, column=3, kind="step") for file in files],
+            bench=Bench(springs=(True, False), units=Units(position="count", input="V")),
+        )
+
+
+def climb(axis: Axis) -> Iterator[tuple[str, Gap]]:
+    """Yield the name and the result of each step."""
+    ladder = [(name, [find_effect(key) for key in (*laws, *ALWAYS)]) for name, laws in LADDER]
+    for name, laws in (*ladder, (WHOLE, CATALOGUE)):
+        yield name, explain_gap(axis.records, axis.bench, catalogue=laws)
+
+
+def rows_of(axis: Axis) -> list[list[str]]:
+    """Return a row for viscous friction alone, and one for each step of the ladder."""
+    rows: list[list[str]] = []
+    for name, gap in climb(axis):
+        if not rows:
+            rows.append([axis.words, "viscous alone", percent(gap.baseline), ""])
+        rows.append([axis.words, name, percent(gap.final), words_of(gap)])
+    return rows
+
+
+def tables(*, quick: bool) -> list[Table]:
+    """Return the held-out error of each step, on each axis."""
+    head = ["axis", "laws on offer", "held-out error", "laws it took"]
+    found = [] if quick else list(axes())
+    rows = [row for axis in found for row in rows_of(axis)]
+    if not rows:
+        rows = [left_out("all", quick=quick, columns=len(head))]
+    return [Table(title="Held-out error, step by step", head=head, rows=rows, note=_NOTE)]
+
+
+_NOTE = """
+Beyond Coulomb no friction law of the ladder helps much here. On EMPS a force that repeats along the
+travel does more than Stribeck and load, and the numbers of the Stribeck law are as uncertain as
+they are large. On the cart presliding does more. The search is greedy, so a step can take a law
+that an earlier one did not.
+
+The error is that of free runs over records, or the part of a record, held out from the fit, as a
+share of the motion. Every step may also add a constant force. A law on offer is taken only if it
+lowers the held-out error. M5 tells motor load from outer load and M6 adds its square: both axes lie
+flat and carry no outer load, so both laws would equal M4. "Load" is the drive's command. Their
+paper measures servos with gearboxes under a pendulum, where load matters most.
+"""
