@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from benchmarks.emps import FILES, SPRINGS, emps_record
-from benchmarks.free_runs import left_out, percent, words_of
+from benchmarks.free_runs import left_out, percent
 from benchmarks.page import Table
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.types import Gap
@@ -36,7 +36,7 @@ LADDER = (
     ("M4 + drag (speed squared)", (*STRIBECK, "load_friction", "quadratic_drag")),
     ("M2 + presliding (Dahl)", (*STRIBECK, "presliding_friction")),
 )
-WHOLE = "cartlab, whole catalogue"
+VISCOUS, WHOLE = "viscous alone", "cartlab, whole catalogue"
 # A constant force is no friction, but on an axis without a spring every step needs one.
 ALWAYS = ("force_offset",)
 CART = "DOF1_en1_input1"
@@ -69,29 +69,32 @@ def axes() -> Iterator[Axis]:
         )
 
 
-def climb(axis: Axis) -> Iterator[tuple[str, Gap]]:
-    """Yield the name and the result of each step."""
-    ladder = [(name, [find_effect(key) for key in (*laws, *ALWAYS)]) for name, laws in LADDER]
-    for name, laws in (*ladder, (WHOLE, CATALOGUE)):
-        yield name, explain_gap(axis.records, axis.bench, catalogue=laws)
+def climb(axis: Axis) -> Iterator[Gap]:
+    """Yield the result of each step of the ladder, then that with the whole catalogue."""
+    for _, laws in LADDER:
+        allowed = [find_effect(key) for key in (*laws, *ALWAYS)]
+        yield explain_gap(axis.records, axis.bench, catalogue=allowed)
+    yield explain_gap(axis.records, axis.bench, catalogue=CATALOGUE)
 
 
-def rows_of(axis: Axis) -> list[list[str]]:
-    """Return a row for viscous friction alone, and one for each step of the ladder."""
-    rows: list[list[str]] = []
-    for name, gap in climb(axis):
-        if not rows:
-            rows.append([axis.words, "viscous alone", percent(gap.baseline), ""])
-        rows.append([axis.words, name, percent(gap.final), words_of(gap)])
-    return rows
+def laws_of(gap: Gap) -> str:
+    """Return the names of the effects found."""
+    return ", ".join(found.effect.key.replace("_", " ") for found in gap.effects)
 
 
 def tables(*, quick: bool) -> list[Table]:
     """Return the held-out error of each step, on each axis."""
-    head = ["axis", "laws on offer", "held-out error", "laws it took"]
     found = [] if quick else list(axes())
-    rows = [row for axis in found for row in rows_of(axis)]
-    if not rows:
+    head = ["laws on offer"]
+    rows = [[name] for name in (VISCOUS, *(name for name, _ in LADDER), WHOLE)]
+    for axis in found:
+        head += [f"{axis.words}: held-out error", "laws it took"]
+        gaps = list(climb(axis))
+        cells = [(percent(gaps[0].baseline), ""), *((percent(g.final), laws_of(g)) for g in gaps)]
+        for row, pair in zip(rows, cells, strict=True):
+            row += pair
+    if not found:
+        head.append("held-out error")
         rows = [left_out("all", quick=quick, columns=len(head))]
     return [Table(title="Held-out error, step by step", head=head, rows=rows, note=_NOTE)]
 
@@ -103,7 +106,8 @@ they are large. On the cart presliding does more. The search is greedy, so a ste
 that an earlier one did not.
 
 The error is that of free runs over records, or the part of a record, held out from the fit, as a
-share of the motion. Every step may also add a constant force. A law on offer is taken only if it
+share of the motion. Every step after the first may add a
+constant force. A law on offer is taken only if it
 lowers the held-out error. M5 tells motor load from outer load and M6 adds its square: both axes lie
 flat and carry no outer load, so both laws would equal M4. "Load" is the drive's command. Their
 paper measures servos with gearboxes under a pendulum, where load matters most.

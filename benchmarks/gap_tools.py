@@ -280,8 +280,8 @@ is within a tenth of the best.
   (up to the third degree, sign v, v|v|, |u| sign v); smoothed differences over 5 to 15 samples;
   STLSQ with normalised columns at six thresholds. The library has no past inputs, so it cannot
   express a delay or a lag.
-- SysIdentPy has a polynomial NARX up to the third degree, 2 to 6 lags of every second, fourth or
-  eighth sample, FROLS with the Akaike criterion and up to 15 terms (its defaults).
+- SysIdentPy has a polynomial NARX up to the third degree with 2 to 6 lags of every second, fourth
+  or eighth sample. FROLS chooses up to 15 terms by the Akaike criterion (its defaults).
 - The network (scikit-learn) has two layers of eight, 2 to 6 lags of every, every second or every
   fourth sample, and L-BFGS, which its documentation recommends for few data.
 - The recurrent network (jax-sysid) has {STATES} states and {CELLS} cells beside a linear part, on
@@ -290,10 +290,10 @@ is within a tenth of the best.
 """
 _SUMMARY_NOTE = """
 **Others are better** outside this lab: they model systems that are not carts. PySINDy accepts any
-term that you add to its library, and the networks need no idea of the effect. Here cartlab has an
-advantage: its catalogue contains every effect that is hidden. A real bench may have others, and
-there a network can be better (see the real carts below). With several carts, some held, the other
-tools would need a model for each arrangement.
+term that you add to its library, and the networks need no idea of the effect. On the real decays
+below, jax-sysid is nearer than cartlab. In simulation cartlab has an advantage: its catalogue
+contains every effect that is hidden. With several carts, some held, the other tools would need a
+model for each arrangement.
 
 Error over the noise: median and quartiles over all benches. "Exactly the effects" counts the
 verdict `named` with nothing missing or added, or `none` if nothing is hidden. Seconds include all

@@ -92,7 +92,8 @@ def named_mistakes(rows: Sequence[dict[str, Any]]) -> Table:
     groups["**all mistakes**"] = [row for row in rows if row["codes"]]
     missed = Counter(row["kind"] for row in rows if not _is_right(row))
     of = Counter(row["kind"] for row in rows)
-    listed = ", ".join(f"`{kind}` ({n} of {of[kind]})" for kind, n in missed.most_common())
+    listed = [f"`{kind}` ({n} of {of[kind]})" for kind, n in missed.most_common() if n > 1]
+    listed.append(f"{sum(n == 1 for n in missed.values())} kinds once")
     benches = len({row["seed"] for row in rows})
     slight = len({row["seed"] for row in rows if row.get("friction")})
     return Table(
@@ -102,7 +103,7 @@ def named_mistakes(rows: Sequence[dict[str, Any]]) -> Table:
         note=_MISTAKES.format(
             benches=benches,
             slight=slight,
-            missed=listed or "no kind",
+            missed=", ".join(listed),
             seconds=spread(row["seconds"] for row in rows),
         ),
     )

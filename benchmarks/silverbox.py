@@ -150,7 +150,7 @@ All tools that ran here learn from the same 30,000 samples; cartlab holds some o
 them, the others choose by the samples they learn from. Settings are those of the hidden effects
 above, without leaving samples out, as a period has only nine. PySINDy has plain differences of
 order 6 beside those smoothed over 5 samples. SysIdentPy has all products up to the third degree of
-2 and 3 lags, the network 3 and 5 lags.
+2 and 3 lags, the network 3 and 5 lags. jax-sysid was not run on them.
 
 *Published*: the same split and measure, not run here. "Baselines" is M. D. Champneys, G. I.
 Beintema, R. Tóth, M. Schoukens, T. J. Rogers, *Baseline results for selected nonlinear system

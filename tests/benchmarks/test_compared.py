@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from benchmarks.black_boxes import Model, Part, best, error
+from benchmarks.black_boxes import CELLS, STATES, Model, Part, _recurrent, best, error
 from benchmarks.bode import judged, modes_named, multisine
 from benchmarks.bode_tools import (
     Dwells,
@@ -153,3 +153,30 @@ def test_only_what_is_said_as_named_counts_as_named(verdict, hidden, named):
     gap: Any = SimpleNamespace(verdict=verdict, effects=effects)
 
     assert is_named(Bench(hidden=hidden, noise=0.1, gap=gap, answers={})) is named
+
+
+def test_a_recurrent_network_without_cells_is_a_linear_system():
+    """A free run is C A^k x0 plus the response to the input; both by matrix powers here."""
+    rng = np.random.default_rng(3)
+    A, B = 0.4 * rng.standard_normal((STATES, STATES)), rng.standard_normal((STATES, 1))
+    C, x0, u = (
+        rng.standard_normal((1, STATES)),
+        rng.standard_normal(STATES),
+        rng.standard_normal(20),
+    )
+    cells = [
+        np.ones((CELLS, STATES)),
+        np.ones((CELLS, 1)),
+        np.ones(CELLS),
+        np.zeros((STATES, CELLS)),
+    ]
+
+    found = _recurrent([A, B, C, *cells], x0, u)
+
+    powers = [np.linalg.matrix_power(A, k) for k in range(20)]
+    markov = [(C @ power @ B).item() for power in powers]
+    expected = [
+        (C @ powers[k] @ x0).item() + sum(markov[k - 1 - i] * u[i] for i in range(k))
+        for k in range(20)
+    ]
+    assert_allclose(found, expected, rtol=1e-9, atol=1e-12)

@@ -73,6 +73,35 @@ def test_a_grader_is_judged_by_who_lost_points_and_who_was_told_why():
     ]  # fmt: skip
 
 
+def test_the_table_of_mistakes_counts_every_grading_in_one_line():
+    """A missed mistake is listed by its kind; an honest team with a flag is not right."""
+
+    def row(kind, codes, found):
+        return {
+            "seed": 1, "kind": kind, "codes": codes, "found": found, "or_else": [], "seconds": 1.0,
+            "friction": True,
+        }  # fmt: skip
+
+    table = grading.named_mistakes(
+        [
+            row("honest, 2 carts", [], []),
+            row("honest, 3 carts", [], ["final_off"]),
+            row("peak_count", ["peak_count"], ["peak_count"]),
+            row("one number: hz_for_rad_s", ["hz_for_rad_s"], ["peak_count"]),
+            row("a + b", ["a", "b"], ["a", "b", "c"]),
+        ]
+    )
+
+    lines = {cells[0]: cells[1:] for cells in table.rows}
+    assert lines["honest"][0].startswith("50 % (1 of 2)")
+    assert lines["one mistake"][0].startswith("100 % (1 of 1)")
+    assert lines["one mistake in one number"][0].startswith("0 % (0 of 1)")
+    assert lines["two mistakes in a table"][2] == "1"
+    assert lines["**all mistakes**"][0].startswith("67 % (2 of 3)")
+    assert "Not always right: 2 kinds once." in table.note
+    assert "1 of them slightly nonlinear" in table.note
+
+
 def test_records_of_many_sessions_are_all_different_and_can_be_read(tmp_path):
     report.write_records(tmp_path / "many", 40)
     data = read_data(load_submission(tmp_path / "many"))
