@@ -1,0 +1,134 @@
+"""The endurance test sees what it looks for: lost, doubled and damaged changes, rising memory."""
+
+import subprocess
+import sys
+
+import pytest
+from numpy.testing import assert_allclose
+
+from benchmarks.endurance import SETTLING, Memory, page_table
+from benchmarks.endurance_checks import Found, check_book, check_folders
+from benchmarks.endurance_people import Change, Journal, digest
+from pipeline.grading.gradebook.request_book import RequestBook
+from pipeline.submission import load_submission
+from tests.helpers import postgres
+from tests.helpers.desks import a_submission
+from tests.helpers.grades import fill_book
+from tests.helpers.places import ROOT
+
+
+def _points(token: str, points: float, *, confirmed: bool = True) -> Change:
+    return Change(kind="points", by="Ada", where=("team-02", "laws"), token=token, points=points,
+                  confirmed=confirmed)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def book(tmp_path_factory):
+    """A class with points by hand, some of them twice, and one request that was answered."""
+    place = str(tmp_path_factory.mktemp("book"))
+    fill_book(place)
+    with RequestBook(place) as book:
+        for why, points in (("once", 0.5), ("twice", 0.5), ("x", 0.0), ("twice", 0.5)):
+            book.override("team-02", "laws", points, why=why, by="Ada")
+        book.release(True, by="prof")
+        book.ask("team-04", "laws", why="see page 3", by="s4")
+        (asked,) = book.queue().waiting
+        book.answer("team-04", "laws", 0.5, text="right", by="Ada", seen=asked.version)
+    return place
+
+
+@pytest.mark.parametrize(
+    ("change", "wrong"),
+    [
+        (_points("once", 0.5), None),
+        (_points("once", 0.5, confirmed=False), None),
+        (_points("never", 0.5, confirmed=False), None),
+        (_points("never", 0.5), "lost"),
+        (_points("twice", 0.5), "doubled"),
+        (_points("once", 1.0), "spoilt"),
+        (Change(kind="request", by="s4", where=("team-04", "laws"), token="see page 3"), None),
+        (Change(kind="answer", by="Ada", where=("team-04", "laws"), token="right",
+                confirmed=True), None),
+        (Change(kind="answer", by="Ada", where=("team-04", "laws"), token="another",
+                confirmed=True), "lost"),
+        (Change(kind="reopened", by="Ada", where=("team-04", "laws"), token="",
+                confirmed=True), "lost"),
+        (Change(kind="together", by="Ada", where=("", "laws"), token="once",
+                teams=("team-02", "team-03"), points=0.5), "spoilt"),
+    ],
+)  # fmt: skip
+def test_a_change_of_points_is_there_once_and_whole(book, change, wrong):
+    """Confirmed: exactly once; not confirmed: at most once; for several teams: all or none."""
+    found = Found()
+    with RequestBook(book) as opened:
+        teams = [one.submission for one in opened.class_now().listings]
+
+    check_book(book, Journal(sent=[change]), teams=teams, found=found)
+
+    named = {key: [t for t in getattr(found, key) if "nobody sent" not in t]
+             for key in ("lost", "doubled", "spoilt")}  # fmt: skip
+    assert [key for key, sentences in named.items() if sentences] == ([wrong] if wrong else [])
+
+
+def test_a_team_that_left_the_class_is_lost(book):
+    """The class list is compared with the teams that were graded; so are points nobody sent."""
+    found = Found()
+
+    check_book(book, Journal(), teams=["team-01"], found=found)
+
+    assert "of 1 teams" in found.lost[0]
+    assert any("nobody sent" in sentence for sentence in found.spoilt)
+
+
+def test_recordings_and_rows_are_compared_with_what_was_sent(tmp_path):
+    """A file that is missing or another, and a row with an earlier note."""
+    folder = a_submission(tmp_path / "s0")
+    first, *_ = load_submission(folder).experiments
+    name = first.file.removeprefix("data/")
+    right = digest((folder / first.file).read_bytes())
+
+    def found(*changes: tuple[str, str, str]) -> Found:
+        made = [Change(kind=kind, by="s0", where=("0", where), token=token, confirmed=True)
+                for kind, where, token in changes]  # fmt: skip
+        all_ = Found()
+        check_folders({("s0", "0"): folder}, Journal(sent=made), found=all_)
+        return all_
+
+    assert found(("upload", name, right)) == Found()
+    assert found(("upload", name, digest(b"other"))).spoilt
+    assert found(("upload", "missing.csv", right)).lost
+    assert found(("row", first.id, first.note)) == Found()
+    assert found(("row", first.id, first.note), ("row", first.id, "newer")).lost
+
+
+def test_the_slope_of_memory_is_that_of_a_line():
+    """10 MB an hour, after the start: with no scatter there is no error."""
+    memory = Memory()
+    for second in range(0, 1800, 2):
+        start = 500.0 if second < SETTLING else 0.0
+        memory.at.append(float(second))
+        memory.mb.append(300.0 + 10.0 * second / 3600 + start)
+
+    seen = memory.slope(SETTLING)
+
+    assert_allclose(seen["slope"], 10.0, rtol=1e-6)
+    assert_allclose(seen["std"], 0.0, atol=1e-6)
+
+
+def test_the_table_has_a_row_for_each_page():
+    row = {"count": 1200, "median": 0.1, "p99": 0.456, "most": 1.5, "over": 3}
+
+    assert page_table({"team": row}).splitlines()[-1] == (
+        "| team | 1,200 | 0.10 s | 0.46 s | 1.50 s | 3 |"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", ["class", "exploration"])
+def test_a_minute_loses_nothing(part):
+    """A small class with kills, and a short exploration."""
+    if part == "class" and (why := postgres.missing()):
+        pytest.skip(why)
+    command = [sys.executable, "-m", "benchmarks.endurance", part, "--quick"]
+    ran = subprocess.run(command, cwd=ROOT, capture_output=True, encoding="utf-8", check=False)
+    assert ran.returncode == 0, ran.stderr
