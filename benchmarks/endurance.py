@@ -67,7 +67,9 @@ KEPT = Path(__file__).with_name("endurance.json")
 PAGE = Path(__file__).with_name("endurance.md")
 PRESET, ASSIGNMENT = "throne-2dof", "lab"
 SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # factors of a wrong number
-SETTLING = 120.0  # s after a start in which memory still grows: imports, caches, connections
+# After a start memory rises for some s: imports, caches, and cycles of dead objects, for which
+# these programs look only after 300,000 new objects.
+SETTLING = 480.0
 BLOCK = 60.0  # s of which memory is averaged: samples in a row are not independent
 KILLED = {"desk": 5, "worker": 3, "connection": 2}  # how often each, while the desk is killed
 FOLDERS = 4  # of each student
@@ -406,7 +408,7 @@ def _watch(
     lab.over.set()
     for person in people:
         person.join(PATIENCE)
-    since = last_start - began + min(SETTLING, length / 10)
+    since = last_start - began + min(SETTLING, length / 4)
     return {
         "kills": dict(kills),
         "memory": {"desk": desk.slope(since), "workers": workers.slope(since)},
@@ -494,7 +496,7 @@ def run_exploration(*, hours: float, speed: float, seed: int) -> dict[str, Any]:
         "turns": int(turns[1]) if turns else 0,
         "status": process.returncode,
         "last": said[-2:],
-        "memory": memory.slope(SETTLING),
+        "memory": memory.slope(min(SETTLING, seconds / 4)),
         "trace": {"at": np.round(memory.at[::15], 1).tolist(), "mb": memory.mb[::15]},
         "load": [float(np.median(load)), max(load)],
         "machine": machine(),

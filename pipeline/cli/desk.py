@@ -32,11 +32,13 @@ def desk(
     """Open the desk, a page in the browser of this computer, for what the other commands do."""
     from pipeline.desk.app import DeskServer
     from pipeline.desk.ending import Ending
+    from pipeline.garbage import collect_for_hours
 
     if (host is None) != (users is None):
         raise ConfigError("--host and --users go together: who listens to others asks who they are")
     if folder is not None and users is not None:
         raise ConfigError("with --users, the file says which folders there are")
+    collect_for_hours()
     server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
     with Ending(say=say) as ending, server:
         say(f"ready: {server.url}")
