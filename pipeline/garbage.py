@@ -22,7 +22,7 @@ def collect_seldom() -> None:
 def collect_for_hours() -> None:
     """Look for cycles more often again, in a process that runs for hours.
 
-    Each saved row of a desk leaves some thousand dead objects: they would add up to 100 MB before
-    the first look.
+    Each saved row of a desk leaves some thousand dead objects: after 120 rows, before the first
+    look, they were 30 MB.
     """
     gc.set_threshold(_OF_A_SERVER)
