@@ -569,7 +569,7 @@ def write_page() -> None:
 def class_words(made: Mapping[str, Any]) -> str:
     """Return what became of the class, as a list."""
     confirmed = ", ".join(f"{KINDS[kind]} {many:,}" for kind, many in made["confirmed"].items())
-    killed = ", ".join(f"{KILLS[what]} {many} times" for what, many in made["kills"].items())
+    killed = ", ".join(f"{KILLS[what]} {many}×" for what, many in made["kills"].items())
     total = sum(made["confirmed"].values())
     wrong = [len(made[key]) for key in ("lost", "doubled", "spoilt")]
     return "\n".join(
@@ -577,8 +577,8 @@ def class_words(made: Mapping[str, Any]) -> str:
             f"- **{total:,} confirmed changes** ({confirmed}): {wrong[0]} lost, "
             f"{wrong[1]} doubled, {wrong[2]} damaged.",
             f"- Killed: {killed}. {made['outlived']} processes outlived their desk.",
-            f"- Memory of the desk: {memory_words(made['memory']['desk'])}.",
-            f"- Memory of its workers together: {memory_words(made['memory']['workers'])}.",
+            f"- Memory of the desk: {memory_words(made['memory']['desk'])}; "
+            f"of its workers together at most {made['memory']['workers']['most']:.0f} MB.",
             f"- {made['teams']} teams, {made['students']} students and 2 TAs for "
             f"{made['minutes']:g} minutes. {load_words(made)}",
         ]
@@ -613,14 +613,21 @@ def load_words(made: Mapping[str, Any]) -> str:
 
 
 def page_table(pages: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the times of the answers, in Markdown."""
+    """Return the times of the answers in Markdown, the slow ones first, most others together."""
     lines = [
         "| page or form | answers | median | 99 % | most | over 1 s |",
         "|---|---|---|---|---|---|",
     ]
-    for page, took in pages.items():
+    slow = {page: took for page, took in pages.items() if took["over"] > 0.1 * took["count"]}
+    for page, took in sorted(slow.items(), key=lambda one: -one[1]["median"]):
         seconds = " | ".join(f"{took[key]:.2f} s" for key in ("median", "p99", "most"))
         lines.append(f"| {page} | {took['count']:,} | {seconds} | {took['over']} |")
+    others = [took for page, took in pages.items() if page not in slow]
+    if others:
+        count, over = (sum(took[key] for took in others) for key in ("count", "over"))
+        most = [max(took[key] for took in others) for key in ("median", "p99", "most")]
+        seconds = " | ".join(f"at most {one:.2f} s" for one in most)
+        lines.append(f"| {len(others)} others | {count:,} | {seconds} | {over} |")
     return "\n".join(lines)
 
 
