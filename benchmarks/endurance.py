@@ -26,6 +26,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from decimal import Decimal
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -562,6 +563,10 @@ def write_page() -> None:
     }
     for name, words in parts.items():
         between = re.compile(rf"(<!-- {name} -->\n).*?(\n<!-- end -->)", re.DOTALL)
+        if name != "pages":
+            words = "\n".join(
+                fill(line, 119, subsequent_indent="  ") for line in words.splitlines()
+            )
         page = between.sub(lambda found, w=words: f"{found[1]}{w}{found[2]}", page, count=1)
     write_file(PAGE, page)
 
