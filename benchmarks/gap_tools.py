@@ -282,8 +282,8 @@ is within a tenth of the best.
   express a delay or a lag.
 - SysIdentPy has a polynomial NARX up to the third degree with 2 to 6 lags of every second, fourth
   or eighth sample. FROLS chooses up to 15 terms by the Akaike criterion (its defaults).
-- The network (scikit-learn) has two layers of eight, 2 to 6 lags of every, every second or every
-  fourth sample, and L-BFGS, which its documentation recommends for few data.
+- The network (scikit-learn) has two layers of eight. It sees 2 to 6 lags of every, every second or
+  every fourth sample. Its documentation recommends L-BFGS for few data.
 - The recurrent network (jax-sysid) has {STATES} states and {CELLS} cells beside a linear part, on
   every fourth sample. As in its documentation, {ADAM} steps of Adam come before at most {LBFGS} of
   L-BFGS. A group lasso on the states has two strengths. The first 48 readings give its start.
