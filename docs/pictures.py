@@ -116,7 +116,7 @@ def desk(team: Path, grades: Path) -> None:
         page.screenshot(path=IMAGES / "desk.png")
         own = "kind=sine&amplitude=0.01&frequency=3&seconds=20&goal=zeta_2"
         page.goto(f"{server.url.rsplit('/', 2)[0]}/bench/0/weigh?{own}")
-        page.get_by_text("What would the program have chosen?").click()
+        page.get_by_text("What would cartlab have chosen?").click()
         page.locator("#brings").scroll_into_view_if_needed()
         page.screenshot(path=IMAGES / "desk-lesson.png")
         page.goto(f"{server.url.rsplit('/', 2)[0]}/")

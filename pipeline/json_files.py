@@ -40,7 +40,7 @@ _SIGNIFICANT = 10  # digits: below that, processors and library versions differ
 
 
 class InFile(NamedTuple):
-    """What stands in the file for a value of the annotated type."""
+    """The form in the file of a value of the annotated type."""
 
     type: Any
 
@@ -105,7 +105,7 @@ def result(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenMember:
-    """What a type writes under one key; `stored` where it is a field, not derived."""
+    """The content that a type writes under one key; `stored` if it is a field, not derived."""
 
     name: str
     key: str
@@ -216,7 +216,7 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
     """
     if issubclass(cls, BaseModel):
         return cls
-    # What stands below the first paragraph is of the fields that are not written.
+    # Only the first paragraph concerns the written fields.
     about = (getdoc(cls) or "").partition("\n\nAttributes\n")[0]
     found: dict[str, Any] = {
         f"{own.name}_": (
@@ -235,7 +235,7 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
 
 
 def _file_type(hint: Any, part: tuple[str, ...]) -> Any:
-    """Return the type of what stands in the file for a value of a type."""
+    """Return the type in the file for a value of a type."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return args[1].type

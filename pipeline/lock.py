@@ -16,13 +16,13 @@ _AGAIN = 0.02  # s until who waits asks again
 
 @contextmanager
 def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
-    """Make a folder and keep other runs out of it; it goes again where nothing came of it.
+    """Make a folder and keep other runs out of it; remove it if it stays empty.
 
     The lock is the system's: it is gone with its process however that ends.
 
     Parameters
     ----------
-    private : nobody but its owner may enter a folder that is made here.
+    private : only its owner may enter a folder that is made here.
 
     Raises
     ------
@@ -63,12 +63,12 @@ def _locked(path: Path, *, patience: float) -> Iterator[None]:
         lock.acquire(timeout=patience, poll_interval=_AGAIN)
     except Timeout:
         raise ConfigError(
-            f"{path.parent}: another cartlab{_holder(path)} writes there; wait for it, or name "
-            "another folder"
+            f"{path.parent}: another cartlab{_holder(path)} is writing there; wait for it, or "
+            f"choose another folder"
         ) from None
     except OSError as error:
         raise ConfigError(
-            f"{path}: {error.strerror or error}; is the folder yours to write?"
+            f"{path}: {error.strerror or error}; can you write to this folder?"
         ) from None
     try:
         yield
@@ -76,16 +76,16 @@ def _locked(path: Path, *, patience: float) -> Iterator[None]:
         lock.release()
 
 
-# The number of the process stands behind a blank: the first byte of a lock can be read on Windows
-# by nobody but who holds it.
+# The number of the process follows a blank, because on Windows only the holder of a lock can read
+# its first byte.
 
 
 def _sign(file: int) -> None:
-    """Write this process's number into a lock that was taken, for whoever is kept out."""
+    """Write this process's number into the acquired lock, for messages to others."""
     before = os.read(file, 32)
     # Up to version 0.2 a lock was a database.
     if before.strip() and not before.strip().isdigit() and not before.startswith(b"SQLite format"):
-        raise OSError("is no lock of cartlab")
+        raise OSError("is not a lock of cartlab")
     os.ftruncate(file, 0)
     os.lseek(file, 0, os.SEEK_SET)
     os.write(file, f" {os.getpid()}".encode())

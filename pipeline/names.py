@@ -69,7 +69,7 @@ class Name:
 
     @property
     def words(self) -> str:
-        """What it is, as one says it: "damping ratio ζ of cart 1"."""
+        """Its name in words: "damping ratio ζ of cart 1"."""
         symbols = {"K": "static gain K", "omega": "frequency ω", "zeta": "damping ratio ζ"}
         place = ""
         if self.cart is not None:
@@ -143,5 +143,5 @@ def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
 
 
 def toml_flags(flags: Iterable[bool]) -> str:
-    """Return flags as they stand in a file: "[false, true]"."""
+    """Return flags in the form of a file: "[false, true]"."""
     return f"[{', '.join('true' if flag else 'false' for flag in flags)}]"

@@ -84,7 +84,7 @@ class Lab:
 
         Raises
         ------
-        DataError : none was designed, with the reasons.
+        DataError : no feedback was designed, with the reasons.
         """
         if self.results.feedback is None:
             raise DataError(f"no feedback was designed: {self._reasons}")
@@ -194,7 +194,7 @@ class Lab:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ExplainedGap:
-    """What the linear carts leave out; at the end of a cell it shows its verdict.
+    """The gap analysis; at the end of a cell it shows its verdict.
 
     Attributes
     ----------

@@ -15,9 +15,9 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 
-OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of what names students
+OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of files with students' names
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
-# What looks like the start of a formula and is none: a number, and the dash for nothing.
+# Not a formula although it looks like one: a number, or the dash for a missing value.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
 # What starts a formula, wide and small forms too, at the start of a cell or behind a semicolon,
 # where a spreadsheet of a country with decimal commas begins another cell, quotes or not.
@@ -32,7 +32,7 @@ def check_folder(out: Path) -> Path:
     ConfigError : something else is in its place.
     """
     if out.exists() and not out.is_dir():
-        raise ConfigError(f"{out}: is a file; name a folder with --out")
+        raise ConfigError(f"{out}: is a file; give a folder with --out")
     return out
 
 
@@ -46,7 +46,7 @@ def named_folder(out: Path) -> Path:
     """
     files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
     if not out.is_dir() and out.suffix.lower() in files:
-        raise ConfigError(f"{out}: several files are written; name a folder with --out")
+        raise ConfigError(f"{out}: this writes several files; give a folder with --out")
     return check_folder(out)
 
 
@@ -58,7 +58,7 @@ def new_folder(out: Path) -> Path:
     ConfigError : there is something in it, which a new submission would be mixed with.
     """
     if named_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
-        raise ConfigError(f"{out}: is not empty; name a new folder with --out")
+        raise ConfigError(f"{out}: is not empty; choose a new folder with --out")
     return out
 
 
@@ -71,18 +71,18 @@ def own_folder(parent: Path, name: str) -> Path:
     """
     folder = parent / name
     if folder.is_symlink():
-        raise ConfigError(f"{folder}: is a link; name another folder with --out")
+        raise ConfigError(f"{folder}: is a link; choose another folder with --out")
     return check_folder(folder)
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
     """Write a file whole or not at all; a link in its place is replaced, not followed.
 
-    What a program that was killed while it wrote has left there goes, once in a process.
+    Remains of a program that was killed while writing are removed, once per process.
 
     Parameters
     ----------
-    private : nobody but its owner may read it, where the system knows owners.
+    private : only its owner may read it, if the system supports owners.
     """
     raw = content.encode() if isinstance(content, str) else content
     _clear_left_over(path.parent)
@@ -112,7 +112,7 @@ def _clear_left_over(folder: Path) -> None:
 
 
 def clear_files(folder: Path, pattern: str) -> None:
-    """Remove what an earlier run wrote, so that nothing stale stands beside the new."""
+    """Remove files of an earlier run, so that no stale ones stay."""
     for path in folder.glob(pattern):
         if path.is_file() or path.is_symlink():
             path.unlink()

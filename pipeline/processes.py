@@ -26,12 +26,12 @@ from pipeline.garbage import collect_seldom
 from pipeline.threads import ONE_EACH
 from pipeline.words.progress import Progress, silent
 
-_GLANCE = 0.05  # s between looks at the clock, the memory and who wants it stopped
+_GLANCE = 0.05  # s between checks of time, memory and stop requests
 _START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
-_STARTS = 3  # whoever frees memory may end a process that has just begun
-_TASKS_EACH = 500  # then a fresh process: what libraries keep does not pile up
-_GRACE = 30.0  # s after its limit until a task without a parent to stop it ends by itself
-_LAST_WORDS = 300  # characters of what a process, or a fault of our own, said
+_STARTS = 3  # the system may end a new process to free memory
+_TASKS_EACH = 500  # then a new process, so that memory kept by libraries does not grow
+_GRACE = 30.0  # s after its limit until a task without a parent ends by itself
+_LAST_WORDS = 300  # characters of the last output of a process, or of an internal error
 _LUMP = 65_536  # bytes
 # One thread computes; another only listens, and needs no heap of its own, of 64 MB in glibc.
 _SPARING = {**ONE_EACH, "MALLOC_ARENA_MAX": "1"}
@@ -92,7 +92,7 @@ class Supervisor:
         Parameters
         ----------
         limit : s for it, the start of a process not included.
-        stop : set by whoever wants it no more.
+        stop : set to cancel the task.
         tell : called with what it is about.
 
         Raises
@@ -317,11 +317,11 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
 
 
 def attempt(work: Callable[[], Any]) -> Any:
-    """Do a task: what goes wrong costs this task, not the process.
+    """Do a task; an error ends the task but not the process.
 
     Raises
     ------
-    Failed : with the reason, for whoever asked.
+    Failed : with the reason, for the caller.
     """
     try:
         return work()

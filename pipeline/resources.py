@@ -1,4 +1,4 @@
-"""Where the templates, rubrics and worked examples are: beside the package or inside it."""
+"""Find the templates, rubrics and worked examples, next to the package or inside it."""
 
 from pathlib import Path
 

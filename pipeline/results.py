@@ -2,15 +2,18 @@
 
 Units throughout: the submission's own position unit (say cm) and input unit (say V), seconds,
 radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
-sigma; `None` means it could not be had.
+sigma; `None` means it could not be determined.
 
-It begins with a recording and what is read off it alone. It goes on where a package has types of
-its own: `Ingested` (`ingest/read.py`, what was read), `Identified` and `Fitted` (`identify/`, what
-the stages make of the records up to the fit), `Repeats` (`soundness/repeated_numbers.py`),
-`Gap` (`gap/types.py`, what the linear carts leave out and what explains it), `Grade`
-(`grading/grade.py`, what a submission earned and why) and `Grading` (`grading/gradings.py`, what
-becomes of it in a class). What a type marks as `written` is what its file holds, in that order
-(`json_files.py`).
+It starts with a recording and the results of single recordings. Other packages have further types:
+
+- `Ingested` (`ingest/read.py`): the data read;
+- `Identified` and `Fitted` (`identify/`): results of the stages up to the fit;
+- `Repeats` (`soundness/repeated_numbers.py`);
+- `Gap` (`gap/types.py`): the gap of the linear carts and its explanation;
+- `Grade` (`grading/grade.py`): the points of a submission, with reasons;
+- `Grading` (`grading/gradings.py`): its place in a class.
+
+Fields marked `written` are in the type's file, in that order (`json_files.py`).
 """
 
 from collections.abc import Mapping
@@ -65,17 +68,17 @@ class Record:
     ----------
     id : the experiment's id, used in every message.
     t : (n,) s, strictly increasing, as measured: never assumed uniform.
-    u : (n,) input, or None where the file has none. Positive pushes cart 1 towards positive x.
+    u : (n,) input, or None if the file has no input. Positive pushes cart 1 towards positive x.
     y : (len(carts), n) positions; row j belongs to cart `carts[j]`.
     carts : the carts that were measured.
     free : the carts free to move; the others are held.
     reference : (n,) set point of a closed-loop run, in position units, or None.
     omega : frequency of a sine dwell, rad/s, or None.
-    resolution : (len(carts),) the encoder step, in position units; 0 where none is seen.
+    resolution : (len(carts),) the encoder step, in position units; 0 if it is not visible.
     hold : how the input behaves between samples.
-    source : path inside the submission; `notes` say what reading it had to mend.
-    turned : its input was found to count the other way than the bench's others, and was turned.
-    position_scale, input_scale : what the file's own numbers were multiplied by to get y and u
+    source : path inside the submission; `notes` list corrections made while reading.
+    turned : its input had the opposite sign to the bench's others, and was reversed.
+    position_scale, input_scale : factors from the file's own numbers to y and u
         (the sign included); a controller's gains may be in the file's units.
     heading_units : what the headings of positions and input state.
     """
@@ -111,7 +114,7 @@ class Record:
         return self.y[self.carts.index(cart)]
 
     def encoder_step(self, cart: int) -> float:
-        """Return the encoder step of one cart, in position units; 0 where none is seen."""
+        """Return the encoder step of one cart, in position units; 0 if it is not visible."""
         return float(self.resolution[self.carts.index(cart)])
 
     @property
@@ -468,7 +471,7 @@ class Check:
 
     @property
     def about(self) -> str:
-        """What it is asked of, "" where there is one thing only: "run-1.cart_1"."""
+        """The subject of the check, such as "run-1.cart_1", or ""."""
         cart = "" if self.cart is None else f"cart_{self.cart}" if self.run else f"cart-{self.cart}"
         if self.parameter and self.part:
             return f"{self.parameter}_{self.part}"
@@ -590,10 +593,10 @@ class Stage(StrEnum):
 
 @result()
 class Skipped:
-    """A stage that could not run, of what recording, cart or parameter if of one, and why.
+    """A stage that could not run, with its recording, cart or parameter, and the reason.
 
-    `missing` is what would let it run, in words. Where recordings are there and do not serve,
-    the reason says why, and nothing is missing.
+    `missing` names the missing data in words. It is empty if there are recordings that cannot be
+    used; the reason then says why.
     """
 
     @property
@@ -712,18 +715,17 @@ class StateSpaceMatrices:
 
 @result(eq=False)
 class Analysis:
-    """All results of one submission. A number that could not be had is null, never 0 or NaN.
+    """All results of one submission. A number that could not be determined is null, never 0 or NaN.
 
     Attributes
     ----------
     authors : (id, name) of each.
-    tables : the students' own reduced tables, also where dwells stand in their place.
-    rows : the table of parameters; `chain` is None where no fit was possible (then `skipped` says
-        why).
+    tables : the students' own reduced tables, even if dwells replace them.
+    rows : the table of parameters; `chain` is None if no fit was possible (`skipped` says why).
     files : the SHA-256 of each data file.
-    unreadable : each experiment that could not be read to its reason.
-    unexplained : each driven recording in which the carts move to the share of its motion's power
-        that the fitted carts leave.
+    unreadable : the reason, for each experiment that could not be read.
+    unexplained : for each driven recording with motion, the share of its power that the fitted
+        carts do not explain.
     discussion : `notes.md`, without its comments.
     reported : the students' own numbers, initial and final, as typed.
     """

@@ -1,6 +1,6 @@
-"""The straight line from a submission to its analysis.
+"""The workflow from a submission to its analysis.
 
-The stages that measure the carts stand in order in `identify/carts.py`, their fits in
+The stages that measure the carts are, in order, in `identify/carts.py`, their fits in
 `identify/fit.py`; what follows them is here.
 """
 

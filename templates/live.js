@@ -275,7 +275,7 @@
       const answer = await fetch('press', { method: 'POST', body: new URLSearchParams({ wish, number }) });
       if (answer.status >= 500) throw new Error(answer.statusText);
     } catch {
-      tell(`No answer: ${wish} was not heard. Use Ctrl-C in the terminal, or the switch.`, true);
+      tell(`No answer to ${wish}. Use Ctrl-C in the terminal, or the switch of the bench.`, true);
     }
   };
   $('confirm').addEventListener('click', async () => {

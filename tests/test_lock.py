@@ -40,7 +40,9 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
     When that process is dead its lock is gone too. The next run removes its scratch folder, and its
     own at the end.
     """
-    refused = pytest.raises(ConfigError, match=rf"another cartlab \(process {other.pid}\) writes")
+    refused = pytest.raises(
+        ConfigError, match=rf"another cartlab \(process {other.pid}\) is writing"
+    )
     with refused, alone_in(tmp_path):
         pass
     command = [sys.executable, "-m", "pipeline", "grade", str(tmp_path / "none")]
@@ -60,7 +62,7 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 def test_a_lock_that_is_none_is_said(tmp_path):
     """A file of that name that is not a lock stops the run with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
-    with pytest.raises(ConfigError, match="no lock of cartlab"), alone_in(tmp_path):
+    with pytest.raises(ConfigError, match="not a lock of cartlab"), alone_in(tmp_path):
         pass
 
 

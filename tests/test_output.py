@@ -86,7 +86,7 @@ def test_a_linked_folder_inside_a_submission_is_refused(tmp_path):
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (tmp_path / "report").symlink_to(elsewhere)
-    with pytest.raises(ConfigError, match="is a link; name another folder with --out"):
+    with pytest.raises(ConfigError, match="is a link; choose another folder with --out"):
         own_folder(tmp_path, "report")
     assert check_folder(tmp_path / "report").is_dir()  # if the user names it
 
@@ -101,7 +101,7 @@ def test_a_file_in_the_way_is_refused(tmp_path):
 @pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
 def test_a_file_s_name_is_no_new_folder(tmp_path, name):
     """A name with an ending is a file; an existing folder of that name is a folder."""
-    with pytest.raises(ConfigError, match="name a folder with --out"):
+    with pytest.raises(ConfigError, match="give a folder with --out"):
         named_folder(tmp_path / name)
     (tmp_path / name).mkdir()
     assert named_folder(tmp_path / name).is_dir()

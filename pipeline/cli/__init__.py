@@ -1,20 +1,20 @@
 """The `cartlab` command: parse, call one function, write, exit code.
 
-The commands are loaded when the first one runs, so that Ctrl-C during loading ends it quietly. What
-is imported here is loaded before anybody can press Ctrl-C.
+The commands are loaded when one is run, so that Ctrl-C during loading ends the program quietly.
+Only what is imported here loads before that.
 """
 
 import sys
 
-TYPE_CHECKING = False  # as that of typing, which takes its time to load
+TYPE_CHECKING = False  # like typing's, which is slow to import
 if TYPE_CHECKING:
     from pipeline.cli.common import app as app
 
-INTERRUPTED = 130  # exit status, as of any program that Ctrl-C ends
+INTERRUPTED = 130  # exit status, as usual after Ctrl-C
 
 
 def __getattr__(name: str) -> object:
-    """Load the application when it is asked for."""
+    """Load the application on first use."""
     if name == "app":
         from pipeline.cli.commands import app
 
@@ -33,5 +33,5 @@ def main() -> None:
         from pipeline.cli.commands import run
 
         run()
-    except KeyboardInterrupt:  # nothing has begun yet, or the message is out
+    except KeyboardInterrupt:  # nothing has started, or the message is printed already
         sys.exit(INTERRUPTED)

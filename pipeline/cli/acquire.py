@@ -1,4 +1,4 @@
-"""The command `acquire`: from a bench, or from files as they appear, to a submission."""
+"""The command `acquire`: fill a submission from a bench or from files as they appear."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -26,30 +26,30 @@ def acquire(
     source: Annotated[
         Path | None,
         typer.Option(
-            "--import", metavar="FOLDER", help="Take files of other programs as they appear there."
+            "--import", metavar="FOLDER", help="Import files that another program writes there."
         ),
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="ID", help="Record this one of the plan only; repeat."),
+        typer.Option(metavar="ID", help="Record only this part of the plan; may be repeated."),
     ] = None,
     yes: Annotated[
-        bool, typer.Option("--yes", help="Take what hands are asked to do as done.")
+        bool, typer.Option("--yes", help="Do not wait for manual steps to be confirmed.")
     ] = False,
     web: Annotated[
         bool, typer.Option("--web", help="With --port: show the session in a browser as well.")
     ] = False,
     once: Annotated[
-        bool, typer.Option("--once", help="With --import: take what is there now, and end.")
+        bool, typer.Option("--once", help="With --import: import what is there now, then stop.")
     ] = False,
 ) -> None:
-    """Carry out the plan on a bench, or take files as they appear, into a submission."""
+    """Record the plan on a bench, or import files as they appear, into a submission."""
     from pipeline.bench.live.terminal import Terminal
 
     if (port is None) == (source is None):
-        raise ConfigError("say where the data come from: either --port or --import")
+        raise ConfigError("state where the data come from: either --port or --import")
     if web and port is None:
-        raise ConfigError("--web shows a bench: it goes with --port")
+        raise ConfigError("--web shows a bench, so it needs --port")
     with Terminal(yes=yes) as terminal, saying_where(folder):
         if source is not None:
             _import(folder, source, terminal, once=once)
@@ -62,14 +62,14 @@ def acquire(
 
 @contextmanager
 def saying_where(folder: Path) -> Iterator[None]:
-    """Say of a full disk or a folder that is not one's own what to do about it."""
+    """Turn a full disk or a read-only folder into an error that says what to do."""
     try:
         yield
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
         raise ConfigError(
-            f"{where}{error.strerror or error}: `acquire` writes into {folder}; make room there, "
-            "or make it yours to write, then give the same command: what was recorded is kept"
+            f"{where}{error.strerror or error}: `acquire` writes into {folder}; free some space "
+            "there, or make it writable, and repeat the command. Finished recordings are kept"
         ) from None
 
 
@@ -77,14 +77,14 @@ def saying_where(folder: Path) -> Iterator[None]:
 def watching(
     folder: Path, terminal: "Terminal", *, web: bool, yes: bool
 ) -> Iterator[tuple[list["Observer"], "Buttons | None"]]:
-    """Yield who watches, the first of whom has the person confirm, and the page's buttons."""
+    """Yield the observers and the page's buttons; the first observer asks for confirmations."""
     if not web:
         yield [terminal], None
         return
     from pipeline.bench.live.live_page import LivePage
 
     with LivePage(folder) as page:
-        terminal.remark(f"watch{'' if yes else ', and confirm,'} at {page.url}")
+        terminal.remark(f"watch{'' if yes else ' and confirm'} at {page.url}")
         yield [terminal, page] if yes else [page, terminal], page.buttons
 
 
@@ -102,7 +102,7 @@ def _record(
     try:
         outcomes = carry_out(folder, port=port, observers=observers, only=only, buttons=buttons)
     except KeyboardInterrupt:
-        terminal.remark("stopped; the same command goes on where this ended")
+        terminal.remark("stopped; repeat the command to continue")
         raise typer.Exit(INTERRUPTED) from None
     whole = {outcome.recording.id for outcome in outcomes if not outcome.partial}
     failed = {outcome.recording.id for outcome in outcomes} - whole
@@ -110,13 +110,12 @@ def _record(
     terminal.remark(f"{len(whole)} recorded into {folder}{report}")
     if not outcomes:
         terminal.remark(
-            "what was asked for exists already; to record it anew, take its table out of "
+            "everything is recorded already; to record something again, delete its entry from "
             "submission.toml"
         )
     if failed:
         terminal.remark(
-            f"not recorded: {', '.join(sorted(failed))}; once what stood in the way is mended, the "
-            "same command tries again"
+            f"not recorded: {', '.join(sorted(failed))}; remove the cause and repeat the command"
         )
         raise typer.Exit(1)
 
@@ -125,8 +124,8 @@ def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> 
     from pipeline.bench.host.importing import Importer
     from pipeline.lock import alone_in
 
-    if not folder.exists():  # no file says how many carts there are
-        raise ConfigError(f"{folder}: no such folder; begin with `cartlab new {folder} --carts N`")
+    if not folder.exists():  # the files do not say how many carts there are
+        raise ConfigError(f"{folder}: no such folder; run `cartlab new {folder} --carts N`")
     taken = 0
     try:
         with alone_in(folder):
@@ -135,5 +134,5 @@ def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> 
                 as_what = f"{imported.file}: {imported.experiment}, a {imported.kind}"
                 terminal.remark("; ".join([as_what, *imported.remarks]))
     except KeyboardInterrupt:
-        pass  # the way to end it
-    terminal.remark(f"{taken} files taken into {folder}: check its submission.toml")
+        pass  # Ctrl-C is the normal end
+    terminal.remark(f"{taken} files imported into {folder}: check its submission.toml")

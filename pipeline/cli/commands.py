@@ -1,7 +1,7 @@
-"""All commands, loaded."""
+"""Load all commands."""
 
 # isort: off
-# In this order `cartlab --help` lists the commands: as a lab needs them.
+# `cartlab --help` lists the commands in this order: as a lab needs them.
 from pipeline.cli.common import app, run
 from pipeline.cli import (
     reports,

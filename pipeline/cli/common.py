@@ -1,7 +1,8 @@
-"""The application: its errors, exit codes, talk and the options that commands share.
+"""The application: errors, exit codes, messages and the options that commands share.
 
-Data goes to `--out` or stdout, talk to stderr. Exit 0 done, 1 done but checks failed, 2 cannot run.
-Everything heavy is imported by the command that needs it, so that `--help` answers at once.
+Data goes to `--out` or stdout, messages to stderr. Exit status: 0 done, 1 checks failed, 2 cannot
+run.
+Each command imports its own heavy modules, so that `--help` answers at once.
 """
 
 import errno
@@ -31,26 +32,26 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s without a word, at first and at most
+FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s between messages, at first and at most
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
 Model = Annotated[
-    Path | None, typer.Option(help="A gap.json whose chain and effects stand for a preset.")
+    Path | None, typer.Option(help="Use the chain and effects of this gap.json, not a preset.")
 ]
 Hide = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); repeat."
+        metavar="EFFECT[:key=value,…]", help="Hide an effect (see `cartlab effects`); may repeat."
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
 
 
 def run() -> None:
-    """Run the command line; an error that a person can act on is one line and exit status 2."""
+    """Run the command line. An error that the user can fix is one line and exit status 2."""
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a console of few letters shows the others as \u…
+        if isinstance(stream, TextIOWrapper):  # a limited console shows other characters as \u…
             stream.reconfigure(errors="backslashreplace")
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
@@ -84,14 +85,14 @@ def _fail(message: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print to stderr: talk, never data; a name in it moves no cursor."""
+    """Print a message to stderr, without control characters that a name might contain."""
     typer.echo("".join(c if c.isprintable() or c == "\n" else " " for c in text), err=True)
 
 
 @contextmanager
 def progress_line() -> Iterator[Progress]:
-    """Show what is being done while it is done, and say so where Ctrl-C ends it."""
-    with ctrl_c_says(lambda: say("stopped; the same command begins anew")) as look:
+    """Show progress, and a message if Ctrl-C ends the work."""
+    with ctrl_c_says(lambda: say("stopped; repeat the command to start again")) as look:
         with _shown_line() as show:
 
             def look_and_show(text: str) -> None:
@@ -110,7 +111,7 @@ def _shown_line() -> Iterator[Progress]:
     from rich import progress
     from rich.console import Console
 
-    # A record may be called "[b]", which is no markup.
+    # A recording may be called "[b]"; that is not markup.
     text_column = progress.TextColumn("{task.description}", markup=False)
     columns = progress.SpinnerColumn(), text_column, progress.TimeElapsedColumn()
     with progress.Progress(*columns, console=Console(stderr=True), transient=True) as shown:
@@ -120,9 +121,9 @@ def _shown_line() -> Iterator[Progress]:
 
 @contextmanager
 def said_now_and_then() -> Iterator[Progress]:
-    """Say what is being done after 2 s, and again after twice as long each time, up to a minute.
+    """Print progress after 2 s, then at doubling intervals of at most a minute.
 
-    For a log, where no line can change: short work says nothing, long work never falls silent.
+    For a log, whose lines cannot change: short work prints nothing, long work keeps printing.
     """
     now, over, began = ["starting"], threading.Event(), time.monotonic()
 

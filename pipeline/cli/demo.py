@@ -1,4 +1,4 @@
-"""The whole job on what is shipped."""
+"""The command `demo`: the whole workflow on shipped examples."""
 
 import json
 import os
@@ -18,9 +18,9 @@ from pipeline.cli.reports import run_report
 
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option(help="Where to write.")] = Path("cartlab-demo"),
+    out: Annotated[Path, typer.Option(help="Output folder.")] = Path("cartlab-demo"),
 ) -> None:
-    """Run the whole job: a shipped example, a class of three, a bench that hides friction."""
+    """Try everything: an example report, a class of three, a bench with hidden friction."""
     from pipeline.output import named_folder
     from pipeline.report.draft.write import Files
     from pipeline.resources import EXAMPLES
@@ -30,40 +30,40 @@ def demo(
     with search_beside(out) as beside:
         say("1 of 3: the report of three carts")
         run_report(EXAMPLES / "three-cart", out=out / "report", files=Files())
-        say("2 of 3: a class, graded")
+        say("2 of 3: grading a class")
         teams = out / "class"
         if not teams.exists():
             write_class(teams)
             for mistake in PLANTED:
                 say(f"planted: {mistake}")
-        jobs = max(1, (os.cpu_count() or 1) - 1)  # a core is taken
+        jobs = max(1, (os.cpu_count() or 1) - 1)  # one core is busy with the search
         grade([teams], rubric=Path(PRESET), out=out / "grades", jobs=jobs)
-        say("3 of 3: what a bench hides")
+        say("3 of 3: the hidden effect of a bench")
         for line in found_beside(beside, out):
             say(line)
 
 
 @contextmanager
 def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """Look for what a bench hides meanwhile: it takes as long as all else together."""
+    """Search for a hidden effect in a second process; it takes as long as the rest together."""
     command = [sys.executable, "-P", "-m", "pipeline.cli.hidden_bench", str(out)]
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=none, text=True) as beside:
         try:
             yield beside
         finally:
-            beside.kill()  # where it has not ended
+            beside.kill()  # if it is still running
 
 
 def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:
-    """Return what is to be said of the bench; what the other process could not do is done here."""
+    """Return the messages about the bench; if the second process failed, search here."""
     with progress_line() as progress:
-        progress("looking for what the bench hides")
+        progress("looking for the hidden effect")
         assert beside.stdout is not None
-        told = beside.stdout.read()  # its stdin stays open: at the end of that it ends
+        told = beside.stdout.read()  # the process ends when its stdin is closed
         if beside.wait() == 0:
             return json.loads(told)
-        say(f"the process beside this one failed (status {beside.returncode}): once more, here")
+        say(f"the second process failed (status {beside.returncode}): searching again here")
         from pipeline.cli.hidden_bench import find_hidden
 
         return find_hidden(out, progress=progress)

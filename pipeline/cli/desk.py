@@ -15,29 +15,32 @@ def desk(
     folder: Annotated[
         Path | None,
         typer.Argument(
-            metavar="[FOLDER]", help="A submission, there or to be made; a grading's output."
+            metavar="[FOLDER]", help="A submission (existing or new), or the output of `grade`."
         ),
     ] = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="To serve at; 0: a free one.")] = 0,
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port to serve at; 0: any free one.")
+    ] = 0,
     browser: Annotated[
         bool, typer.Option("--browser/--no-browser", help="Open the page in a browser.")
     ] = True,
     host: Annotated[
-        str | None, typer.Option(help="Of a lab server: the address to listen at.")
+        str | None, typer.Option(help="For a lab server: the address to listen at.")
     ] = None,
     users: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="With --host: who may see what.")
+        Path | None,
+        typer.Option(metavar="FILE", help="With --host: the users and what each may see."),
     ] = None,
 ) -> None:
-    """Open the desk, a page in the browser of this computer, for what the other commands do."""
+    """Open the desk: all tasks of the other commands in a browser on this computer."""
     from pipeline.desk.app import DeskServer
     from pipeline.desk.ending import Ending
     from pipeline.garbage import collect_for_hours
 
     if (host is None) != (users is None):
-        raise ConfigError("--host and --users go together: who listens to others asks who they are")
+        raise ConfigError("--host and --users need each other: others may only enter by name")
     if folder is not None and users is not None:
-        raise ConfigError("with --users, the file says which folders there are")
+        raise ConfigError("with --users, the file lists the folders: give none here")
     collect_for_hours()
     server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
     with Ending(say=say) as ending, server:
@@ -46,4 +49,4 @@ def desk(
             webbrowser.open(server.url)
         while not ending.asked.wait(0.5):  # s
             if not server.runs:
-                raise ConfigError(f"the desk's server ended by itself ({ending.log} says more)")
+                raise ConfigError(f"the desk's server stopped unexpectedly (see {ending.log})")

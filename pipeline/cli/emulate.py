@@ -19,26 +19,27 @@ def emulate(
         str, typer.Option(help="socket://HOST:PORT (port 0: any that is free) or pty.")
     ] = "socket://127.0.0.1:0",
     speed: Annotated[
-        float, typer.Option(min=0.01, help="Times faster than real time, as far as it can.")
+        float, typer.Option(min=0.01, help="Speed relative to real time, if the computer keeps up.")
     ] = 1.0,
     period: Annotated[
-        float, typer.Option(min=0.5, max=20.0, help="True ms from line to line.")
+        float, typer.Option(min=0.5, max=20.0, help="True time between lines, ms.")
     ] = 1.0024,
     stock: Annotated[
-        bool, typer.Option("--stock", help="Know only what the stock bench does: d, g and z.")
+        bool, typer.Option("--stock", help="Support only the stock commands: d, g and z.")
     ] = False,
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KIND=RATE", help="Spoil the line: drop=0.01, delay@5, stuck=1@5, …; repeat."
+            metavar="KIND=RATE",
+            help="Disturb the line: drop=0.01, delay@5, …; may repeat.",
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of noise, hands and faults.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of noise, hands and faults.")] = 0,
     remote: Annotated[
         bool, typer.Option("--remote", help="Listen to other computers too.")
     ] = False,
 ) -> None:
-    """Run a virtual bench that speaks the serial protocol; its address is said on stderr."""
+    """Run a virtual bench that speaks the serial protocol; print its address on stderr."""
     from pipeline.simulated.emulator.announce import RunningBench, announced
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench

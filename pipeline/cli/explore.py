@@ -1,4 +1,4 @@
-"""The command that explores a bench by itself."""
+"""The command `explore`: record at a bench until the carts are known."""
 
 import sys
 from typing import Annotated
@@ -17,23 +17,23 @@ def explore(
     port: Annotated[str, typer.Option(help="The bench, as for `acquire`.")],
     until: Annotated[
         str,
-        typer.Option(metavar="GOAL", help='How well what is to be known: "zeta 1%", "all 0.1%".'),
+        typer.Option(metavar="GOAL", help='Accuracy to reach: "zeta 1%", "all 0.1%".'),
     ] = "all 1%",
     limit: Annotated[
-        str, typer.Option("--time", help="At the bench at most, rests included: 20min, 90s.")
+        str, typer.Option("--time", help="Time limit, including rests: 20min, 90s.")
     ] = "20min",
     yes: Annotated[
-        bool, typer.Option("--yes", help="Take what hands are asked to do as done.")
+        bool, typer.Option("--yes", help="Do not wait for manual steps to be confirmed.")
     ] = False,
     ask: Annotated[
-        bool, typer.Option("--ask", help="Ask before each recording that was chosen: v vetoes it.")
+        bool, typer.Option("--ask", help="Ask before each chosen recording; v vetoes it.")
     ] = False,
     web: Annotated[
         bool,
         typer.Option("--web", help="Show the session in a browser, with buttons to veto and stop."),
     ] = False,
 ) -> None:
-    """Record, identify, look for the gap, choose the next recording, again, until it is known."""
+    """Record, identify, analyse the gap and choose the next recording, until the goal is met."""
     from pipeline.bench.live.terminal import Terminal
     from pipeline.experiments.exploring.at_bench import explore_bench
     from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
@@ -41,7 +41,7 @@ def explore(
 
     goal, seconds = read_error_goal(until), read_time(limit)
     if ask and not sys.stdin.isatty():
-        raise ConfigError("--ask: nobody is at the keyboard")
+        raise ConfigError("--ask needs a terminal to answer at")
     with (
         Terminal(yes=yes) as terminal,
         saying_where(folder),
@@ -58,7 +58,7 @@ def explore(
                 vetoes=terminal.vetoes if ask else lambda recording: False,
             )
         except KeyboardInterrupt:
-            terminal.remark("stopped; what was recorded is in the submission")
+            terminal.remark("stopped; finished recordings are in the submission")
             raise typer.Exit(INTERRUPTED) from None
         terminal.remark(f"{len(turns)} turns; wrote {folder / NAME}")
     if not turns[-1].reached:

@@ -28,17 +28,17 @@ def grade(
         typer.Argument(metavar="PATH…", help="Submission folders, trees of them, or zip files."),
     ],
     rubric: Annotated[Path, typer.Option(metavar="FILE", help="A rubric, or a shipped name.")],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Where the gradebook is or will be.")],
-    jobs: Annotated[int, typer.Option(min=1, help="Processes; default: one a core.")] = (
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder with the gradebook.")],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; default: one per core.")] = (
         os.cpu_count() or 1
     ),
     cluster: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, tcp://HOST:PORT.")
     ] = None,
-    time_limit: Annotated[float, typer.Option(min=1, help="s for each submission.")] = 120.0,
-    memory_limit: Annotated[float, typer.Option(min=0.1, help="GB for each submission.")] = 1.0,
+    time_limit: Annotated[float, typer.Option(min=1, help="For each submission, s.")] = 120.0,
+    memory_limit: Annotated[float, typer.Option(min=0.1, help="For each submission, GB.")] = 1.0,
     figures: Annotated[
-        bool, typer.Option("--figures/--no-figures", help="Draw those of the feedback.")
+        bool, typer.Option("--figures/--no-figures", help="Draw the figures of the feedback.")
     ] = True,
     anonymous: Annotated[
         bool, typer.Option("--anonymous", help="Leave names out; anonymous-key.csv reveals them.")
@@ -48,10 +48,11 @@ def grade(
         typer.Option(metavar="URL", help="A database; default: gradebook.sqlite in --out."),
     ] = None,
     lateness: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="Who was late; see docs/batch.md.")
+        Path | None,
+        typer.Option(metavar="CSV", help="Table of late submissions; see docs/batch.md."),
     ] = None,
 ) -> None:
-    """Grade a class: gradebook, grades.csv, a page of the class, feedback for each student."""
+    """Grade a class: gradebook, grades.csv, class page, feedback for each student."""
     from pipeline.grading.batch.grade_class import Options, grade_class
 
     options = Options(
@@ -64,7 +65,7 @@ def grade(
         gradebook=gradebook,
         lateness=lateness,
     )
-    kept = f"stopped; what is graded is kept in {out}, and the same command goes on from there"
+    kept = f"stopped; finished grades are kept in {out}; repeat the command to continue"
     with ctrl_c_says(lambda: say(kept)) as look, _batch_progress() as show:
 
         def progress(done: int, total: int, last: str) -> None:
@@ -81,26 +82,26 @@ def _say_what_came_of_it(done: "Summary", *, out: Path, rubric: Path) -> None:
     for remark in done.remarks:
         say(remark)
     if done.changes:
-        say("since the class list before:")
+        say("changes since the last class list:")
         for change in done.changes[:20]:
             say(f"  {change}")
         if (more := len(done.changes) - 20) > 0:
-            say(f"  and {more} more; cartlab history tells each")
+            say(f"  and {more} more; see cartlab history")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
     if done.lacks_room:
         say(
-            f"the disk is full: for {done.lacks_room} of {done.total} there was no room to unpack "
-            f"them in {out}; make room there, then the same command grades them"
+            f"the disk is full: {done.lacks_room} of {done.total} submissions could not be "
+            f"unpacked in {out}; free some space there and repeat the command"
         )
     if len(done.failed) == done.total > 1 and not done.unsettled:
-        say(f"not one could be graded: is {rubric} the rubric for these submissions?")
+        say(f"no submission could be graded: is {rubric} the rubric for these submissions?")
     say(f"{done.counted}; wrote {out}")
 
 
 @contextmanager
 def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
-    """Show how many are done, and on a terminal how long the others will take."""
+    """Show how many are done and, on a terminal, the remaining time."""
     if not sys.stderr.isatty():
         with said_now_and_then() as show:
             yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
@@ -113,7 +114,7 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
 
 
 def columns() -> "tuple[ProgressColumn, ...]":
-    """Return what a line of progress has: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
+    """Return the parts of a progress line: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -134,7 +135,7 @@ def columns() -> "tuple[ProgressColumn, ...]":
 
 
 def counting(shown: "Progress") -> Callable[[int, int, str], None]:
-    """Return what tells a progress bar; what was known before says nothing of the speed."""
+    """Return the function that updates a progress bar; known grades do not count as speed."""
     task = shown.add_task("opening", total=None)
 
     def show(done: int, total: int, last: str) -> None:
@@ -153,7 +154,7 @@ Team = Annotated[
 ]
 Lab = Annotated[
     str | None,
-    typer.Option("--assignment", help="A rubric's name, where the gradebook has several."),
+    typer.Option("--assignment", help="Name of the rubric, if the gradebook has several."),
 ]
 
 
@@ -161,15 +162,17 @@ Lab = Annotated[
 def override(
     grades: Grades,
     team: Team,
-    criterion: Annotated[str, typer.Argument(metavar="CRITERION", help="Its id in the rubric.")],
+    criterion: Annotated[
+        str, typer.Argument(metavar="CRITERION", help="Criterion id in the rubric.")
+    ],
     points: Annotated[
-        str, typer.Argument(metavar="POINTS", help="A number, or auto: the automatic ones again.")
+        str, typer.Argument(metavar="POINTS", help="A number, or auto for the automatic points.")
     ],
     why: Annotated[str, typer.Option(help="The reason, which the student reads.")],
-    by: Annotated[str, typer.Option(metavar="NAME", help="Who says so.")],
+    by: Annotated[str, typer.Option(metavar="NAME", help="Who decides.")],
     assignment: Lab = None,
 ) -> None:
-    """Give a criterion points by hand, which every later grading keeps."""
+    """Give a criterion points by hand; every later grading keeps them."""
     from pipeline.grading.gradebook.override import read_points
     from pipeline.grading.publish.anonymous import meant
 
@@ -204,7 +207,7 @@ def remove(
         gone = [names.get(name, name) for name in book.remove(list(names))]
     say(f"no longer in the class: {', '.join(gone)}")
     if by_hand:
-        say(f"with points given by hand, which count no more: {', '.join(by_hand)}")
+        say(f"their points given by hand no longer count: {', '.join(by_hand)}")
 
 
 def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
@@ -221,7 +224,7 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
 @contextmanager
 def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
-    """Open a gradebook that is changed; its pages, where it has a folder of them, follow."""
+    """Open a gradebook for a change; if it is a folder, update its pages afterwards."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
@@ -268,9 +271,7 @@ def export_grades(
     lms: Annotated[Platform | None, typer.Option(help="The learning platform.")] = None,
     autograder: Annotated[
         Path | None,
-        typer.Option(
-            metavar="RUBRIC", help="In place of grades: a zip by which Gradescope grades itself."
-        ),
+        typer.Option(metavar="RUBRIC", help="Write an autograder zip for Gradescope instead."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -280,20 +281,21 @@ def export_grades(
         ),
     ] = None,
     roster: Annotated[
-        Path | None, typer.Option(metavar="CSV", help="The platform's own table, to be filled in.")
+        Path | None,
+        typer.Option(metavar="CSV", help="The table exported from the platform, to fill in."),
     ] = None,
     title: Annotated[
-        str | None, typer.Option(help="Of the assignment there; default: the rubric's.")
+        str | None, typer.Option(help="Title of the assignment there; default: the rubric's.")
     ] = None,
     assignment: Lab = None,
 ) -> None:
     """Write the class grades for import into a learning platform, or Gradescope's autograder."""
     if autograder is not None:
         if grades or lms or roster or title or assignment:
-            raise typer.BadParameter("--autograder takes a rubric and --out, nothing else")
+            raise typer.BadParameter("--autograder takes only a rubric and --out")
         return _export_autograder(autograder, out or Path("autograder.zip"))
     if grades is None or lms is None:
-        raise typer.BadParameter("name GRADES and --lms, or a rubric with --autograder")
+        raise typer.BadParameter("give GRADES and --lms, or --autograder with a rubric")
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.export import export
 
@@ -319,15 +321,15 @@ def _export_autograder(rubric: Path, out: Path) -> None:
 
 @app.command()
 def survey(
-    file: Annotated[Path, typer.Argument(metavar="CSV", help="Answers, a row a student.")],
+    file: Annotated[Path, typer.Argument(metavar="CSV", help="Answers, one row per student.")],
     as_json: AsJson = False,
 ) -> None:
-    """Make the tables of opinions and of knowledge and confidence from a questionnaire."""
+    """Make tables of opinions, knowledge and confidence from a questionnaire."""
     from pipeline.grading.publish.survey import read_survey, survey_dict, survey_text
 
     found = read_survey(file)
     if found.left_out:
-        say(f"left out, no question of either table: {', '.join(found.left_out)}")
+        say(f"left out, because no table has these questions: {', '.join(found.left_out)}")
     if as_json:
         typer.echo(json.dumps(survey_dict(found), indent=1, ensure_ascii=False))
     else:
@@ -339,7 +341,7 @@ def check_rubric(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A rubric, or a shipped name.")],
     as_json: AsJson = False,
 ) -> None:
-    """Validate a rubric and show what it asks of a submission."""
+    """Validate a rubric and show what it requires."""
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.rubric_text import rubric_dict, rubric_text
 

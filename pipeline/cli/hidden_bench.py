@@ -1,4 +1,4 @@
-"""The demonstration's bench: friction hidden in it, and found; `python -m` makes it apart."""
+"""The bench of `demo`: hide friction and find it; run with `python -m` in a second process."""
 
 import json
 import os
@@ -11,7 +11,7 @@ from pipeline.words.progress import Progress, silent
 
 
 def find_hidden(out: Path, *, progress: Progress) -> list[str]:
-    """Write a bench that hides friction and what explains it; return what is to be said."""
+    """Write a bench with hidden friction and its gap analysis; return the messages to print."""
     from pipeline.simulated.hidden import prepare_bench
     from pipeline.simulated.submission import write_submission
 
@@ -23,8 +23,8 @@ def find_hidden(out: Path, *, progress: Progress) -> list[str]:
 
 
 def _end_with_the_first() -> None:
-    os.read(0, 1)  # returns where whoever began this is gone, however it ended
-    os._exit(1)  # whatever is under way: files are written whole or not at all
+    os.read(0, 1)  # returns when the process that started this one is gone
+    os._exit(1)  # safe at any time: files are written whole or not at all
 
 
 if __name__ == "__main__":

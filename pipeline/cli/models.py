@@ -17,7 +17,7 @@ def simulate(
     hide: Hide = None,
     seed: Annotated[int, typer.Option(min=0, help="Random seed: same seed, same bytes.")] = 0,
     reported: Annotated[
-        bool, typer.Option("--reported", help="Add what an honest student would report.")
+        bool, typer.Option("--reported", help="Add the numbers an honest student would report.")
     ] = False,
 ) -> None:
     """Write a synthetic submission: decays, steps, sine dwells, a sweep, a closed-loop step."""
@@ -41,11 +41,11 @@ def effects(
         str | None, typer.Argument(metavar="[NAME]", help="One effect; default: all.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Write effects.html here, with pictures of each.")
+        Path | None, typer.Option(help="Write effects.html, with pictures, to this folder.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """List what a bench may do beyond the linear chain: law, fingerprint, what decides."""
+    """List the effects beyond the linear chain: law, fingerprint, deciding experiment."""
     from pipeline.plant.nonlinear.effects import CATALOGUE, find_effect
     from pipeline.report.effects.catalogue import catalogue_data, catalogue_text
 

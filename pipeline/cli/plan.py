@@ -1,4 +1,4 @@
-"""The command that proposes what to record."""
+"""The command `plan`: propose what to record."""
 
 import json
 from typing import Annotated
@@ -13,23 +13,23 @@ from pipeline.errors import ConfigError
 def plan(
     folder: Folder,
     stock: Annotated[
-        bool, typer.Option("--stock", help="The bench knows the stock commands only: no chirp.")
+        bool, typer.Option("--stock", help="The bench has only the stock commands (no chirp).")
     ] = False,
     number: Annotated[
         int | None,
-        typer.Option("--next", min=1, max=20, help="Choose so many by what they will tell."),
+        typer.Option("--next", min=1, max=20, help="Choose this many, the most informative first."),
     ] = None,
     goal: Annotated[
         str | None,
         typer.Option(
             "--for",
-            help="With --next: what is to be known better: a parameter (zeta_2), `design` (the "
-            "predicted overshoot), `worst`, `mean`, `volume`; `gap`: which explanation is right.",
+            help="With --next: what to improve: a parameter (zeta_2), `design` (the "
+            "predicted overshoot), `worst`, `mean`, `volume`, or `gap` (the right explanation).",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Propose the experiments to record: write plan.toml, or add to it what the data allow."""
+    """Propose the experiments to record: write plan.toml, or add to it."""
     from pipeline.bench.host.raw import known_commands
     from pipeline.experiments.goal import WORST
     from pipeline.experiments.next_recordings import plan_next
@@ -39,7 +39,7 @@ def plan(
     from pipeline.words.text import with_symbols
 
     if goal and number is None:
-        raise ConfigError("--for says what the next experiments are for: it goes with --next N")
+        raise ConfigError("--for states the goal of the next experiments, so it needs --next N")
     submission = load_submission(folder)
     before = {recording.id for recording in current_plan(submission).recordings}
     with progress_line() as progress:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @app.command()
 def new(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to make.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="The folder to create.")],
     carts: Annotated[int, typer.Option(min=1, max=4, help="How many carts the bench has.")] = 1,
 ) -> None:
     """Write a commented submission folder to fill in."""
@@ -40,7 +40,7 @@ def inspect(
 ) -> None:
     """Show what data files hold: format, columns, rate, duration, kind, problems.
 
-    Of a folder (its data/, where it has one) a table with one line a file.
+    For a folder (its data/, if there is one) it shows a table with one line per file.
     """
     from pipeline.ingest.folder import data_files_in, files_not_read, not_read_notes
     from pipeline.ingest.inspect import (
@@ -59,9 +59,9 @@ def inspect(
         found = data_files_in(folder)
         listed += found
         if not found:
-            unreadable.append(f"{folder}: no data files in it")
+            unreadable.append(f"{folder}: contains no data files")
     with progress_line() as progress:
-        for file in listed:  # one broken file does not hide the others
+        for file in listed:  # one broken file must not hide the others
             progress(f"reading {file.name}")
             try:
                 inspections.append(inspect_file(file))
@@ -90,7 +90,7 @@ def inspect(
 
 @app.command()
 def fill(folder: Folder, as_json: AsJson = False) -> None:
-    """Find out what the files in DIR/data are and write their tables into submission.toml."""
+    """Find out what the files in DIR/data are and add their entries to submission.toml."""
     from pipeline.identify.springs import fill as fill_folder
     from pipeline.ingest.fill import format_found, format_passed_over
 
@@ -106,11 +106,11 @@ def fill(folder: Folder, as_json: AsJson = False) -> None:
         typer.echo(format_found(found))
     left = [f for f in found if f.state in ("unknown", "broken", "missing", "refused")]
     did = "nothing to add to" if toml.read_bytes() == before else "wrote"
-    say(f"{did} {toml}: springs, units and what is marked unsure are yours")
+    say(f"{did} {toml}: check springs, units and everything marked unsure")
     for message in (*filled.doubts, *format_passed_over(found)):
         say(f"cartlab: {message}")
     if left:
-        say(f"cartlab: of no use yet: {', '.join(f.file for f in left)}")
+        say(f"cartlab: not used yet: {', '.join(f.file for f in left)}")
         raise typer.Exit(1)
 
 
@@ -121,14 +121,14 @@ def report(
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     compare: Annotated[
         Path | None,
-        typer.Option(metavar="RESULTS", help="An earlier results.json: say what changed."),
+        typer.Option(metavar="RESULTS", help="An earlier results.json: show what changed."),
     ] = None,
     tables: Annotated[
         bool, typer.Option("--tables", help="Write tables/*.csv and, for MATLAB, results.mat too.")
     ] = False,
     plots: Annotated[
         bool,
-        typer.Option("--plots", help="Write compare.html too: runs and models over each other."),
+        typer.Option("--plots", help="Write compare.html too: plots of all runs and models."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -152,7 +152,7 @@ def run_report(
     files: "Files",
     compare: Path | None = None,
 ) -> "Analysis":
-    """Write the report of a submission and say in a few lines what it found."""
+    """Write the report of a submission and print a short summary."""
     from pipeline.output import named_folder, own_folder
     from pipeline.report.draft.changes import changes_line
     from pipeline.report.draft.write import make_report
@@ -184,9 +184,9 @@ def _unreadable(analysis: "Analysis") -> list[str]:
 def _comparison(
     earlier: Path | None, submission: "Submission"
 ) -> "Callable[[Analysis], DraftChanges | None]":
-    """Return what compares an analysis with an earlier draft.
+    """Return a function that compares an analysis with an earlier draft.
 
-    The draft is read at once; one that cannot be compared is refused before anything is analysed.
+    The draft is read at once: if it cannot be compared, it is refused before the analysis.
     """
     if earlier is None:
         return lambda analysis: None
@@ -202,13 +202,15 @@ def check(
     folder: Folder,
     rubric: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Whose tolerances hold: a rubric, or a shipped name."),
+        typer.Option(
+            metavar="FILE", help="The rubric that sets the tolerances: a file or shipped name."
+        ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Say which of your numbers disagree with your recordings; asked again, where to look.
+    """List your numbers that disagree with your recordings; asked again, say where to look.
 
-    It never says the value. How often it was asked is in DIR/checks.jsonl, which is handed in.
+    It never shows the right value. DIR/checks.jsonl, part of your submission, counts the checks.
     """
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.self_check.check import check_numbers
@@ -232,13 +234,13 @@ def solution(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Says what is accepted; default: the shipped one for so many carts.",
+            help="The rubric that sets the accepted ranges; default: the shipped one.",
         ),
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Write the instructor's reference: derivations, numbers put in, what to expect."""
+    """Write the instructor's solution: derivations with numbers and expected values."""
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.output import named_folder, own_folder
     from pipeline.report.solution.write import make_solution
@@ -250,9 +252,9 @@ def solution(
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
     failed = [f"cartlab: {with_symbols(check.message)}" for check in analysis.failed_checks]
-    for line in failed:  # what could not be read is among them
+    for line in failed:  # unreadable files are among them
         say(line)
-    doubtful = ", doubtful as the checks above failed" if analysis.failed_checks else ""
+    doubtful = ", doubtful because the checks above failed" if analysis.failed_checks else ""
     say(_wrote(out, "solution", pdf=pdf) + doubtful)
     if as_json:
         typer.echo(text, nl=False)
@@ -269,8 +271,8 @@ def gap(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Of the search; past it, the best answer so far, said as such. Without it the "
-            "search ends by itself, and the answer is the same on every machine.",
+            help="Time limit of the search; the best answer so far is then marked as such. "
+            "Without a limit the answer is the same on every computer.",
         ),
     ] = None,
     pdf: Annotated[bool, typer.Option("--pdf/--no-pdf", help="Write the PDF too.")] = True,
@@ -282,7 +284,7 @@ def gap(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Find what the linear model leaves out, name it, and show the gap shrink on held-out runs."""
+    """Find and name what the linear model leaves out, and test it on held-out runs."""
     with progress_line() as progress:
         text, told = explain(
             folder, out=out, budget=budget, pdf=pdf, model=model, progress=progress
@@ -318,7 +320,7 @@ def explain(
     from pipeline.gap.explain import investigate  # … simulator
 
     found = investigate(analysis, budget=budget, progress=progress)
-    progress("weighing what to record next")
+    progress("choosing the next recording")
     found = propose_for(found, submission)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "gap.json", text := json_text(found))

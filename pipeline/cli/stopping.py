@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command, whatever a library makes of it."""
+"""Make Ctrl-C end a command, even inside libraries that handle it badly."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -11,11 +11,11 @@ from pipeline.cli import INTERRUPTED
 
 @contextmanager
 def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Yield a look that ends the work where Ctrl-C was pressed; call `say` where that ended it.
+    """Yield `look`, which ends the work if Ctrl-C was pressed; call `say` when that happens.
 
-    A library that is interrupted may end in an error of its own. And Python itself drops the
-    interrupt where it falls into the callback of a weak reference, as it may at any import: then
-    the next look ends the work.
+    An interrupted library may raise its own error. Python itself drops an interrupt that arrives
+    in the callback of a weak reference, as can happen during any import. Then the next call of
+    `look` ends the work.
     """
     pressed = False
 

@@ -91,7 +91,7 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     yield "event: end\ndata: \n\n"
 
 
-# Address, method, who answers. What changes anything is a POST of a form that needs no script.
+# Address, method, who answers. Every change is a POST of a form that works without scripts.
 # Streams of news are coroutines and take no thread: those that answer would soon be used up.
 ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/", "GET", show_home),
@@ -201,8 +201,8 @@ class DeskServer:
             listener = socket.create_server((host, port))
         except OSError as error:
             raise ConfigError(
-                f"the desk cannot listen at port {port} of {host} ({error.strerror}): name another "
-                "with --port, or an IPv4 address of this computer with --host"
+                f"the desk cannot listen at port {port} of {host} ({error.strerror}): choose "
+                f"another with --port, or give an IPv4 address of this computer with --host"
             ) from None
         port = listener.getsockname()[1]
         self.url = f"http://{host}:{port}/"
@@ -282,7 +282,7 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
 
 
 def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:
-    """Return what tells of an address that is none, and of a fault of our own."""
+    """Return the handlers for unknown addresses and for internal errors."""
 
     def answer(request: Request, error: Exception) -> Response:
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())

@@ -66,7 +66,7 @@ class Desk:
     benches: Benches = field(default_factory=Benches)
     books: Books = field(default_factory=Books)
     said: dict[tuple[str, str], list[Said]] = field(default_factory=dict)
-    # What each zip that was downloaded was made of.
+    # The content of each downloaded zip.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
@@ -133,7 +133,7 @@ class Ask:
 
     @property
     def place(self) -> Place | None:
-        """What the address is about: a submission, a gradebook, None where there is none of theirs.
+        """The submission or gradebook of the address; None if it is not one of the user's.
 
         Of others' places there is no address.
         """
@@ -159,7 +159,7 @@ class Ask:
     def place_or_404(self) -> Place:
         """Return the place that the address is about, a folder or a database, else refuse."""
         if self.place is None:
-            raise HTTPException(404, "there is nothing here that is yours to see")
+            raise HTTPException(404, "you have no access to anything here")
         return self.place
 
     def require_place(self) -> None:
@@ -200,7 +200,7 @@ class Ask:
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """Whose room the address is in, and which; perhaps a place on its pages."""
+        """The room of the address, perhaps with a place on its pages."""
         return self.user.name, self.here + place
 
     @property

@@ -69,7 +69,7 @@ class BenchSession(ShownSession):
             return 503  # its process ends
 
     def stop(self) -> None:
-        """Have it end: the bench is told first."""
+        """End it, after stopping the bench."""
         with suppress(OSError, ValueError):  # it has ended, its pipe is closed
             self.heed("stop", 0)
 
@@ -165,7 +165,7 @@ class Benches:
         """Have all of them end, and wait until their benches have been told."""
         for session in self._sessions.values():
             session.stop()
-        # s for the bench to be told and what came to be saved, on a busy machine
+        # s to stop the bench and save the data, on a busy machine
         by = time.monotonic() + 20.0
         for session in self._sessions.values():
             session.close(by=by)

@@ -29,7 +29,7 @@ class Class:
 
     @cached_property
     def names(self) -> Mapping[str, str] | None:
-        """What stands in for the name of each submission, None where names are shown."""
+        """The pseudonym of each submission, None if names are shown."""
         if not self.rubric.anonymous:
             return None
         return pseudonyms({one.submission: one.first_key for one in self.now.listings})
@@ -45,7 +45,7 @@ class Class:
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """Who was graded and has not all points of a criterion; one never judged has none."""
+        """The graded submissions without full points of a criterion; an unjudged one has 0."""
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
@@ -81,11 +81,11 @@ class Books:
 
         Raises
         ------
-        ConfigError : there is none.
+        ConfigError : the gradebook is missing.
         """
         with self._lock:
             if isinstance(place, Path) and not place.is_dir():
-                raise ConfigError(f"{place.name}: there is no such folder any more")
+                raise ConfigError(f"{place.name}: this folder no longer exists")
             if place not in self._books:
                 self._books[place] = RequestBook(place)
             return self._books[place]

@@ -67,7 +67,7 @@ def list_folders(root: Path, inside: str) -> FolderList:
     root = root.resolve()
     folder = read_path(inside or ".", wanted="choose a folder", inside=root)
     if not folder.is_dir() or not _is_shown(folder, root):
-        raise ConfigError(f"{inside}: is no folder of {root}, or a hidden one")
+        raise ConfigError(f"{inside}: not a folder in {root}, or a hidden one")
     names, more = _list_names(folder)
     paths = dict.fromkeys((folder / name).resolve() for name in names)
     kept = [path for path in paths if _is_shown(path, root)]
@@ -90,7 +90,7 @@ def _list_names(folder: Path) -> tuple[list[str], bool]:
         with os.scandir(folder) as entries:
             names = [e.name for e in entries if not _is_hidden(e.name) and _is_folder(e)]
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be looked into ({error.strerror})") from None
+        raise ConfigError(f"{folder}: cannot be opened ({error.strerror})") from None
     names.sort(key=str.casefold)
     return names[:_LOOKED_AT], len(names) > _LOOKED_AT
 

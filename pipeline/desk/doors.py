@@ -52,10 +52,10 @@ class SecretDoor:
         """Return who asks, or the answer to who may not."""
         known = self._knows(headers.get("cookie", "").encode("latin-1"))
         if not _is_same(scope["path"].strip("/").encode(), self.secret):
-            why = "the desk is opened by the address that cartlab printed when it started"
+            why = "open the desk with the address that cartlab printed when it started"
             return {"user": self._user} if known else refuse(why)
         if self._opened and not known:
-            return refuse("this address was opened already; start `cartlab desk` again")
+            return refuse("this address was used already; start `cartlab desk` again")
         self._opened = True
         let_in(scope)
         answer = RedirectResponse(
@@ -88,7 +88,7 @@ class ProxyDoor:
         # Whoever is logged in where the proxy runs has its address, and not its secret.
         known = len(sent) == 1 and _is_same(sent[0].encode("latin-1"), self._proxy.secret)
         if not known or ip_address(scope["client"][0]) != ip_address(self._proxy.address):
-            return refuse("ask by the address of the laboratory")
+            return refuse("use the address of the lab's server")
         names = headers.getlist(self._proxy.header)
         listed = [name for name in _read_name(names[0]) if name in self._users] if names else []
         if len(names) != 1 or not listed:
@@ -141,7 +141,7 @@ def limit_bodies(app: ASGIApp, *, uploads: int) -> ASGIApp:
 
     async def limited(scope: Scope, receive: Receive, send: Send) -> None:
         most = left = uploads if scope["path"].endswith("/files") else MOST_FORM
-        too_much = f"too much at once: at most {most:,} bytes"
+        too_much = f"too much data in one request: at most {most:,} bytes"
 
         async def count() -> Message:
             """Read on, whatever the request says of its length itself."""

@@ -49,7 +49,7 @@ class Ending:
         assert self._watch.stdin is not None
         faulthandler.enable(file=self._watch.stdin)
         threading.excepthook = self._in_thread
-        # What a program can catch: Ctrl-C, kill, a terminal or session that closes.
+        # Signals that a program can catch: Ctrl-C, kill, a closed terminal or session.
         for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
             number = getattr(signal, name, None)
             # nohup has a program ignore SIGHUP; it stays ignored.

@@ -1,4 +1,4 @@
-"""What the instructor's room has its worker do: benches with hidden effects, and their solutions.
+"""Tasks of the instructor's room: benches with hidden effects, and their solutions.
 
 A bench is what a form says of one: `preset`, or the `m`, `c` and `k` of an own chain as typed.
 """
@@ -21,7 +21,7 @@ from pipeline.words.progress import Progress
 
 SLIDE = 1.0  # decades that a slider goes to each side of the usual size
 
-_OWN = "own chain"
+_OWN = "custom chain"
 
 
 def look_at_exercise(

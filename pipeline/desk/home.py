@@ -60,7 +60,7 @@ def open_place(ask: Ask) -> Response:
     if "://" in typed:
         ask.desk.books.book(typed)
         return RedirectResponse(_add_place(typed, ask.user.gradebooks, "grades"), status_code=303)
-    address = enter(ask.user, read_path(typed, wanted="name a folder"))
+    address = enter(ask.user, read_path(typed, wanted="enter a folder"))
     if to in _ROOMS and address.startswith("/student/"):
         address = address.replace("student", to, 1)
     elif to == "compare" and address.startswith("/student/"):
@@ -79,15 +79,15 @@ def enter(user: User, folder: Path) -> str:
     if folder.name == FILE and folder.is_file():
         folder = folder.parent
     if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"{folder}: is a file; name the folder that it lies in")
+        raise ConfigError(f"{folder}: this is a file; enter its folder")
     if (folder / FILE).is_file():
         return _add_place(folder, user.gradebooks, "grades")
     if not folder.parent.is_dir():
-        raise ConfigError(f"{folder}: there is no folder {folder.parent} to make it in")
+        raise ConfigError(f"{folder}: the folder {folder.parent} does not exist")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"{folder}: cannot be made ({error.strerror})") from None
+        raise ConfigError(f"{folder}: cannot be created ({error.strerror})") from None
     return _add_place(folder, user.folders, "student")
 
 

@@ -86,8 +86,8 @@ class Jobs:
             if before and not before.over:
                 if before.asked != asked:
                     raise Busy(
-                        f"{before.title} is under way in this folder: wait for its end or stop it "
-                        "first"
+                        f"{before.title} is running in this folder: wait until it ends, or stop "
+                        "it first"
                     )
                 return before
             job = self._jobs[place] = Job(title=title, place=place, asked=asked)
@@ -129,8 +129,8 @@ class Jobs:
         except Failed as error:
             job.tell("stopped" if job.stop.is_set() else "failed", str(error))
         except OSError as error:
-            job.tell("failed", f"no process could be started for it ({error.strerror or error})")
-        except BaseException as error:  # who waits for it is told; the log has the rest
+            job.tell("failed", f"its process could not be started ({error.strerror or error})")
+        except BaseException as error:  # report it to the waiting page; the log has the rest
             job.tell("failed", f"the desk itself failed ({type(error).__name__}: {error})")
             raise
         finally:
@@ -200,7 +200,7 @@ class WorkerPool:
             new = threading.Semaphore(_WAITING), threading.Lock()
             waiting, one = self._folders.setdefault(folder, new)
         if not waiting.acquire(blocking=False):
-            raise Busy("a file of this folder is still being looked at; try again in a minute")
+            raise Busy("a file of this folder is still being read; try again in a minute")
         try:
             with one:
                 yield

@@ -7,7 +7,11 @@ from pipeline.grading.gradebook.history import to_the_second
 from pipeline.grading.gradebook.requests import RequestEvent, hide_people
 from pipeline.grading.words import points_text
 
-_HEADS = {"asked": "asked", "answered": "answered", "reopened": "reopened it: ask once more"}
+_HEADS = {
+    "asked": "asked",
+    "answered": "answered",
+    "reopened": "reopened it: you may ask once more",
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +30,7 @@ def describe_steps(
 
     Parameters
     ----------
-    team : the name that stands in for a submission whose students may not be named.
+    team : the pseudonym of a submission whose students may not be named.
     submission : the real name then, which is hidden as the students' are.
     """
     shown = []
@@ -44,5 +48,5 @@ def describe_steps(
 
 def _describe_points(points: float | None) -> str:
     if points is None:
-        return "the points stay"
+        return "points unchanged"
     return f"{points_text(points)} {'point' if points == 1 else 'points'}"

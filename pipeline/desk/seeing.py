@@ -19,7 +19,7 @@ _SHOWS_NONE = frozenset(
 _TELLS_NONE = frozenset({"check_numbers"})  # tasks whose stages and end show no computed number
 REFUSED = (
     "in this lab you find the numbers yourself: the report is for your TA. "
-    "The check tells which of your numbers disagree with your recordings"
+    "The check shows which of your numbers disagree with your recordings"
 )
 
 

@@ -1,4 +1,4 @@
-"""What the desk has another process do, by name: files of strangers are read nowhere else."""
+"""Tasks that the desk runs in another process; only there are files of strangers read."""
 
 import json
 import os
@@ -54,13 +54,13 @@ def look_at_file(
 ) -> dict[str, Any]:
     """Return what a data file is, with a thumbnail; `columns` as `submission.toml` states them."""
     if leaves(Path(folder), file):
-        raise SubmissionError(f"{file}: leaves the folder")
+        raise SubmissionError(f"{file}: is outside the folder")
     found = look_at(Path(folder), file, columns=columns)
     return {**_describe(found), "lines": draw_thumbnail(Path(folder), found, columns=columns)}
 
 
 def list_files(folder: str, *, progress: Progress) -> list[str]:
-    """Return the data files that there are."""
+    """Return the existing data files."""
     return data_files(Path(folder))
 
 
@@ -272,7 +272,7 @@ def regrade_class(
 
     try:
         done = grade_class(
-            [read_path(path, wanted="name the submissions") for path in paths],
+            [read_path(path, wanted="enter the submissions") for path in paths],
             rubric_file=Path(rubric),
             out=Path(folder),
             options=Options(
@@ -284,7 +284,9 @@ def regrade_class(
         )
     except ConfigError:
         if anonymous:
-            raise ConfigError("it could not begin; cartlab grade in a terminal says why") from None
+            raise ConfigError(
+                "it could not start; run cartlab grade in a terminal to see why"
+            ) from None
         raise
     return "; ".join([done.counted, *(() if anonymous else done.remarks)])
 

@@ -25,11 +25,11 @@ def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
         path = (inside / typed if inside else Path(typed).expanduser()).resolve()
         path.exists()
     except RuntimeError:
-        raise ConfigError(f"{typed}: this computer knows nobody of that name") from None
-    except OSError as error:  # a name too long, a folder that is closed to whoever runs the desk
+        raise ConfigError(f"{typed}: this computer has no such user") from None
+    except OSError as error:  # a name that is too long, or a folder without access
         raise ConfigError(f"{_clip(typed, most=60)}: {error.strerror}; {wanted}") from None
     if inside and not path.is_relative_to(inside):
-        raise ConfigError(f"{typed}: leads out of {inside.name}, where yours is made")
+        raise ConfigError(f"{typed}: is outside {inside.name}, where your files are written")
     return path
 
 
@@ -38,7 +38,7 @@ def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
 
     Raises
     ------
-    ConfigError : it is none, or outside of `least` to `most`.
+    ConfigError : it is not a whole number from `least` to `most`.
     """
     number = typed if typed.isascii() and typed.isdecimal() else ""
     # However many digits it has, no more are read than the largest has.
@@ -51,11 +51,11 @@ def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
 def read_number(
     typed: str, *, name: str, above: float = -math.inf, below: float = math.inf
 ) -> float:
-    """Return a number that was typed, with a point or a comma; 0 where nothing was.
+    """Return a typed number, with a point or a comma; 0 for an empty field.
 
     Raises
     ------
-    ConfigError : it is none, or not between `above` and `below`.
+    ConfigError : it is not a number between `above` and `below`.
     """
     try:
         value = float(typed.replace(",", ".") or 0)

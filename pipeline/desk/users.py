@@ -87,7 +87,7 @@ class User:
 
     @property
     def sees_places(self) -> bool:
-        """Whether they are told where on this computer a folder lies."""
+        """Return whether they may see the path of a folder on this computer."""
         return self.role not in ("student", "ta")
 
     def told(self, text: str) -> str:
@@ -202,13 +202,15 @@ def _refuse_open_to_all(path: Path) -> None:
     """Refuse a file that everybody may read, or change, or put another in the place of."""
     folder = path.resolve().parent
     mode, above = path.stat().st_mode, folder.stat().st_mode
-    everybody = "everybody on this computer may"
+    everybody = "everybody on this computer can"
     if mode & stat.S_IROTH:
-        raise ConfigError(f"{path}: {everybody} read it, and the proxy's secret with it: chmod o-r")
+        raise ConfigError(
+            f"{path}: {everybody} read it, including the proxy's secret: run chmod o-r on it"
+        )
     if mode & stat.S_IWOTH:
-        raise ConfigError(f"{path}: {everybody} write it, and give themselves any role: chmod o-w")
+        raise ConfigError(f"{path}: {everybody} write it and take any role: run chmod o-w on it")
     if above & stat.S_IWOTH and not above & stat.S_ISVTX:  # in /tmp only the owner may
-        raise ConfigError(f"{folder}: {everybody} put another {path.name} there: chmod o-w")
+        raise ConfigError(f"{folder}: {everybody} replace {path.name} there: run chmod o-w on it")
 
 
 def _find_wrong(found: Users, root: Path) -> Iterator[str]:
@@ -219,23 +221,23 @@ def _find_wrong(found: Users, root: Path) -> Iterator[str]:
     except ValueError:
         yield f"proxy.address: expected an address such as 127.0.0.1, found {proxy.address!r}"
     if proxy.header.lower() == proxy.secret_header.lower():
-        yield "proxy.secret_header: expected another header than that of the name"
+        yield "proxy.secret_header: expected a header other than that of the name"
     for user in found.users:
         where = f"users: {user.name!r}"
         if names.count(user.name) > 1:
-            yield f"{where} is there twice"
+            yield f"{where} is listed twice"
         # A proxy may write a name in either; nobody is taken for another.
         if (other := user.name.encode().decode("latin-1")) != user.name and other in names:
-            yield f"{where} in UTF-8 is {other!r} in Latin-1, which is there too"
+            yield f"{where} in UTF-8 equals {other!r} in Latin-1, which is also listed"
         for key, room in _ROOM_OF.items():
             if getattr(user, key) and room not in _ROOMS[user.role]:
-                yield f"{where}: a {user.role} has no {key}; take it away, or give another role"
+                yield f"{where}: a {user.role} cannot have {key}; remove it, or change the role"
         if user.rubric and user.role != "student":
-            yield f"{where}: a {user.role} has no rubric; take it away, or give another role"
+            yield f"{where}: a {user.role} cannot have a rubric; remove it, or change the role"
         books = [own.gradebook for own in user.grades]
         for place in (*user.folders, *user.gradebooks, *books, user.workshop):
             if "://" not in place and not (root / place).is_dir():
-                yield f"{where}: there is no folder {root / place}"
+                yield f"{where}: the folder {root / place} does not exist"
         for own in user.grades:
             if "://" in own.gradebook and not own.assignment:
                 yield (

@@ -29,11 +29,11 @@ def main() -> None:
             _say(line)
             crashed = True
     if not said:
-        why = "was killed: by kill -9, by a system short of memory, or by a library that ended it"
+        why = "was killed: by kill -9, by the system for lack of memory, or by a library"
         if crashed:
             why = "crashed: the lines above say where"
         _log(path, process, why)
-        _say(f"cartlab: the desk {why}. Files are whole: start it again. The log: {path}")
+        _say(f"cartlab: the desk {why}. Files are intact: start it again. The log: {path}")
 
 
 def _log(path: str, process: str, line: str) -> None:

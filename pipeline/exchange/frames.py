@@ -1,6 +1,6 @@
 """The results of an analysis as pandas tables, their columns named as in `results.json`.
 
-A column's unit, if it has one, is in `frame.attrs["units"]`.
+Units of columns are in `frame.attrs["units"]`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 def parameters(analysis: Analysis) -> "pd.DataFrame":
     """Return initial and final estimates, one row a parameter; the index is its name."""
     frame = _frame(_rows(analysis.rows), keys(ParameterRow), analysis=analysis)
-    frame["consistent"] = frame["consistent"].astype("boolean")  # None where there is none
+    frame["consistent"] = frame["consistent"].astype("boolean")  # missing values stay missing
     return frame.set_axis(frame["name"].to_list(), axis="index")
 
 

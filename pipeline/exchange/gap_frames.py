@@ -1,4 +1,4 @@
-"""What the linear carts leave out as pandas tables, their columns named as in `gap.json`."""
+"""The gap analysis as pandas tables, with columns named as in `gap.json`."""
 
 from typing import TYPE_CHECKING
 

@@ -1,4 +1,4 @@
-"""Tables that platforms and people bring as CSV."""
+"""Read CSV tables from platforms and people."""
 
 import csv
 import io
@@ -15,14 +15,14 @@ _MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # no class and no questionnaire is l
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """Return a CSV as texts under its heading, the lines that its rows end on as index.
+    """Return the cells of a CSV as text, indexed by the line on which each row ends.
 
-    Separators are commas, semicolons or tabs; rows without a text are left out, short ones filled
-    up, and cells beyond the heading cut off.
+    Separators are commas, semicolons or tabs. Empty rows are left out, short rows are padded, and
+    cells beyond the heading are dropped.
 
     Raises
     ------
-    ConfigError : it is no such table, or too large.
+    ConfigError : it is not such a table, or too large.
     """
     import pandas as pd
 
@@ -35,7 +35,7 @@ def read_table(path: Path) -> "pd.DataFrame":
     except UnicodeDecodeError:
         raise ConfigError(f"{path.name}: is not UTF-8 text; save it as CSV UTF-8") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
-    # Not pandas' reader: it cannot tell the line of a row, which a message has to.
+    # Not pandas' reader: it does not report the line of a row, which messages need.
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     head: list[str] = []
     rows: dict[int, list[str]] = {}
@@ -52,5 +52,5 @@ def read_table(path: Path) -> "pd.DataFrame":
                     f"{path.name}: has more than {_MOST_COLUMNS} columns or {_MOST_ROWS} rows"
                 )
     except csv.Error as error:
-        raise ConfigError(f"{path.name} line {reader.line_num}: no table: {error}") from None
+        raise ConfigError(f"{path.name} line {reader.line_num}: not a table: {error}") from None
     return pd.DataFrame(list(rows.values()), index=list(rows), columns=head, dtype=object)

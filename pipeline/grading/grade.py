@@ -1,4 +1,4 @@
-"""The grade of a submission as it is made, stored and published: `grade.json`."""
+"""The grade of a submission: `grade.json`."""
 
 from typing import Annotated, Any, Literal, get_args
 
@@ -34,13 +34,13 @@ Values = dict[str, Any]  # numbers, texts, or lists of them
 
 
 class GradeTable(BaseModel):
-    """A table of the file; unknown keys are let through, as later versions may add some."""
+    """A table of the file; unknown keys are allowed, because later versions may add some."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Criterion(GradeTable):
-    """One line of the grade; `skip` where what it builds on failed, or nothing could be judged."""
+    """One line of the grade; `skip` if a required criterion failed or nothing could be judged."""
 
     id: str
     title: str
@@ -53,19 +53,19 @@ class Criterion(GradeTable):
 
 
 class Flag(GradeTable):
-    """A named mistake, where, and the evidence for it."""
+    """A named mistake: its place and the evidence."""
 
     code: Code
     parameters: Annotated[
         tuple[str, ...],
-        Field(description="the numbers it explains, or what is missing, or the runs concerned"),
+        Field(description="the numbers it explains, the missing items, or the runs concerned"),
     ]
     message: str
     evidence: Values
 
 
 class GradeOverride(GradeTable):
-    """Points given by hand, already among those of the criterion."""
+    """Points given by hand, already included in the criterion."""
 
     criterion: str
     points: float
@@ -79,24 +79,26 @@ class Grade(GradeTable):
 
     schema_: Annotated[Literal["cartlab-grade/1"], Field(alias="schema")] = "cartlab-grade/1"
     submission: str
-    authors: Annotated[tuple[str, ...], Field(description="none where names are left out")]
+    authors: Annotated[tuple[str, ...], Field(description="none if names are left out")]
     status: Literal["graded", "failed"]
     points: float
     out_of: float
     days_late: float = 0.0
-    deducted: Annotated[float, Field(description="for lateness, already out of `points`")] = 0.0
+    deducted: Annotated[
+        float, Field(description="for lateness, already subtracted from `points`")
+    ] = 0.0
     reason: Annotated[
-        str, Field(description="why it could not be graded, a line for each reason, or empty")
+        str, Field(description="why it could not be graded, one line per reason, or empty")
     ] = ""
     criteria: tuple[Criterion, ...] = ()
     flags: tuple[Flag, ...] = ()
     notes: tuple[str, ...] = ()
     units: Annotated[
-        Units | None, Field(description="of the numbers in the criteria; none where not judged")
+        Units | None, Field(description="of the numbers in the criteria; none if not judged")
     ] = None
     springs: Annotated[
         tuple[str, ...],
-        Field(description="that the recordings ask for and the rubric does not have"),
+        Field(description="that the recordings need and the rubric lacks"),
     ] = ()
     overrides: tuple[GradeOverride, ...] = ()
 
@@ -110,7 +112,7 @@ class Grade(GradeTable):
         authors: tuple[str, ...],
         days_late: float,
     ) -> "Grade":
-        """Return the grade of what could not be graded."""
+        """Return the grade of a submission that could not be graded."""
         return cls(
             submission=submission,
             authors=authors,
@@ -133,10 +135,10 @@ def grade_text(grade: Grade) -> str:
 
 
 def read_grade(text: str) -> Grade:
-    """Return the grade that a `grade.json` holds.
+    """Read the grade in a `grade.json`.
 
     Raises
     ------
-    ValueError : it is none.
+    ValueError : the text is not a grade.
     """
     return Grade.model_validate_json(text)

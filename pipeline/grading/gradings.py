@@ -1,4 +1,4 @@
-"""What the runner and the gradebook share: gradings, the members of a class, the batch."""
+"""Types shared by the runner and the gradebook: gradings, class members, batches."""
 
 import unicodedata
 from collections.abc import Mapping
@@ -11,18 +11,18 @@ from pipeline.grading.grade import Flag
 
 @dataclass(frozen=True, kw_only=True)
 class Member:
-    """A submission of a class: whose it is, and the fingerprints of its recordings.
+    """A submission of a class: its owner and the fingerprints of its recordings.
 
     Attributes
     ----------
     submission : its id, unique in the batch.
-    owner : who handed it in, as the learning platform calls them, or "".
-    key : hash of all that its grading depends on: the files as handed in, rubric, code, name,
-        lateness; behind a hyphen that of the files alone.
-    fingerprints : to find its recordings in other submissions; see `shared.py`.
-    reason : one line, why it could not be graded, or "".
+    owner : the account that submitted it, as the learning platform names it, or "".
+    key : hash of everything the grading depends on: submitted files, rubric, code, name and
+        lateness; after a hyphen, the hash of the files alone.
+    fingerprints : used to find its recordings in other submissions; see `shared.py`.
+    reason : why it could not be graded, in one line, or "".
     grading : the number of its grading in the gradebook.
-    of_class : whether it is of the assignment that is being graded.
+    of_class : whether it belongs to the assignment being graded.
     """
 
     submission: str
@@ -36,28 +36,28 @@ class Member:
 
     @cached_property
     def people(self) -> set[str]:
-        """The authors, however they typed their ids."""
+        """The authors, with ids in a normal form."""
         return set(map(person, self.authors))
 
     @property
     def content(self) -> str:
-        """The part of its key that is of the files alone, "" where it has none."""
+        """The part of the key that depends on the files alone, or ""."""
         return self.key.partition("-")[2]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grading(Member):
-    """What one submission came to by itself, before it is compared with the others.
+    """The result of one submission, before it is compared with the others.
 
     Attributes
     ----------
-    status : `failed` where it could not be graded.
-    settled : False where a limit or a crash ended it: another run tries again.
-    grade : `grade.json` without what other submissions add (shared data, overrides).
-    findings : what the checks found, as `judge.reweigh` keeps it, "" where it failed.
+    status : `failed` if it could not be graded.
+    settled : False if a limit or a crash ended it; the next run tries again.
+    grade : `grade.json` without shared data and overrides.
+    findings : results of the checks, in the form of `judge.reweigh`; "" if grading failed.
     figures : (file name, SVG) for the feedback.
-    detail : for whoever mends the grader: the traceback of an error of its own, or "".
-    lacks_room : the disk was full. It concerns this run alone: the gradebook does not keep it.
+    detail : for developers: the traceback of an error in the grader, or "".
+    lacks_room : the disk was full. This concerns only this run; the gradebook does not keep it.
     """
 
     status: Literal["graded", "failed"]
@@ -71,19 +71,19 @@ class Grading(Member):
 
     @property
     def member(self) -> Member:
-        """What a batch itself needs of a grading: all else stays in the book."""
+        """The part of a grading that a batch needs; the rest stays in the gradebook."""
         return Member(**{own.name: getattr(self, own.name) for own in fields(Member)})
 
 
 def person(author: str) -> str:
-    """Return an author's id without what people type one way today and another tomorrow."""
+    """Return an author's id in a normal form, so that different spellings match."""
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
 
 
 def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
-    """Whether what was given to some people still concerns a submission of these authors.
+    """Return whether points given to some people still apply to a submission of these authors.
 
-    A submission that cannot be read names no authors: then its name decides.
+    A submission that cannot be read has no authors; then its name decides.
     """
     if not authors or not given:
         return True
@@ -92,16 +92,15 @@ def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """A batch that ran to its end; the gradings themselves stay in the gradebook.
+    """A complete batch; the gradings themselves stay in the gradebook.
 
     Attributes
     ----------
     keys : of the gradings, in the order of the submissions' ids.
-    shared : by submission, the flag for recordings that stand in another submission too.
+    shared : by submission, the flag for recordings that another submission also contains.
     failed : (submission, reason) of those that could not be graded.
-    unsettled : those of them that the next run tries again; lacks_room : for which the disk was
-        full.
-    kept, moved, taken_over : what became of the class list before, see `so_far.SoFar`.
+    unsettled : failed ones that the next run tries again; lacks_room : failed for a full disk.
+    kept, moved, taken_over : changes since the last class list, see `so_far.SoFar`.
     """
 
     keys: tuple[str, ...]

@@ -1,4 +1,4 @@
-"""The rubric: what a lab asks, the criteria with their points and tolerances, the late policy."""
+"""The rubric: required items, criteria with points and tolerances, late policy."""
 
 from decimal import Decimal
 from fnmatch import fnmatchcase
@@ -21,7 +21,7 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class RequiredRuns(TomlTable):
-    """So many experiments of a kind; `carts` are the carts free in it, default: all."""
+    """A minimum number of experiments of a kind; `carts` are the free carts, default: all."""
 
     kind: Kind
     carts: tuple[int, ...] = ()
@@ -29,7 +29,7 @@ class RequiredRuns(TomlTable):
 
 
 class Required(TomlTable):
-    """What must be handed in: runs, parameters (`K_*` is a pattern), the further tables."""
+    """The required items: runs, parameters (`K_*` is a pattern) and further tables."""
 
     experiments: tuple[RequiredRuns, ...] = ()
     initial: tuple[str, ...] = ()
@@ -39,9 +39,9 @@ class Required(TomlTable):
 
 
 class Late(TomlTable):
-    """Points lost to lateness: `percent_per_day` of those earned, after the days of grace.
+    """Deduction for late work: `percent_per_day` of the points earned, after the days of grace.
 
-    `due` is the deadline, where the platform says when something was handed in.
+    `due` is the deadline, used if the platform gives submission times.
     """
 
     due: AwareDatetime | None = None
@@ -63,9 +63,9 @@ class FlagCosts(
 ):
     """By code, the least share of its criterion's points that a remark costs.
 
-    The tolerances already weigh each wrong number. But one wrong entry among the many of A and B
-    makes another model of the carts, and its share of the entries does not say so. Whether
-    `shared_data` is a copy is for a person to say, who gives the points by hand.
+    The tolerances already weigh each wrong number. But a single wrong entry of A or B makes the
+    whole model wrong, which its share of the entries does not reflect. Only a person decides
+    whether `shared_data` is a copy, and sets those points by hand.
     """
 
     def of(self, code: Code) -> float:
@@ -74,20 +74,20 @@ class FlagCosts(
 
 
 class _Criterion(TomlTable):
-    """What every criterion has; `requires` are criteria that must not have failed before it."""
+    """The fields of every criterion; `requires` lists criteria that must not have failed."""
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")]
     points: Points
     title: str = ""
     requires: tuple[str, ...] = ()
-    message: str = ""  # said where not all points were earned
+    message: str = ""  # shown if points were lost
 
 
 class _Graded(_Criterion):
-    """Full credit up to `full_percent` of error, none from `none_percent`, in between a line.
+    """Full credit up to an error of `full_percent`, none from `none_percent`, linear in between.
 
-    Half a unit of the last digit typed and `sigmas` standard errors of the reference come off the
-    error first; dampings have limits of their own.
+    Half a unit of the last typed digit and `sigmas` standard errors of the reference are first
+    subtracted from the error. Dampings have their own limits.
     """
 
     full_percent: Percent = 5.0
@@ -97,13 +97,13 @@ class _Graded(_Criterion):
 
 
 class RequiredPieces(_Criterion):
-    """Is all there that `[required]` asks for? Credit is the share that is."""
+    """Is everything in `[required]` present? Credit is the share that is."""
 
     check: Literal["required"]
 
 
 class DataQuality(_Criterion):
-    """Do the recordings hold what they should? Credit is the share of good runs."""
+    """Are the recordings sound? Credit is the share of good runs."""
 
     check: Literal["data"]
 
@@ -117,7 +117,7 @@ class Parameters(_Graded):
 
 
 class InitialFinal(_Graded):
-    """The student's initial against the student's final estimates; guesses are not judged."""
+    """The student's initial estimates against the final ones; guesses are not judged."""
 
     check: Literal["initial_final"]
     parameters: tuple[str, ...] = ("*",)
@@ -130,9 +130,9 @@ class InitialFinal(_Graded):
 class Laws(_Criterion):
     """Redundancies and inequalities that the final table of a real chain obeys.
 
-    A law holds where it does for some table within half the last digits typed. Else the worst law
-    counts: a quarter of the points is lost where it only holds within these percentages, half
-    within twice them, all from four times on.
+    A law holds if some table within half a unit of the last typed digits obeys it. Otherwise the
+    worst law counts: a quarter of the points is lost if it only holds within these percentages,
+    half within twice as much, and all from four times as much.
     """
 
     check: Literal["laws"]
@@ -147,9 +147,9 @@ class StateModel(_Graded):
 
 
 class Gains(_Criterion):
-    """What the gains do on the carts: stable, overshoot and settling time within the goal.
+    """The gains on the carts: stable, and overshoot and settling time within the goal.
 
-    Overshoot in percentage points above the goal, settling time in percent above it.
+    Overshoot counts in percentage points above the goal, settling time in percent above it.
     """
 
     check: Literal["gains"]
@@ -160,7 +160,7 @@ class Gains(_Criterion):
 
 
 class Claims(_Criterion):
-    """Reported overshoot (percentage points) and settling time (percent) against what gains do."""
+    """Reported overshoot (percentage points) and settling time (percent) against simulation."""
 
     check: Literal["claims"]
     overshoot_full: Percent = 5.0
@@ -178,9 +178,9 @@ class Prefilter(_Criterion):
 
 
 class Hardware(_Criterion):
-    """A closed-loop run whose controller is stated; how far the model is from it (NRMSE, percent).
+    """A closed-loop run with a stated controller: its difference from the model (NRMSE, percent).
 
-    Where gains other than the reported ones ran, that is said.
+    If the run did not use the reported gains, the message says so.
     """
 
     check: Literal["hardware"]
@@ -208,12 +208,12 @@ class Rubric(TomlTable):
 
     Attributes
     ----------
-    system, design : win over the submission's own; without `design` the submission's is used.
+    system, design : replace the submission's own; without `design` the submission's is used.
     step : points are rounded to it.
-    anonymous : names stay out of what is written unless asked for.
-    examples : submission folders handed out with the task, from the rubric's own folder: their
-        recordings may stand in anybody's submission.
-    students : what they see at the desk of a lab server, where its list of users names the rubric.
+    anonymous : names are left out of all files unless requested.
+    examples : submission folders given out with the assignment, relative to the rubric's folder;
+        any submission may contain their recordings.
+    students : what students see at the desk of a lab server whose user list names the rubric.
     """
 
     version: Literal[1]
@@ -236,10 +236,10 @@ class Rubric(TomlTable):
 
     @property
     def out_of(self) -> float:
-        """All points there are."""
+        """The sum of all points."""
         return float(sum(Decimal(str(criterion.points)) for criterion in self.criteria))
 
 
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
-    """Return the names that fit one of the patterns, in their own order."""
+    """Return the names that match one of the patterns, in their order."""
     return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]

@@ -1,4 +1,4 @@
-"""Read a rubric; every mistake in it is one line that names file, line, key and what is near."""
+"""Read a rubric; every mistake is one line with file, line, key and a suggestion."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -36,7 +36,7 @@ _CHECKS: dict[str, type[BaseModel]] = {
     for check in get_args(model.model_fields["check"].annotation)
 }
 _OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # the keys that every check has
-# Values that contradict nothing, for those that are wrong or missing.
+# Harmless values, used in place of wrong or missing ones.
 _HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
 _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
@@ -44,7 +44,7 @@ _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 
 
 def load_rubric(path: Path) -> Rubric:
-    """Read and check a rubric: a file, or the name of one that is shipped.
+    """Read and check a rubric: a file or a shipped name.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def load_rubric(path: Path) -> Rubric:
 
 
 def find_rubric(path: Path) -> Path:
-    """Return the file of a rubric, given that or the name of one that is shipped.
+    """Return the file of a rubric, given a file or a shipped name.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def find_rubric(path: Path) -> Path:
 
 
 def shipped_rubric(carts: int) -> Rubric | None:
-    """Return the shipped rubric for so many carts, if there is one."""
+    """Return the shipped rubric for a number of carts, if there is one."""
     path = RUBRICS / f"throne-{carts}dof.toml"
     return load_rubric(path) if path.is_file() else None
 
@@ -91,7 +91,7 @@ class InvalidRubric(ConfigError):
 
     Attributes
     ----------
-    problems : (line, what is wrong) in the order of the file; line 0 is all of it.
+    problems : (line, problem) in the order of the file; line 0 stands for the whole file.
     """
 
     def __init__(self, where: str, problems: Sequence[tuple[int, str]]) -> None:
@@ -100,7 +100,7 @@ class InvalidRubric(ConfigError):
 
 
 def parse_rubric(text: str, *, where: str) -> Rubric:
-    """Check the text of a rubric; `where` is what to call the file.
+    """Check the text of a rubric; messages call the file `where`.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
 
 @dataclass(frozen=True, kw_only=True)
 class _Complaint:
-    """What is wrong at a place of the document; `missing`: there is nothing."""
+    """A problem at a place of the document; `missing`: nothing is there."""
 
     at: Location
     what: str
@@ -137,22 +137,22 @@ class _Validated:
 
 
 def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
-    """Whether a missing key may be in a line that is not TOML."""
+    """Return whether a missing key may be in a line that is not valid TOML."""
     if not complaint.missing:
         return False
     lines = read.text.split("\n")
     headings = [n for n, typed in enumerate(lines, start=1) if typed.lstrip().startswith("[")]
     end = next((n for n in headings if n > line), len(lines) + 1)
-    # A whole table is missing where its heading is the slip, wherever that is.
+    # If the mistake is in a heading, the whole table is missing.
     return any(len(complaint.at) == 1 or line <= slip < end for slip, _ in read.slips)
 
 
 def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
-    """Check a document; what is wrong with one value hides nothing of what is with another.
+    """Check a document and report all problems, also when one value would hide another's.
 
     Parameters
     ----------
-    lost : ids of criteria that may be in lines that are not TOML.
+    lost : ids of criteria that may be in lines that are not valid TOML.
     """
     complaints: list[_Complaint] = []
     criteria = document.get("criteria")
@@ -193,18 +193,18 @@ def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) 
         at, typed = ("criteria", i, meant[0]), own[meant[0]]
         what = "unknown key; did you mean 'check'?"
     else:
-        typed, what = "", f"is required and not there{nearest('', tuple(_CHECKS))}"
+        typed, what = "", f"is required and missing{nearest('', tuple(_CHECKS))}"
     missing = not meant and "check" not in own
     complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}", missing=missing))
     left = {key: value for key, value in own.items() if key not in meant}
     close = get_close_matches(str(typed), list(_CHECKS), n=1)
-    if not close:  # its own keys are those of no check, so only what all have is looked at
+    if not close:  # its check is unknown, so only the common keys are checked
         left = {key: value for key, value in left.items() if key in _OF_CRITERIA}
     return {**left, "check": close[0] if close else "data"}
 
 
 def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
-    """Return where a pydantic error is, without what is no key of the file, and what it says."""
+    """Return the place of a pydantic error, as keys of the file, and its message."""
     return _Complaint(
         at=without_tag(error["loc"], document),
         what=explain(error, document, root=Rubric),
@@ -213,7 +213,7 @@ def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
 
 
 def _without(document: dict, wrong: Sequence[ErrorDetails]) -> dict:
-    """Return a document with harmless values, or none, where others are wrong."""
+    """Return a document in which wrong values are replaced by harmless ones or removed."""
     left = deepcopy(document)
     for error in wrong:
         *way, key = without_tag(error["loc"], document)
@@ -236,18 +236,18 @@ def _tuples(value: Any) -> Any:
     return tuple(_tuples(item) for item in value) if isinstance(value, list) else value
 
 
-# ------------------------------------------------- what the tables say about one another
+# ------------------------------------------------- contradictions between the tables
 
 
 def _contradictions(
     found: Rubric, ids: Sequence[object], *, lost: Collection[str]
 ) -> Iterator[tuple[Location, str]]:
-    """Yield (location, what is wrong); `ids` are those of the criteria as they were typed."""
+    """Yield (location, problem); `ids` are the ids of the criteria as typed."""
     n, names = found.system.carts, found.names
     if not found.criteria:
-        yield ("criteria",), "there is none; add a [[criteria]] table for each"
+        yield ("criteria",), "missing; add a [[criteria]] table for each criterion"
     if found.step != round(found.step, 2):
-        yield ("step",), f"{found.step:g}: points go to the hundredth"
+        yield ("step",), f"{found.step:g}: points have at most two decimals"
     if len(found.system.springs) != n + 1:
         yield (
             ("system", "springs"),
@@ -271,7 +271,7 @@ def _contradictions(
     known_ids = [id_ for id_ in ids if isinstance(id_, str)]
     for i, (id_, criterion) in enumerate(zip(ids, found.criteria, strict=True)):
         if id_ is not None and id_ in seen:
-            yield ("criteria", i, "id"), f"{id_!r} is used before"
+            yield ("criteria", i, "id"), f"{id_!r} was used before"
         for parent in criterion.requires:
             if parent not in seen and (parent in ids or parent not in lost):
                 where = "comes later" if parent in ids else "is no criterion"
@@ -280,9 +280,10 @@ def _contradictions(
         seen.add(id_)
         points = criterion.points
         if points != round(points, 2):
-            yield ("criteria", i, "points"), f"{points:g}: points go to the hundredth"
+            yield ("criteria", i, "points"), f"{points:g}: points have at most two decimals"
         elif Decimal(str(points)) % Decimal(str(found.step)):
-            yield ("criteria", i, "points"), f"{points:g} is no multiple of step = {found.step:g}"
+            said = f"{points:g} is not a multiple of step = {found.step:g}"
+            yield ("criteria", i, "points"), said
         if isinstance(criterion, Parameters | InitialFinal):
             for pattern in criterion.parameters:
                 if not matching((pattern,), names):
@@ -298,7 +299,7 @@ def _contradictions(
 
 
 def _nearest(pattern: str, names: Sequence[str]) -> str:
-    """Return what may be meant: a pattern where one was typed, else a parameter."""
+    """Suggest a pattern if one was typed, else a parameter."""
     patterns = [f"{read.symbol}_*" for read in map(read_name, names) if read.suffix]
     return nearest(pattern, list(dict.fromkeys(patterns)) if "*" in pattern else names)
 

@@ -1,7 +1,7 @@
-"""The values of a rubric as a form, and written back into its text.
+"""Show the values of a rubric as a form, and write them back into its text.
 
-The text stays the truth. Only a value that changed is replaced, or a line is added:
-comments, order and everything else stay byte for byte.
+The text is the source. Only a changed value is replaced, or a line is added.
+Comments, order and everything else stay byte for byte.
 """
 
 import re
@@ -45,9 +45,9 @@ class RubricField:
 
     Attributes
     ----------
-    name : of the input; that of a criterion has its id in it.
-    value : as it is shown; a share is shown in percent.
-    choices : the words that the value can be; none: it is a number.
+    name : name of the input; it contains the id of the criterion.
+    value : as shown; shares are shown in percent.
+    choices : the possible words; empty for a number.
     """
 
     name: str
@@ -80,7 +80,7 @@ class RubricForm:
 
     @property
     def charged(self) -> list[str]:
-        """The codes of the remarks that take something."""
+        """The codes of the remarks that cost points."""
         return [code for code, field in self.costs.items() if field.value != "0"]
 
     def fields(self) -> Iterator[RubricField]:
@@ -162,7 +162,7 @@ def _field(
 
 
 def _digits(number: Decimal) -> str:
-    """Return a number without an exponent and without zeros that say nothing."""
+    """Return a number without exponent and without trailing zeros."""
     text = format(number.normalize(), "f")
     return "0" if text == "-0" else text
 
@@ -171,17 +171,17 @@ def _digits(number: Decimal) -> str:
 
 
 def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Value]:
-    """Return the values that were changed in a form, as the file has them.
+    """Return the values changed in a form, in the form of the file.
 
-    Fields that are not among `typed` stay.
+    Fields that are not in `typed` stay unchanged.
 
     Raises
     ------
-    WrongFields : some have wrong values, or are no fields of this rubric.
+    WrongFields : some have wrong values, or are not fields of this rubric.
     """
     fields = {field.name: field for field in form.fields()}
     changed: dict[Key, Value] = {}
-    wrong = {name: "the text does not have it any more" for name in typed if name not in fields}
+    wrong = {name: "the text no longer contains it" for name in typed if name not in fields}
     for name, field in fields.items():
         text = typed.get(name)
         if text is None or text.strip() == field.value:
@@ -206,11 +206,11 @@ def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Valu
 
 
 def with_values(text: str, values: Mapping[Key, Value]) -> str:
-    """Return the text of a rubric with other values in it.
+    """Return the text of a rubric with new values.
 
     Raises
     ------
-    ConfigError : a value is not on a line of its own; a person must change it in the text.
+    ConfigError : a value shares its line; a person must change it in the text.
     """
     for key, value in values.items():
         text = _with_value(text, key, _toml(value))
@@ -234,7 +234,7 @@ def _with_value(text: str, key: Key, value: str) -> str:
 
 
 def _set(document: dict[str, Any], key: Key, value: str) -> dict[str, Any]:
-    """Return a document with another value in it, given as TOML."""
+    """Return a document with one value replaced, given as TOML."""
     document = deepcopy(document)
     here: Any = document
     for part in key[:-1]:
@@ -244,9 +244,9 @@ def _set(document: dict[str, Any], key: Key, value: str) -> dict[str, Any]:
 
 
 def _candidates(text: str, key: Key, value: str) -> Iterator[str]:
-    """Yield the text with a value in the line that has it, or in a new one; the best first.
+    """Yield candidates for the text with a new value, in its line or a new one, best first.
 
-    What looks like a key may stand within a longer value: whoever asks sees what TOML makes of it.
+    Text that looks like a key may be inside a longer value, so the caller parses each candidate.
     """
     lines, places = text.split("\n"), list(key_lines(text))
     for number, path in places:
@@ -265,7 +265,7 @@ def _candidates(text: str, key: Key, value: str) -> Iterator[str]:
 
 
 def _above(lines: Sequence[str], at: int) -> int:
-    """Return where the comments begin that stand above a line."""
+    """Return the start of the comments above a line."""
     while at and lines[at - 1].lstrip().startswith("#"):
         at -= 1
     return at

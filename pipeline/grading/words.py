@@ -6,10 +6,10 @@ WORDS = phrases("grading")
 
 
 def on_one_line(reason: str) -> str:
-    """Return reasons, a line each, where there is room for one line alone."""
+    """Join reasons, one per line, into a single line."""
     return "; ".join(line.rstrip(".") for line in reason.split("\n"))
 
 
 def points_text(points: float) -> str:
-    """Return points to the hundredth, without zeros that say nothing."""
+    """Return points with at most two decimals, without trailing zeros."""
     return f"{points:.2f}".rstrip("0").rstrip(".")

@@ -37,7 +37,7 @@ def read_points(table: FileTable, columns: Mapping[str, Column], *, carts: Seque
     factor = conversion(frequency.unit or ("rad/s" if is_omega else None), "Hz")
     if factor is None:
         raise SubmissionError(
-            f"{table.source}: {frequency.name!r} is in {frequency.unit}, Hz was expected"
+            f"{table.source}: {frequency.name!r} is in {frequency.unit}, expected Hz"
         )
     omega = _measured(2 * np.pi * factor * _positive(table, frequency), table, frequency)
     return {
@@ -93,8 +93,8 @@ def frequency_responses(
     spread = np.sqrt(squares / freedom) if freedom >= 3 and squares > 0 else None
     relative = _RATIO_SPREAD if spread is None else float(spread)
     source = (
-        f"standard errors of the amplitude ratios are taken as {_RATIO_SPREAD:.0%}: "
-        "the table has no repeats to tell"
+        f"standard errors of the amplitude ratios are taken as {_RATIO_SPREAD:.0%}, because the "
+        f"table has no repeats"
         if spread is None
         else f"standard errors of the amplitude ratios are {relative:.2%}, from {freedom} repeats"
     )

@@ -126,7 +126,8 @@ def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> 
         if np.ptp(x) == 0.0 and (moving or (u is not None and np.ptp(u) > 0)):
             problems.append(never_changes(name))
         problems += [
-            f"{name!r} stands still at speed from {t[first]:.4g} s to {t[last]:.4g} s: "
+            f"{name!r} stands still while the cart moves fast, from {t[first]:.4g} s to "
+            f"{t[last]:.4g} s: "
             "the encoder stuck"
             for first, last in stuck_spans(x)[:3]
         ]

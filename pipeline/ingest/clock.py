@@ -80,14 +80,14 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
     if column is None:
         if sample_rate is None:
             raise SubmissionError(
-                f"{table.source}: no time column; it has {table.headings()}; name it in "
-                "`columns`, or state `sample_rate` in Hz"
+                f"{table.source}: no time column; it has {table.headings()}; name the time "
+                f"column in `columns`, or state `sample_rate` in Hz"
             )
         return np.arange(n) / sample_rate
     factor = conversion(column.unit, "s")
     if factor is None:
         raise SubmissionError(
-            f"{table.source}: {column.name!r} is in {column.unit}, which is no unit of time"
+            f"{table.source}: {column.name!r} is in {column.unit}, which is not a unit of time"
         )
     return table.values[column.index] * factor
 
@@ -105,7 +105,7 @@ def clock_notes(
         i = clock.stopped
         before, after = clock.t[i - 1], clock.t[i]
         what = "stands still" if after == before else "goes back"
-        hint = "; two records pasted together?" if after < before else ""
+        hint = "; were two recordings pasted together?" if after < before else ""
         raise SubmissionError(
             f"{table.source} {table.place(i)}: time {what}, from {before:g} s to {after:g} s{hint}"
         )
@@ -121,7 +121,9 @@ def clock_notes(
             f"one sample every {1e3 * (clock.period or clock.mean_interval):.6g} ms{even}"
         )
     for i in clock.gaps[:3]:
-        notes.append(f"time is missing between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s")
+        notes.append(
+            f"there is a gap in time between {clock.t[i - 1]:.4g} s and {clock.t[i]:.4g} s"
+        )
     if len(clock.gaps) > 3:
         notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
     # Relative difference of a stated rate that the time column contradicts.

@@ -43,7 +43,7 @@ from pipeline.words.numbers import by_note, first_few
 
 UNSURE = "unsure: "  # begins a comment below a table, to be removed by a person who knows
 _TO_STATE = {  # facts that a file does not show
-    "columns": "columns = { }    # which is what, by name or number: time, input, x1, …",
+    "columns": "columns = { }    # by name or number: time, input, x1, …",
     "sample_rate": "sample_rate = 0    # Hz",
 }
 _NO_NAME = re.compile(r"[^\w.-]+", re.ASCII)
@@ -213,7 +213,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
     if not looked:
         what = "; ".join(_not_looked_into(passed_over(folder)))
         what = what or f"copy yours there ({', '.join(ENDINGS)})"
-        raise ConfigError(f"{folder / 'data'}: no recording in it; {what}")
+        raise ConfigError(f"{folder / 'data'}: contains no recordings; {what}")
     if new:
         write_templates(folder, carts=_carts_seen(looked))
     found: list[Found] = []
@@ -253,7 +253,7 @@ class _Filling:
             if posix(str(table["file"])) == found.file:
                 return self._complete(table, found, found.inspection)
         if (same := self._same(found.file)) is not None:
-            told = f"is a copy of {same}, whose table is for both"
+            told = f"is a copy of {same}, whose entry stands for both"
             return replace(found, state="copy", remarks=(told,))
         if found.kind is None:
             self._say_unknown(found)
@@ -346,7 +346,7 @@ class _Filling:
         line = f"file = {json.dumps(found.file, ensure_ascii=False)}"
         if f"# {line}" in tomlkit.dumps(self._document).splitlines():
             return
-        why = "; ".join(found.remarks) or "nothing tells what it is"
+        why = "; ".join(found.remarks) or "its content is not clear"
         id_ = json.dumps(free_id(PurePosixPath(found.file).stem, ()))
         kind = 'kind = ""    # decay, step, sine, sweep, closed_loop or bode?'
         self._document.add(tomlkit.nl())
@@ -382,7 +382,7 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
     if not is_count(unit) or not fractions:
         return ""
     have = "has" if len(fractions) == 1 else "have"
-    return f"a count has no fractions, and {first_few(fractions, 1)} {have} some: is it cm?"
+    return f"counts are whole numbers, but {first_few(fractions, 1)} {have} some: is it cm?"
 
 
 def system_doubts(folder: Path) -> dict[str, str]:
@@ -438,7 +438,7 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
         renamed = ", or columns = { x1 = … }" if n == 1 else ""
         yield f"{positions[cart].name!r} moves, but carts = {n}: more carts{renamed}?"
     if n > 1 and list(positions) == [1] and not re.search(r"\d", positions[1].name):
-        yield "is it cart 1 that it measures? Else columns = { x2 = … }"
+        yield "does it measure cart 1? If not, columns = { x2 = … }"
 
 
 def _carts_seen(looked: Sequence[Found]) -> int:

@@ -16,9 +16,9 @@ _AS_TEXT = "save the recording as .csv"
 _FORMS = {
     ".xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each recording as .xlsx or .csv"),
     ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
-    ".h5 .hdf5 .npy .npz .parquet": ("data in a form that is not read", _AS_TEXT),
-    ".json .xml .out": ("data in a form that is not read", _AS_TEXT),
-    ".fig": ("a MATLAB figure", "save the data that it shows as .csv"),
+    ".h5 .hdf5 .npy .npz .parquet": ("a data format that cartlab does not read", _AS_TEXT),
+    ".json .xml .out": ("a data format that cartlab does not read", _AS_TEXT),
+    ".fig": ("a MATLAB figure", "save its data as .csv"),
     ".doc .docx .rtf .pdf": ("a document", "save a table of numbers in it as .csv"),
 }
 _FORM_OF = {ending: form for endings, form in _FORMS.items() for ending in endings.split()}
@@ -60,7 +60,7 @@ def refused(root: Path, name: str) -> NotRead | None:
     if problem is None:
         return None
     link = (root / name).is_symlink()
-    advice = "put the file itself here in place of the link" if link else ""
+    advice = "replace the link with the file itself" if link else ""
     shown = name if name.isprintable() else name.encode("unicode_escape").decode("ascii")
     return NotRead(file=shown, reason=problem, advice=advice)
 
@@ -74,7 +74,7 @@ def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
         if _is_hidden(name) or name in known or not _is_recording(path):
             continue
         if outside(folder, name) is None and _is_table(folder, name):
-            reason = "it lies beside data/, and only what is in data/ is looked at"
+            reason = "it is outside data/, and only files in data/ are read"
             found.append(NotRead(file=name, reason=reason, advice="move it into data/"))
     return found
 
@@ -96,7 +96,9 @@ def _not_read(root: Path, name: str) -> NotRead:
         return NotRead(file=name, reason=reason, advice=advice)
     what = f"its ending is {ending}" if ending else "its name has no ending"
     if _is_table(root, name):
-        return NotRead(file=name, reason=f"a table of numbers, but {what}", advice="end it in .csv")
+        return NotRead(
+            file=name, reason=f"a table of numbers, but {what}", advice="rename it to end in .csv"
+        )
     return NotRead(file=name, reason="no recording", advice="")
 
 

@@ -93,8 +93,8 @@ def _say_signs(
         return []
     if not any(found.get(name) for name in searched):
         return [
-            "the data do not tell the sign of the input: it is taken as "
-            f"{signs[searched[0]]:+d}; state it if it is not"
+            "the data do not show the sign of the input: it is assumed to be "
+            f"{signs[searched[0]]:+d}; state it if this is wrong"
         ]
     usual = 1 if sum(signs[name] for name in searched) >= 0 else -1
     text = f"sign of the input found from the data: {usual:+d}"
@@ -102,7 +102,8 @@ def _say_signs(
         text += f", but {-usual:+d} in {abridge(others, most=FEW_NAMES)}"
     if unsure := [name for name in searched if not found.get(name)]:
         text += (
-            f"; taken from the others where the data do not tell: {abridge(unsure, most=FEW_NAMES)}"
+            f"; taken from the others where the data do not show it: "
+            f"{abridge(unsure, most=FEW_NAMES)}"
         )
     return [text]
 

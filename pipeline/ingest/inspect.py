@@ -122,7 +122,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))
         problems.append(_name_them(told))
     elif unused and not unnamed:
-        problems.append(f"no role for {', '.join(unused)}: name them in `columns` to use them")
+        problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
     # Without names everything else is missing too.
     further = [] if bare and not guessed else problems
     try:
@@ -189,7 +189,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
 
 def _name_them(told: Roles) -> str:
     """Return how to name columns without headings, as far as their signals tell."""
-    said = "the columns have no names: say in submission.toml which is what"
+    said = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
     if line and not told.doubts:
         return f"the columns have no names; what they do says columns = {{ {line} }}"
@@ -197,7 +197,7 @@ def _name_them(told: Roles) -> str:
         return f"{said}, perhaps columns = {{ {line} }}: {'; '.join(told.doubts)}"
     return (
         f"{said}, by their numbers from 1: columns = {{ time = …, input = …, x1 = … }}; none looks "
-        "like the time: without it, state sample_rate = … (Hz) in its place"
+        "like time: if there is none, state sample_rate = … (Hz) instead"
         + "".join(f"; {doubt}" for doubt in told.doubts)
     )
 

@@ -58,8 +58,8 @@ def read_data(submission: Submission) -> Ingested:
     """
     if not submission.experiments:
         raise SubmissionError(
-            f"{submission.folder.resolve().name}/submission.toml: there is no [[experiments]] "
-            "table yet; add one for each data file"
+            f"{submission.folder.resolve().name}/submission.toml: it has no [[experiments]] "
+            f"table yet; add one for each data file"
         )
     tables: dict[str, tuple[FileTable, str]] = {}
     opened: list[_Opened] = []
@@ -122,7 +122,7 @@ def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
         return []
     return [
         f"system.input.per_count = {per_count:g} is not used: no input holds counts (whole "
-        f"numbers beyond ±{_FEW_COUNTS:g}); every input is taken to be in {system.input.unit}"
+        f"numbers beyond ±{_FEW_COUNTS:g}); every input is read in {system.input.unit}"
     ]
 
 
@@ -130,7 +130,7 @@ def _copies(tables: Mapping[str, tuple[FileTable, str]]) -> list[str]:
     """Return a warning for every file that is a copy of another."""
     first: dict[str, str] = {}
     return [
-        f"{name} is a copy of {original}: a repeat is a recording of its own"
+        f"{name} is a copy of {original}; a repeat must be recorded separately"
         for name, (_, digest) in tables.items()
         if (original := first.setdefault(digest, name)) != name
     ]
@@ -142,8 +142,8 @@ def _read_bode(
     """Add the rows of a Bode table to `points`; return whether it can be used."""
     if len(experiment.carts) < system.carts:
         warnings.append(
-            f"{experiment.id}: not used: a bode table is fitted with all carts free, "
-            f"here only {list(experiment.carts)} are"
+            f"{experiment.id}: not used: a bode table needs all carts free, here only "
+            f"{list(experiment.carts)} are"
         )
         return False
     _refuse_cut(table)

@@ -1,4 +1,4 @@
-"""A report as plain data: sections of blocks, which HTML and PDF render alike.
+"""A report as plain data: sections of blocks, which HTML and PDF both render.
 
 Content is decided once (`content.py`), so the two renderings cannot disagree, and every text is
 data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
@@ -197,7 +197,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report; `plots` is a page of plots beside it, "" where there is none."""
+    """A whole report; `plots` is a page of plots next to it, or ""."""
 
     title: str
     subtitle: str

@@ -141,13 +141,13 @@ def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Subm
     location = without_tag(location, document)
     where, found, kind = dotted(location, document), error["input"], error["type"]
     if kind == "missing":
-        return f"{where}: is required and not there"
+        return f"{where}: is required and missing"
     if kind == "extra_forbidden":
         keys = list_keys(list_tables(root).get(table, root))
         return f"{where}: unknown key{nearest(location[-1], keys)}"
     text = f"{where}: {refusal(error)}"
     if kind == "tuple_type" and isinstance(found, dict):
-        text += f"; begin each with [[{where}]], in double brackets"
+        text += f"; start each with [[{where}]], in double brackets"
     if kind == "literal_error" and isinstance(found, str):
         close = get_close_matches(
             found, re.findall(r"'([^']*)'", error.get("ctx", {}).get("expected", "")), n=1
@@ -167,7 +167,7 @@ def refusal(error: ErrorDetails) -> str:
     """Return what was expected and what was found of one pydantic error."""
     kind, found = error["type"], quote(error["input"])
     if kind == "json_invalid":
-        return "no JSON, or cut short"
+        return "not JSON, or truncated"
     if kind == "value_error":  # its message includes what was found
         return error["msg"].removeprefix("Value error, ").rstrip(".")
     if kind not in _EXPECTED:

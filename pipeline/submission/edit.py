@@ -22,7 +22,9 @@ class Outdated(SubmissionError):
     """The file has changed since the change was prepared; `text` is its present content."""
 
     def __init__(self, text: str) -> None:
-        super().__init__(f"{NAME}: was changed meanwhile, by another program or in another window")
+        super().__init__(
+            f"{NAME}: was changed in the meantime, by another program or in another window"
+        )
         self.text = text
 
 
@@ -66,7 +68,7 @@ def edit_submission(
         where = f"{folder.resolve().name}/{NAME}"
         if len(text) > 200_000:  # tomlkit takes seconds for the worst of them
             raise SubmissionError(
-                f"{where}: {len(text):,} characters; a program changes files of up to 200,000"
+                f"{where}: {len(text):,} characters; cartlab edits files of up to 200,000"
             )
         newline = "\r\n" if "\r\n" in text else "\n"
         try:
@@ -75,7 +77,7 @@ def edit_submission(
             new = re.sub(r"\n{3,}(?=\[\[experiments\]\])", "\n\n", tomlkit.dumps(document))
             new = new.rstrip() + "\n"
         except (TOMLKitError, RecursionError) as error:
-            raise SubmissionError(f"{where}: cannot be changed by a program ({error})") from None
+            raise SubmissionError(f"{where}: cannot be edited by cartlab ({error})") from None
         except ValueError:  # an integer of thousands of digits
             parse_submission(text, folder=folder, where=where)  # in the file as it was?
             raise SubmissionError(f"{where}: a number has too many digits") from None
@@ -83,7 +85,7 @@ def edit_submission(
             parse_submission(text, folder=folder, where=where)  # no table where one was?
             raise
         if len(new.encode()) > MAX_TOML_BYTES:
-            raise SubmissionError(f"{where}: would have more than {MAX_TOML_BYTES:,} bytes")
+            raise SubmissionError(f"{where}: would exceed {MAX_TOML_BYTES:,} bytes")
         submission = parse_submission(new, folder=folder, where=where)
         write_file(folder / NAME, new.replace("\n", newline))
         return submission

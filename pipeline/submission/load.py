@@ -62,7 +62,7 @@ def load_submission(path: Path) -> Submission:
         raise SubmissionError(f"{quote(str(path))}: no such folder")
     if toml != path and not toml.exists() and not toml.is_symlink():
         hint = _near_file(folder, NAME, ()) or "; cartlab fill writes one for the files in data/"
-        raise SubmissionError(f"{quote(str(path))}: there is no file {NAME!r} in it{hint}")
+        raise SubmissionError(f"{quote(str(path))}: contains no {NAME}{hint}")
     if (problem := outside(folder, toml.name)) is not None:
         raise SubmissionError(f"{where}: {problem}")
     return parse_submission(
@@ -212,7 +212,7 @@ def _notes(folder: Path) -> str | None:
     if len(text) > most:
         shown = text[: text.rfind("\n", 0, most) + 1] or text[:most]
         length = f"{len(shown):,} of {len(text):,} characters"
-        text = f"{shown}\n\n(notes.md goes on: {length} are shown.)\n"
+        text = f"{shown}\n\n(notes.md is longer: {length} are shown.)\n"
     return text if text.strip() else None
 
 
@@ -365,17 +365,17 @@ def leaves(folder: Path, name: str) -> str | None:
     """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
-        hidden = "it has a character that does not show: rename the file"
+        hidden = "it contains an invisible character: rename the file"
         hint = "" if name.isprintable() else f"; {backslash_words() if _typed(name) else hidden}"
         return f"expected a file name, found {shown}{hint}"
     windows, relative = PureWindowsPath(name), Path(posix(name))
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
-        return f"{shown} leaves the submission folder"
+        return f"{shown} is outside the submission folder"
     steps = [folder / part for part in (relative, *relative.parents)[:-1]]
     with suppress(OSError, RuntimeError):  # `outside` tells what cannot be followed
         linked = any(map(_may_be_link, steps))
         if linked and not steps[0].resolve().is_relative_to(folder.resolve()):
-            return f"{shown} leaves the submission folder through a link"
+            return f"{shown} is outside the submission folder, through a link"
     return None
 
 
@@ -410,7 +410,7 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
         why = "a loop of links" if error.errno == errno.ELOOP else error.strerror
         return f"{shown} cannot be read ({why})"
     if stat.S_ISDIR(info.st_mode):
-        return f"{shown} is a folder, a file was expected"
+        return f"{shown} is a folder, expected a file"
     if not stat.S_ISREG(info.st_mode):
         return f"{shown} is not a regular file"
     if info.st_size > MAX_DATA_BYTES:

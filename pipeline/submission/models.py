@@ -43,7 +43,7 @@ class InputScale(TomlTable):
     sign: Literal[1, -1] | None = Field(
         default=None,
         title="Sign of the input",
-        description="-1: a positive input drives cart 1 towards negative x; left out, it is found "
+        description="-1 if a positive input drives cart 1 towards negative x; if left out, found "
         "from the data",
     )
     per_count: Positive | None = Field(
@@ -66,7 +66,7 @@ class PositionScale(TomlTable):
     unit: Unit = Field(
         default="count",
         title="Unit of positions",
-        description="cm; count where a file holds encoder counts",
+        description="cm, for example; count for files of encoder counts",
     )
     per_count: Positive | None = Field(
         default=None,
@@ -83,14 +83,14 @@ class System(TomlTable):
 
     carts: int = Field(ge=1, le=MOST_CARTS, title="Carts")
     springs: tuple[bool, ...] = Field(
-        default=(), title="Springs that are there", description="from one wall to the other"
+        default=(), title="Springs on the bench", description="from one wall to the other"
     )
     input: InputScale = InputScale()
     position: PositionScale = PositionScale()
     columns: dict[str, str | int] = Field(
         default={},
         title="Columns of all your files",
-        description="where their headings are not understood, a line each: x1 = Encoder 1 Pos, or "
+        description="if their headings are not recognised, one per line: x1 = Encoder 1 Pos, or "
         "x1 = 3 for the third",
     )
 
@@ -127,10 +127,10 @@ class Design(TomlTable):
         default=1.0, gt=0, le=1000, title="Settling time", description="s, to within 2 %"
     )
     input_limit: Positive | None = Field(
-        default=None, title="Largest input", description="in input units; may be left out"
+        default=None, title="Largest input", description="in input units; optional"
     )
     sample_time: Annotated[Finite, Field(ge=1e-4, le=1)] | None = Field(
-        default=None, title="Sample time of the controller", description="s; may be left out"
+        default=None, title="Sample time of the controller", description="s; optional"
     )
     method: Literal["poles", "lqr"] = Field(default="lqr", title="Method")
 
@@ -140,7 +140,7 @@ class StateFeedbackController(TomlTable):
 
     type: Literal["state_feedback"] = Field(title="Controller")
     gains: tuple[Finite, ...] = Field(
-        default=(), title="Gains", description="of a state feedback: two a cart, position first"
+        default=(), title="Gains", description="of a state feedback: two per cart, position first"
     )
     prefilter: Finite = Field(default=1.0, title="Prefilter")
 
@@ -169,10 +169,12 @@ class Experiment(TomlTable):
     file: str
     # Filled in with all of them on loading.
     carts: tuple[int, ...] = Field(
-        default=(), title="Free carts", description="1, 2; all where left out"
+        default=(), title="Free carts", description="1, 2; if left out, all"
     )
     frequency: Positive | None = Field(
-        default=None, title="Frequency", description="Hz, of a sine; found where left out"
+        default=None,
+        title="Frequency",
+        description="Hz, of a sine; if left out, found from the data",
     )
     window: tuple[Finite, Finite] | None = Field(
         default=None, title="Use only", description="from, to, in s"
@@ -182,16 +184,16 @@ class Experiment(TomlTable):
     columns: dict[str, str | int] | None = Field(
         default=None,
         title="Columns",
-        description="of this file, a line each: x1 = Encoder 1 Pos, or x1 = 3",
+        description="of this file, one per line: x1 = Encoder 1 Pos, or x1 = 3",
     )
     sample_rate: Positive | None = Field(
-        default=None, title="Sample rate", description="Hz, of a file without a time column"
+        default=None, title="Sample rate", description="Hz, for a file without a time column"
     )
     hold: Literal["zero_order", "band_limited"] = "zero_order"
     controlled_cart: int | None = Field(default=None, title="Controlled cart")
     controller: Controller | None = None
     reference: Finite | None = Field(
-        default=None, title="Set point", description="where the file has no column for it"
+        default=None, title="Set point", description="if the file has no column for it"
     )
 
 
@@ -201,7 +203,7 @@ class ReportedStateSpace(TomlTable):
     A: tuple[tuple[TypedNumber, ...], ...] = Field(
         default=(),
         title="A",
-        description="a row a line, two for each cart, states x1, v1, x2, v2, …",
+        description="one row per line, two for each cart, states x1, v1, x2, v2, …",
     )
     # Flat; a column [[b1], [b2], …] is accepted.
     B: tuple[TypedNumber, ...] = Field(default=(), title="B")
@@ -223,7 +225,7 @@ class ReportedFeedback(TomlTable):
     gains: tuple[TypedNumber, ...] = Field(
         default=(),
         title="Gains",
-        description="two a cart, position first: u = prefilter·r − gains·[x1, v1, …]",
+        description="two per cart, position first: u = prefilter·r − gains·[x1, v1, …]",
     )
     prefilter: TypedNumber | None = Field(default=None, title="Prefilter")
     overshoot_percent: TypedNumber | None = Field(
@@ -263,7 +265,7 @@ class Submission(TomlTable):
         default=(),
         max_length=50,
         title="You",
-        description="one line each: id, name (the name may be left out)",
+        description="one line each: id, name (the name is optional)",
     )
     system: System
     design: Design | None = None

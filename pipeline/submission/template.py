@@ -12,13 +12,13 @@ from pipeline.submission.models import MOST_CARTS
 _NOTES = """\
 <!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
 
-     `cartlab report` asks what your data raise, say about zeta_b. Answer under a heading of that
-     name; the answer then appears beside the question:
+     `cartlab report` asks what your data raise, say about zeta_b. Answer under a heading with that
+     name; the report shows the answer below the question:
 
      ## zeta_b
      The decay saw …
 
-     All else is free text: what limits the model? What would you record next? -->
+     Everything else is free text: what limits the model? What would you record next? -->
 """
 
 
@@ -33,7 +33,7 @@ def new_submission(folder: Path, *, carts: int) -> None:
         raise ConfigError(f"carts: expected 1 to {MOST_CARTS}, found {carts}")
     folder = Path(folder)
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(f"{folder}: exists already and not empty; name a new folder")
+        raise ConfigError(f"{folder}: exists already and is not empty; choose a new folder")
     write_templates(folder, carts=carts)
 
 

@@ -95,7 +95,7 @@ def _find_refusal(headers: Headers, method: str, door: Door) -> str:
     """
     origin, site = headers.get("origin"), door.site(headers)
     if not site:
-        return "ask by the address that cartlab printed"
+        return "use the address that cartlab printed"
     if origin != site and (origin is not None or method != "GET"):
         return "another page's request"
     if headers.get("sec-fetch-site", "none") in ("same-origin", "none"):

@@ -1,8 +1,8 @@
-"""A server in a thread of its own, which writes nowhere who asked for what.
+"""A server in its own thread, without an access log.
 
-Anybody on this computer can connect. Connections that have not been let in yet share a fixed number
-of places, so that whoever serves never lacks a descriptor. uvicorn's own limits do not do this: it
-keeps every idle connection, and its `limit_concurrency` refuses whoever comes after them.
+Anybody on this computer can connect. Connections that are not admitted yet share a fixed number of
+places, so that the server never runs out of descriptors. uvicorn's own limits do not do this: it
+keeps every idle connection, and its `limit_concurrency` refuses all later ones.
 """
 
 import asyncio
@@ -66,7 +66,7 @@ class Served:
 
 
 def let_in(scope: Scope) -> None:
-    """Let the connection of a request stay: whoever sent it may ask here."""
+    """Keep the connection of a request, because its sender is admitted."""
     scope["state"]["let_in"]()
 
 

@@ -23,7 +23,7 @@ _SIGNED_ZERO = re.compile(r"[+−]0\.0 %")
 
 
 def significant(value: float | None, *, digits: int = 4, power: bool = False) -> str:
-    """Return a number with `digits` significant digits; a dash where there is none."""
+    """Return a number with `digits` significant digits; a dash for a missing number."""
     if value is None or not math.isfinite(value):
         return NOTHING
     if value == 0:

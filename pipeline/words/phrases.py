@@ -1,9 +1,8 @@
 """Sentences that an instructor may edit or translate: `templates/words/SUBJECT.toml`, by key.
 
-A sentence names the values it takes in braces, marks **strong** words, `code` and [links](#here).
-Code decides which sentence is said and passes the values, already written as text; what stands in
-a value is never markup. A file is read when its first sentence is said: a slip in it is then told
-like any other mistake.
+A sentence has its values in braces and marks **strong** words, `code` and [links](#here). Code
+chooses the sentence and passes the values as text, which is never read as markup. A file is read
+when its first sentence is needed; only then are mistakes in it reported.
 """
 
 import re
@@ -30,7 +29,7 @@ class Phrases:
 
     @cached_property
     def by_key(self) -> Mapping[str, str]:
-        """The sentences as they stand in the file."""
+        """The sentences of the file."""
         where = self._where()
         text = read_text(self.path, where=where, limit=_LARGEST, error=ConfigError)
         found = parse_toml(text, where=where, error=ConfigError)
@@ -53,7 +52,7 @@ class Phrases:
         return tuple(span for span in _spans(self._template(key, values), values) if span.text)
 
     def _template(self, key: str, values: Mapping[str, object]) -> str:
-        """Return a sentence that asks for nothing but these values."""
+        """Return a sentence that uses only these values."""
         known = f"it may name {', '.join(f'{{{v}}}' for v in sorted(values)) or 'no values'}"
         if key not in self.by_key:
             raise ConfigError(f"{self._where()}: the sentence {key} is missing; {known}")

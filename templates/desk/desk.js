@@ -36,7 +36,7 @@ htmx.onLoad(() => {
 });
 document.addEventListener("htmx:sendError", () => {
   const said = document.querySelector("[role=status]");
-  said.textContent = "No answer: the desk was ended, or this was more than it takes at once.";
+  said.textContent = "No answer: the desk has stopped, or the upload is too large.";
 });
 
 // An answer replaces all of #main. Of each page, by its heading, is kept what was typed and not sent with the request; it goes

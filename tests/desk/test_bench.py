@@ -64,7 +64,7 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
         assert first["points"][0][0] < 0.1 < 0.5 < first["points"][-1][0]
         # The room gives notice when it shows the plan again: a page drawn just before then reloads.
         assert heard[0].endswith(b"event: ended\ndata:\n\n")
-        assert "Stopped. Begin again" in visitor.get("/bench/0/").text
+        assert "Stopped. Start again" in visitor.get("/bench/0/").text
         assert visitor.get("/bench/0/events").body == b"event: ended\ndata:\n\n"
         assert visitor.post("/bench/0/press", wish="stop", number="0").status == 404
     while (ended := real.event("run"))["ended"] == "complete":
@@ -202,7 +202,7 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
         assert now > after > best
         said = f"The damping ratio ζ: ± {now:.2g} % now, ± {after:.2g} % after yours"
         assert said in answer.text
-        assert answer.text.index(said) < answer.text.index("What would the program have chosen?")
+        assert answer.text.index(said) < answer.text.index("What would cartlab have chosen?")
         assert 'value="0,01"' in answer.text  # as it was typed
         decay = visitor.get("/bench/0/weigh?kind=decay&seconds=20&cart=1")
         assert "and this is a decay" in decay.text
@@ -236,7 +236,7 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
         assert f'<option value="{NOBODY}">{NOBODY} (used last, not found now)' in page
         begun(visitor, work, "long", port=real.address)
         visitor.post("/bench/0/press", wish="stop", number="0", plain="1")
-        until(lambda: "Stopped. Begin again" in visitor.get("/bench/0/").text)
+        until(lambda: "Stopped. Start again" in visitor.get("/bench/0/").text)
     with DeskServer(folder=work) as server:  # another desk, later
         page = Visitor.of(server.url).get("/bench/0/").text
     first = re.findall(r'<select name="port" id="port"><option value="([^"]+)"', page)

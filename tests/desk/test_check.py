@@ -198,7 +198,7 @@ def test_on_ones_own_computer_the_submission_says_it(tmp_path):
 @pytest.mark.parametrize(
     ("entry", "said"),
     [
-        ('role = "ta"\nrubric = "lab.toml"', "a ta has no rubric"),
+        ('role = "ta"\nrubric = "lab.toml"', "a ta cannot have a rubric"),
         ('role = "student"\nfolders = ["team"]\nrubric = "none.toml"', "there is no such rubric"),
     ],
 )

@@ -15,13 +15,13 @@ USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        (["--host", "127.0.0.1"], "go together"),
-        (["--users", "users.toml"], "go together"),
-        (["team", "--host", "127.0.0.1", "--users", "users.toml"], "the file says"),
+        (["--host", "127.0.0.1"], "need each other"),
+        (["--users", "users.toml"], "need each other"),
+        (["team", "--host", "127.0.0.1", "--users", "users.toml"], "the file lists"),
         (["--host", "127.0.0.1", "--users", "nowhere.toml"], "nowhere.toml"),
         (["--host", "127.0.0.1", "--users", "users.toml"], "users: is required"),
         (["users.toml"], "is a file"),
-        (["nowhere/team"], "there is no folder"),
+        (["nowhere/team"], "does not exist"),
     ],
 )
 def test_what_it_cannot_do_is_one_line(options, why, tmp_path):

@@ -330,7 +330,7 @@ def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
     bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     made = who.post("/exercises/make", out="first", **bench)
     assert made.status == 303
-    until(lambda: "The exercise is made" in who.get(made.headers["location"]).text)
+    until(lambda: "The exercise is ready" in who.get(made.headers["location"]).text)
     assert load_submission(root / "shop" / "first").experiments
     rubric = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
     assert who.post("/rubric/save", file="a.toml", text=rubric, seen="new").status == 303
@@ -379,15 +379,15 @@ def test_forged_names_are_refused(lab):
         ((PROXY + USERS).replace('"ta"', '"boss"', 1), "role"),
         ((PROXY + USERS).replace('secret = "the', 'secrets = "the'), "secret"),
         ((PROXY + USERS).replace("the-proxy-and-the-desk-know-it", "short"), "secret"),
-        ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "another header"),
+        ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "a header other than"),
         ((PROXY + USERS).replace("127.0.0.1", "proxy.lab"), "proxy.address"),
         ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta has no folders"),
         ((PROXY + USERS).replace('"ta"', '"student"'), "a student has no gradebooks"),
-        ((PROXY + USERS).replace('"two"', '"twoo"'), "there is no folder"),
-        ((PROXY + USERS).replace('"shop"', '"shops"'), "there is no folder"),
+        ((PROXY + USERS).replace('"two"', '"twoo"'), "does not exist"),
+        ((PROXY + USERS).replace('"shop"', '"shops"'), "does not exist"),
         (PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n', "a ta has no workshop"),
         (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
-        ((PROXY + USERS).replace('"s2"', '"s1"'), "there twice"),
+        ((PROXY + USERS).replace('"s2"', '"s1"'), "listed twice"),
         (
             (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),
             "in UTF-8 is 'Ã¼' in Latin-1, which is there too",

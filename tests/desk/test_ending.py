@@ -102,8 +102,8 @@ def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
     ("sent", "status", "told"),
     [
         ("memory MainThread", 1, "the desk ends: MemoryError"),
-        ("memory server", 2, "the desk's server ended by itself"),
-        ("exit0 server", 2, "the desk's server ended by itself"),
+        ("memory server", 2, "the desk's server stopped unexpectedly"),
+        ("exit0 server", 2, "the desk's server stopped unexpectedly"),
         ("exit now", 3, "was killed: by kill -9"),
     ],
 )

@@ -99,7 +99,7 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
     )
     assert answer.status == 303
     made = unescape(wait_for(visitor, answer.headers["location"]))
-    assert "2 exercises are made." in made
+    assert "2 exercises are ready." in made
     assert re.findall(r'<th scope="row">(\w+)</th><td>(\d+)</td>', made) == [("1", "5"), ("2", "6")]
     assert told in made
     kinds = re.findall(r"<figcaption>([\w ]+): ", made)
@@ -125,8 +125,8 @@ def test_an_own_chain_and_what_is_wrong_with_it(visitor):
     chain = {"preset": "", "m": "2e-4 3e-4", "c": "5e-4, 5e-4", "k": "0 0.1 0.05"}
     page = shown(visitor, **chain, effect="input_delay")
     assert "input_delay: delay" in page
-    assert "own chain: m needs numbers" in shown(visitor, **(chain | {"m": "2e-4 heavy"}))
-    assert "own chain: chain: m must be positive" in shown(visitor, **(chain | {"m": "0 1e-4"}))
+    assert "custom chain: m needs numbers" in shown(visitor, **(chain | {"m": "2e-4 heavy"}))
+    assert "custom chain: chain: m must be positive" in shown(visitor, **(chain | {"m": "0 1e-4"}))
     wrong = FRICTION | {"coulomb_friction.force.value": "-1"}
     assert "force must be at least 0" in shown(visitor, preset="throne-2dof", **wrong)
     assert visitor.post("/exercises/make", **wrong, out="x", folders="1", seed="0").status == 422
@@ -151,7 +151,7 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
         visitor = Visitor.of(server.url)
         assert visitor.get("/solution/0/solution.html").status == 404
         assert visitor.post("/solution/0/make").status == 303
-        assert "Make it anew" in wait_for(visitor, "/solution/0/")
+        assert "Make it again" in wait_for(visitor, "/solution/0/")
         assert visitor.get("/solution/0/solution.html").status == 200
         values = json.loads(visitor.get("/solution/0/solution.json").body)
     assert values["schema"] == "cartlab-solution/1"

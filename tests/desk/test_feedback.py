@@ -104,7 +104,7 @@ def test_students_see_nothing_before_the_release(lab):
     for path in (HERE, HERE + "whole"):
         assert "points" not in student.get(path).text
     assert student.get(HERE + "whole").status == 404
-    assert "Your feedback is not out." in student.get(HERE).text
+    assert "Your feedback is not published yet." in student.get(HERE).text
     assert ask(student).status == 422
     for name in ("Ada", "s4"):
         assert lab(name).post(ROOM + "release", do="release").status == 403
@@ -115,7 +115,7 @@ def test_students_see_nothing_before_the_release(lab):
     assert "omega_1" in whole.text or "is off" in whole.text
     assert "default-src 'none'" in whole.headers["content-security-policy"]
     lab("prof").post(ROOM + "release", do="hide")
-    assert "Your feedback is not out." in student.get(HERE).text
+    assert "Your feedback is not published yet." in student.get(HERE).text
 
 
 def test_of_another_s_feedback_there_is_no_address(released):
@@ -141,9 +141,9 @@ def test_the_grade_is_the_one_that_the_list_names(released):
     """By exact name in the class that the list names; nothing about the server is shown."""
     six = released("s6")
     assert "team-06" in six.get(HERE).text
-    assert "Your feedback is not out." in six.get("/feedback/1/").text
+    assert "Your feedback is not published yet." in six.get("/feedback/1/").text
     wrong = six.get("/feedback/2/")  # an author's name is not the submission's
-    assert (wrong.status, "your grade cannot be read now" in wrong.text) == (422, True)
+    assert (wrong.status, "your grade cannot be read at the moment" in wrong.text) == (422, True)
     assert [f'href="/feedback/{n}/"' in six.get("/").text for n in range(3)] == [True] * 3
     home = released("s5").get("/").text
     assert '<a href="/feedback/0/">Feedback</a>' in home
@@ -153,8 +153,11 @@ def test_the_grade_is_the_one_that_the_list_names(released):
 @pytest.mark.parametrize(
     ("users", "why"),
     [
-        ('role = "ta"\ngrades = [{ gradebook = "g", submission = "a" }]', "a ta has no grades"),
-        ('role = "student"\ngrades = [{ gradebook = "h", submission = "a" }]', "no folder"),
+        (
+            'role = "ta"\ngrades = [{ gradebook = "g", submission = "a" }]',
+            "a ta cannot have grades",
+        ),
+        ('role = "student"\ngrades = [{ gradebook = "h", submission = "a" }]', "does not exist"),
         ('role = "student"\ngrades = [{ gradebook = "g" }]', "submission"),
         ('role = "student"\ngrades = [{ gradebook = "g", submission = "" }]', "submission"),
         (
@@ -243,7 +246,7 @@ def test_few_requests_wait_at_once(released):
         assert ask(released("s4"), criterion).status == 303
     refused = ask(released("s4"), criteria[MOST_OPEN])
     assert refused.status == 422
-    assert f"{MOST_OPEN} requests of yours wait" in refused.text
+    assert f"{MOST_OPEN} of your requests are waiting" in refused.text
 
 
 def test_the_second_of_two_answers_sees_both(released, book):
@@ -311,7 +314,7 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
     (tmp_path / "grades").rename(tmp_path / "elsewhere")
     for answer in (released("s4").get(HERE), ask(released("s4"))):
         assert answer.status == 422
-        assert "your grade cannot be read now; tell your instructor" in answer.text
+        assert "your grade cannot be read at the moment; tell your instructor" in answer.text
         assert str(tmp_path) not in answer.text
         assert "gradebook" not in answer.text
 

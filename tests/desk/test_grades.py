@@ -121,8 +121,8 @@ def test_the_class_says_who_shares_recordings(ta):
     page = ta.get(ROOM).text
     line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
     assert line
-    assert line.groups() == ("A recording that another submission has too", "2")
-    assert page.count("<td>a recording that another submission has too") == 2
+    assert line.groups() == ("A recording that another submission also contains", "2")
+    assert page.count("<td>a recording that another submission also contains") == 2
     assert "<td>shared_data" not in page
 
 
@@ -455,7 +455,7 @@ def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
     assert upload(ta, ROOM + "import", "table", head + good).status == 303
     assert "2 changes imported" in ta.get(ROOM).text
     upload(ta, ROOM + "import", "table", head + good)
-    assert "0 changes imported, 2 were the same already" in ta.get(ROOM).text
+    assert "0 changes imported, 2 were already the same" in ta.get(ROOM).text
     with Gradebook(grades) as book:
         assert book.entry("team-01").overrides["laws"].why == "clear, at last"
         assert book.entry("Ünal 学生 & co").overrides["pieces"].by == "Ada"
@@ -679,7 +679,7 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
     for wrong, fields in (
         ("needs a reason", {"points": "0.5", "why": " "}),
         ("Expected 0 to 1 points", {"points": "7", "why": "x"}),
-        ("Many: points are a number", {"other": "many", "points": "same", "why": "x"}),
+        ("Many: expected a number of points", {"other": "many", "points": "same", "why": "x"}),
     ):
         answer = apply(ta, together(), sent(page, *names, do="apply", **fields))
         assert answer.status == 422
@@ -751,7 +751,7 @@ def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
     assert f"{len(names)} teams" in shown.text.split('id="sets"')[1]
     ta.post(ROOM + "together", do="undo", set=shown.value("set"))
     page = ta.get(ROOM).text
-    assert f"{len(names) - 1} teams taken back. Changed since, so as before: {names[0]}." in page
+    assert f"{len(names) - 1} teams undone. Kept, because changed since: {names[0]}." in page
     with Gradebook(grades) as book:
         given = {name: book.entry(name).overrides for name in names}
     assert {name: own["laws"].why for name, own in given.items() if own} == {

@@ -150,7 +150,7 @@ def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
         home = unescape(visitor.get("/").text)
     assert "2 submissions and 1 class are open." in home
     assert re.search(r">team</a>\s*<span>\d+ files</span> <span[^>]*>no report<", home)
-    assert re.search(r">grades</a> <span[^>]*>0 of \d+ looked at<", home)
+    assert re.search(r">grades</a> <span[^>]*>0 of \d+ reviewed<", home)
     assert "no plan yet" in home
 
 

@@ -78,7 +78,7 @@ def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch)
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
     job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over)
-    assert (job.state, "no process could be started" in job.said) == ("failed", True)
+    assert (job.state, "its process could not be started" in job.said) == ("failed", True)
 
 
 def test_a_fault_of_our_own_is_told(tmp_path, jobs):
@@ -94,7 +94,7 @@ def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
     job = jobs.start("make_report", title="The report", **given)
     assert jobs.start("make_report", title="The report", **given) is job
-    with pytest.raises(Busy, match="The report is under way"):
+    with pytest.raises(Busy, match="The report is running"):
         jobs.start("make_solution", title="The solution", **given)
     job.stop.set()
     until(lambda: job.over)

@@ -121,7 +121,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
         assert f'href="/rubric/?start={path.stem}"' in page
     assert "20 points in 14 criteria; fits submissions with 3 carts." in page
     assert "Open lab.toml" in page
-    assert "It has mistakes." in page
+    assert "It contains errors." in page
     assert "other.toml" not in page
     begun = visitor.get("/rubric/?start=throne-3dof")
     assert begun.value("file") == str(tmp_path / "rubric-2.toml")
@@ -217,7 +217,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
         shown = visitor.post("/rubric/preview", **fields, **{"class": "0"})
         assert shown.status == 200, shown.text
         text = " ".join(re.sub(r"<[^>]+>", " ", unescape(shown.text)).split())
-        assert "2 of 2 teams would have other points." in text
+        assert "2 of 2 teams would have different points." in text
         assert "of 20 to " in text
         rows = re.findall(r'<tr>\s*<th scope="row">.*?</tr>', shown.text, re.DOTALL)
         assert ["team-2" in rows[0], "team-1" in rows[1]] == [True, True]
@@ -247,7 +247,7 @@ def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
         text = ONE_CART.replace("at_least = 8", "at_least = 9")
         shown = visitor.post("/rubric/preview", **sent(page, lab, text=text), **{"class": "0"})
     assert "<li><code>required</code></li>" in shown.text
-    assert "No team of graded would have other points." in shown.text
+    assert "No team of graded would have different points." in shown.text
 
 
 def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):

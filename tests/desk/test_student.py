@@ -68,7 +68,7 @@ def workers():
 def take_upload(name: str, content: io.BytesIO, folder: Path, *, workers: WorkerPool) -> list[str]:
     """Upload one file; return the message."""
     said = take_uploads([(name, content)], folder, workers=workers)
-    assert all(("not taken" in line.text) == (line.tone == "refused") for line in said)
+    assert all(("not uploaded" in line.text) == (line.tone == "refused") for line in said)
     return [line.text for line in said]
 
 
@@ -140,7 +140,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     assert visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "29.13"}).status == 303
     assert "The report is out of date" in visitor.get(HERE).text
     assert "report/report.pdf" not in zipped(visitor).namelist()  # nobody submits a stale report
-    assert "The report in the zip is of the files and answers as they are now" in handed_in(visitor)
+    assert "The report in the zip matches your current files and answers" in handed_in(visitor)
     assert "29.13" in visitor.get(HERE + "report/report.html").text
     packed = visitor.get(HERE + "hand-in.zip")
     new = zipfile.ZipFile(io.BytesIO(packed.body)).read("report/report.pdf")
@@ -182,7 +182,7 @@ def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)
     assert 'id="system-position-unit-asked"' in page.text
-    assert "a count has no fractions" in page.text
+    assert "counts are whole numbers" in page.text
     given = {"system.position.unit": "furlong"}
     visitor.post(HERE + "save", seen=page.value("seen"), **given)
     page = visitor.get(HERE)
@@ -258,7 +258,7 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
     page = unescape(visitor.get(HERE).text)
     names = ["a-b.csv", "a-b-2.csv", "a-b-3.csv", "a-b-4.csv"]
     assert sorted(path.name for path in (folder / "data").iterdir()) == sorted(names)
-    said = "'a\\xa0b.csv': taken as a-b.csv; no name may have characters that do not show"
+    said = "'a\\xa0b.csv': saved as a-b.csv; names may not contain invisible characters"
     assert said in page
     assert {e.file for e in load_submission(folder).experiments} <= {f"data/{n}" for n in names}
     assert all(f"{name} <small>" in page for name in names)
@@ -371,7 +371,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
-    assert page.count("No report of these files says it.") == 2
+    assert page.count("Not known without a current report.") == 2
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
@@ -380,8 +380,8 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     (folder / "report").symlink_to(folder.parent)
     page = handed_in(visitor)
     assert "is a link" in page
-    assert "No report has been made: the zip goes without one." in page
-    assert page.count("No report of these files says it.") == 2  # not: none, nothing
+    assert "There is no report yet, so the zip has none." in page
+    assert page.count("Not known without a current report.") == 2  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 
@@ -401,9 +401,9 @@ def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
     visitor, folder = filled
     (folder / "data" / "new.csv").write_bytes(b"")
     page = visitor.get(HERE).text
-    assert ("the file is empty" in page, "what its columns are" in page) == (True, False)
+    assert ("the file is empty" in page, "state its columns" in page) == (True, False)
     (folder / "data" / "new.csv").write_text("a,b\n1,2\n3,4\n5,6\n", encoding="utf-8")
-    assert "what its columns are" in visitor.get(HERE).text
+    assert "state its columns" in visitor.get(HERE).text
 
 
 def test_an_essay_and_an_empty_file_are_no_recordings(filled):
@@ -424,7 +424,7 @@ def test_a_recording_that_was_cut_short_is_not_green(filled):
     file.write_bytes(file.read_bytes()[:-3].rpartition(b",")[0])
     page = visitor.get(HERE).text
     assert 'id="kind-decay" open' in page
-    assert "the file was cut short: export it again" in page
+    assert "the file is truncated: export it again" in page
 
 
 def test_edits_from_outside_show_and_are_not_written_over(filled):
@@ -581,12 +581,12 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
     sound = (folder / NAME).read_bytes()
     (folder / NAME).unlink()
     visitor.upload(HERE + "files", [(NAME, broken)])
-    assert "not taken" in visitor.get(HERE).text
+    assert "not uploaded" in visitor.get(HERE).text
     (folder / NAME).write_bytes(broken)  # by an editor
     visitor.upload(HERE + "files", [(NAME, sound)])
     assert load_submission(folder).experiments
     visitor.upload(HERE + "files", [(NAME, b"version = 1\n")])
-    assert "there is one already" in unescape(visitor.get(HERE).text)
+    assert "it exists already" in unescape(visitor.get(HERE).text)
     assert (folder / NAME).read_bytes().startswith(sound[:200])
 
 
@@ -595,7 +595,7 @@ def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, 
     """By the limit on what is read."""
     for name in ("notes.md", "there/notes.md"):
         (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
-        assert "not taken" in said
+        assert "not uploaded" in said
     (tmp_path / "notes.md").write_bytes(broken)
     assert take_upload("notes.md", io.BytesIO(b"So."), tmp_path, workers=workers) == []
     assert (tmp_path / "notes.md").read_bytes() == b"So."
@@ -682,7 +682,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
         zipped(("big.csv", bytes(30_000_000))), zipped(("../out.csv", b"x")), io.BytesIO(b"PK"),
     ):  # fmt: skip
         (said,) = take_upload("b.zip", wrong, tmp_path, workers=workers)
-        assert "not taken" in said
+        assert "not uploaded" in said
     assert [path.name for path in tmp_path.rglob("*.csv")] == ["a.csv"]
 
 
@@ -699,7 +699,7 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
     assert "at most 2 files and 15 bytes" in said
     three = [(f"{n}.csv", io.BytesIO(b"123456"[:n])) for n in (4, 5, 6)]
     (said,) = take_uploads(three, tmp_path / "whole", workers=workers)
-    assert said.text.startswith("'6.csv': not taken: a hand-in has at most 2 files")
+    assert said.text.startswith("'6.csv': not uploaded: a submission has at most 2 files")
 
 
 def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
@@ -768,7 +768,7 @@ def test_the_gap_is_looked_for_as_a_job(filled):
 
 def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
     """In the words of the command; the process goes on."""
-    with pytest.raises(Failed, match="no recording in it"):
+    with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
     with pytest.raises(Failed, match="leaves"):
         workers.do("look_at_file", folder=str(tmp_path), file="../x.csv", columns={})
@@ -794,7 +794,7 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
     (folder / "data" / "away.csv").symlink_to(__file__)
     page = unescape(visitor.get(HERE).text)
     assert "<b>data/book.ods</b>: a spreadsheet; save each recording as .xlsx or .csv" in page
-    assert "put the file itself here in place of the link" in page
+    assert "replace the link with the file itself" in page
     assert "&lt;b&gt;.docx" in visitor.get(HERE).text
 
 
@@ -817,10 +817,10 @@ def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
     submission = load_submission(folder)
     assert (submission.system.position.unit, submission.title) == ("cm", "Mine")
     assert "Use cm" not in answers(visitor.get(HERE).text)
-    assert "a count has no fractions" not in (folder / NAME).read_text(encoding="utf-8")
+    assert "counts are whole numbers" not in (folder / NAME).read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("There is one", True)])
+@pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("Spring present", True)])
 def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
     """Either way the doubt disappears, even if the answer confirms the file."""
     visitor, folder = room
@@ -844,10 +844,10 @@ def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
     asked.write_text(json.dumps(told), encoding="utf-8")
     page = visitor.get(HERE)
     assert "all steps go down" in page.text
-    answer = answers(page.text)["Turn the sign"]
+    answer = answers(page.text)["Reverse the sign"]
     assert visitor.post(HERE + "save", seen=page.value("seen"), answer=answer).status == 303
     assert load_submission(folder).system.input.sign == -1
-    assert "Turn the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
+    assert "Reverse the sign" not in answers(visitor.get(HERE).text)  # the report is out of date
 
 
 def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
@@ -994,8 +994,8 @@ def test_what_was_not_taken_does_not_look_like_what_was(room):
     files = unescape(visitor.get(HERE).text).partition('id="files"')[2]
     said = dict(re.findall(r'<p class="said (\w+)">(.*?)</p>', files))
     assert "written into" in said["done"]
-    assert said["changed"] == "'a.csv': taken as a-2.csv"
-    assert "'plot.py': not taken" in files
+    assert said["changed"] == "'a.csv': saved as a-2.csv"
+    assert "'plot.py': not uploaded" in files
     assert said["refused"]
 
 

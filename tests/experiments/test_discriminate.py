@@ -400,4 +400,4 @@ def test_the_recording_is_a_plan_entry_that_can_be_recorded(proposed, tmp_path):
             analysis,
         )
     )
-    assert "tells best which of these acts" in html
+    assert "decides best between the two" in html

@@ -94,7 +94,7 @@ def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
     assert status == 0
     assert err.splitlines() == [
         "no longer in the class: team-02, team-03",
-        "with points given by hand, which count no more: team-02",
+        "their points given by hand no longer count: team-02",
     ]
     assert run("remove", grades, "team-02")[0] == 2
 
@@ -156,7 +156,7 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
     status, out, err = run("export", grades, "--lms", lms)
     assert (status, out) == (0, "")
     assert f"wrote {grades / lms}.csv" in err
-    assert "nobody is named in it, so not exported: broken" in err
+    assert "it names no author, so not exported: broken" in err
     run("export", grades, "--lms", lms, "--out", tmp_path / "elsewhere", "--title", "Lab")
     assert (tmp_path / "elsewhere" / f"{lms}.csv").is_file()
 
@@ -173,7 +173,7 @@ def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
     assert (folder / "gs.csv").read_bytes() == (tmp_path / f"{lms}.csv").read_bytes()
     status, _, err = run("export", grades, "--lms", lms, "--out", tmp_path / "gs.xlsx")
     assert status == 2
-    assert "gs.xlsx: several files are written; name a folder" in err
+    assert "gs.xlsx: this writes several files; give a folder" in err
 
 
 def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
@@ -204,7 +204,7 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
         "late.csv: no such submission: team-9",
         "team-1: the submission is for 1 cart, the rubric for 2",
         "team-2: the submission is for 1 cart, the rubric for 2",
-        "not one could be graded: is throne-2dof the rubric for these submissions?",
+        "no submission could be graded: is throne-2dof the rubric for these submissions?",
         f"0 of 2 graded; wrote {out}",
     ]
     with (out / "grades.csv").open(newline="", encoding="utf-8") as file:
@@ -212,7 +212,7 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
     inside = tmp_path / "c" / "team-1" / "grades"
     status, _, err = run("grade", tmp_path / "c", "--rubric", "throne-2dof", "--out", inside)
     assert (status, inside.exists()) == (2, False)
-    assert "is in a submission; name a folder outside of it" in err
+    assert "is inside a submission; choose a folder outside it" in err
 
 
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
@@ -233,7 +233,7 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
     words = ("grade", tmp_path / "c", "--rubric", "throne-1dof", "--out", out, "--jobs", 1,
              "--anonymous", "--no-figures", "--lateness", late)  # fmt: skip
     said = [run(*words)[2]]
-    assert "1 folder passed over: they look like results of a grading" in said[0]
+    assert "1 folder skipped: they look like results of a grading" in said[0]
     assert "late.csv: no such submission: 1 name" in said[0]
     assert re.search(r"anon-\w+: anon-\w+/submission.toml: system.carts", said[0])
     run("override", out, "roe-richard", "pieces", "1", "--why", "x", "--by", "Ada")
@@ -288,7 +288,7 @@ def test_a_survey_is_told_on_stdout(run, tmp_path):
     status, out, err = run("survey", file)
     assert status == 0
     assert out.startswith("| Question ")
-    assert err == "left out, no question of either table: Timestamp\n"
+    assert err == "left out, because no table has these questions: Timestamp\n"
     assert json.loads(run("survey", file, "--json")[1])["students"] == 13
 
 

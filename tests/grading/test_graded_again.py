@@ -85,7 +85,7 @@ def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, 
     (own / "notes.md").write_text("one more word", encoding="utf-8")
     outcome = grade_task(known, rubric=RUBRIC, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
-    assert outcome.reason == "its files changed while the class was graded: grade it again"
+    assert outcome.reason == "its files changed during the grading: grade it again"
 
 
 def test_the_version_covers_what_it_computes_with(monkeypatch):

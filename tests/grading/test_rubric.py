@@ -90,19 +90,19 @@ def test_a_pattern_is_written_out(tmp_path):
             17,
             r"\.chek \(gains\): unknown key; did you mean 'chec",
         ),
-        ('check = "final"\n', "", 14, r"check \(gains\): is required and not there; known: req"),
+        ('check = "final"\n', "", 14, r"check \(gains\): is required and missing; known: req"),
         ("points = 2", "points = two", 16, r"points takes a number, written in digits; found po"),
         (
             "version = 1",
             "version = 1\nstep = 0.4",
             23,
-            r"points \(model\): 1\.5 is no multiple of st",
+            r"points \(model\): 1\.5 is not a multiple of st",
         ),
         (
             "version = 1",
             "version = 1\nstep = 0.125",
             2,
-            r"step: 0\.125: points go to the hundredth",
+            r"step: 0\.125: points have at most two decimals",
         ),
         ("[required]", "[flags]\nwrong_state = 1\n[required]", 9, r"you mean 'wrong_state_space'"),
         (
@@ -116,11 +116,11 @@ def test_a_pattern_is_written_out(tmp_path):
         ('parameters = ["K_*"]', 'parameters = ["L_*"]', 18, r"no parameter 'L_\*'"),
         ('kind = "step"', 'kind = "stop"', 12, r"kind: expected .*did you mean 'step'"),
         ('requires = ["gains"]', 'requires = ["gians"]', 24, r"'gians' is no criterion; did you"),
-        ('id = "model"', 'id = "gains"', 21, r"'gains' is used before"),
+        ('id = "model"', 'id = "gains"', 21, r"'gains' was used before"),
         ("[false, true, true]", "[true]", 5, r"expected 3 values \(wall-1, 1-2, 2-wall\), found 1"),
         ("version = 1", "version = 2", 1, r"version: expected 1, found 2"),
         ("points = 1.5", "points = 1.5\nfull_percent = 30", 23, r"full_percent .*more than none"),
-        ("points = 1.5", "points = 0.333", 22, r"points \(model\): 0.333: points go to the hund"),
+        ("points = 1.5", "points = 0.333", 22, r"points \(model\): 0.333: points have at most two"),
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
@@ -184,5 +184,5 @@ def test_every_remark_has_its_cost():
 
 def test_toml_that_is_none_says_where(tmp_path):
     """A syntax error keeps the line given by the parser."""
-    with pytest.raises(ConfigError, match=r"line 2: nothing stands after the =; found title ="):
+    with pytest.raises(ConfigError, match=r"line 2: the value after = is missing; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

@@ -281,8 +281,8 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
     }  # fmt: skip
     refused = found["data/a.csv"]
     assert refused.inspection is None
-    assert "leaves the submission folder through a link" in refused.remarks[0]
-    assert refused.advice == "put the file itself here in place of the link"
+    assert "is outside the submission folder, through a link" in refused.remarks[0]
+    assert refused.advice == "replace the link with the file itself"
 
 
 def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
@@ -291,7 +291,9 @@ def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
     (tmp_path / "theirs" / "data" / "grades.xls").write_bytes(b"PK")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs" / "data")
-    with pytest.raises(ConfigError, match="leaves the submission folder through a link") as told:
+    with pytest.raises(
+        ConfigError, match="is outside the submission folder, through a link"
+    ) as told:
         fill_submission(tmp_path / "mine")
     assert "grades" not in str(told.value)
     assert "a.csv" not in str(told.value)
@@ -307,10 +309,10 @@ def test_a_name_that_does_not_show_is_named(mark, tmp_path):
     assert mark not in done.stdout + done.stderr
     (line,) = [line for line in done.stdout.splitlines() if line.startswith("! ")]
     assert f"data/step{ascii(mark)[1:-1]}1.csv" in line
-    assert "a character that does not show: rename the file" in line
+    assert "an invisible character: rename the file" in line
     assert [e.file for e in load_submission(tmp_path).experiments] == ["data/b.csv"]
     (tmp_path / "data" / "b.csv").unlink()
-    with pytest.raises(ConfigError, match="does not show: rename the file"):
+    with pytest.raises(ConfigError, match="an invisible character: rename the file"):
         fill_submission(tmp_path)
 
 
@@ -454,7 +456,7 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
     assert told == {
         "data/a.csv": ("new", ""),
         "data/book.ods": ("not_read", "save each recording as .xlsx or .csv"),
-        "data/scope.rec": ("not_read", "end it in .csv"),
+        "data/scope.rec": ("not_read", "rename it to end in .csv"),
         "data/film.mp4": ("not_read", ""),
         "spare.csv": ("not_read", "move it into data/"),
     }

@@ -42,7 +42,7 @@ def test_the_essentials_are_told(tmp_path):
     assert [column.role for column in got.columns] == ["time", "input", "x1", None]
     assert got.columns[2].high == pytest.approx(0.681)
     assert got.columns[2].step == pytest.approx(0.00227, rel=1e-6)
-    assert got.problems == ("no role for remark: name them in `columns` to use them",)
+    assert got.problems == ("not used: remark; name them in `columns` to use them",)
 
 
 KINDS = {
@@ -85,13 +85,16 @@ def _frozen() -> np.ndarray:
 
 uneven = np.cumsum(np.random.default_rng(1).uniform(0.003, 0.007, T.size))
 PROBLEMS = {
-    "stuck": ({"time": T, "x1": _frozen()}, "'x1' stands still at speed from 2.495 s to 2.695 s"),
+    "stuck": (
+        {"time": T, "x1": _frozen()},
+        "'x1' stands still while the cart moves fast, from 2.495 s to 2.695 s",
+    ),
     "dead": ({"time": T, "x1": X, "x2": 0 * T}, "'x2' never changes"),
     "clipped": (
         {"time": T, "x1": X, "input": np.clip(2 * np.sin((2 + T) * T), -1.5, 1.5)},
         "the input is clipped at 1.5",
     ),
-    "gap": ({"time": T + (T > 5), "x1": X}, "time is missing between 5 s and 6.005 s"),
+    "gap": ({"time": T + (T > 5), "x1": X}, "there is a gap in time between 5 s and 6.005 s"),
     "rounding": ({"time": np.round(T * 1.013, 3), "x1": X}, "time stamps rounded to 0.001 s"),
     "uneven": ({"time": uneven, "x1": X}, "the sample interval varies by 2"),
     "pasted": ({"time": np.r_[T, T], "x1": np.r_[X, X]}, "line 2002: time goes back"),
@@ -120,7 +123,7 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
     assert got.samples == 2000
     (problem,) = got.unusable
     assert got.problems == (problem,)
-    assert problem.startswith("line 2002: expected 2 columns, found 1; the file was cut short")
+    assert problem.startswith("line 2002: expected 2 columns, found 1; the file is truncated")
 
 
 def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
@@ -167,7 +170,7 @@ def test_columns_without_a_clock_get_no_suggestion(tmp_path):
     got = inspect_file(tmp_path / "a.mat")
     assert got.needs == ("columns", "sample_rate")
     (said,) = got.problems
-    assert "say in submission.toml which is what, by their numbers from 1: columns = {" in said
+    assert "state their roles in submission.toml, by their numbers from 1: columns = {" in said
     assert "state sample_rate = … (Hz)" in said
 
 

@@ -337,7 +337,9 @@ def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
     late = T + np.where(T > 2.0, 0.7, 0.0)
     record = read(tmp_path, "", STEP, csv(time=late, input=U, x1=X1)).records[0]
     assert record.t.size == N
-    assert any(note.startswith("time is missing between 1.992 s and 2.70") for note in record.notes)
+    assert any(
+        note.startswith("there is a gap in time between 1.992 s and 2.70") for note in record.notes
+    )
 
 
 def test_columns_that_are_not_used_are_mentioned(tmp_path):
@@ -353,7 +355,9 @@ def test_a_broken_channel_is_noted(tmp_path):
     x = np.round(440 * 5 * np.sin(6 * T))
     x[200:240] = x[199]
     record = read(tmp_path, "", 'kind = "sweep"', csv(time=T, input=sweep, x1=x)).records[0]
-    assert any("'x1' stands still at speed from 1.76" in note for note in record.notes)
+    assert any(
+        "'x1' stands still while the cart moves fast, from 1.76" in note for note in record.notes
+    )
     assert "the input is clipped at 1" in record.notes
 
 
@@ -452,7 +456,7 @@ def test_data_that_do_not_tell_the_sign_are_said_to(tmp_path):
     """If cart 1 is not measured, the sign is taken as +1, with a note."""
     data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
     assert_array_equal(data.records[0].u, U)
-    assert "the data do not tell the sign of the input" in data.warnings[0]
+    assert "the data do not show the sign of the input" in data.warnings[0]
 
 
 def test_a_dwell_carries_its_frequency(tmp_path):

@@ -53,7 +53,7 @@ def test_an_answer_is_replaced_added_and_taken_away():
 
 def test_a_heading_that_would_end_the_answer_is_refused():
     """Text that the report would not show as the answer is refused."""
-    with pytest.raises(SubmissionError, match="begins with ###"):
+    with pytest.raises(SubmissionError, match="must start with ###"):
         with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
 

@@ -103,9 +103,9 @@ def test_the_report_has_a_section_on_the_changes():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("not json", "no results.json of cartlab"),
+        ("not json", "not a results.json of cartlab"),
         ('{"schema": "cartlab-gap/1"}', "schema: expected 'cartlab-results/1', found"),
-        ("[" * 10_000, "no results.json of cartlab"),
+        ("[" * 10_000, "not a results.json of cartlab"),
         ("{}", "schema: Field required"),
     ],
 )

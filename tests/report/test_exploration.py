@@ -67,11 +67,11 @@ def test_the_answer_comes_first_and_each_turn_has_the_run_that_decided(tmp_path)
     page = write_diary(turns, two_cart_analysis(), tmp_path, wanted=0.01).read_text("utf-8")
 
     titles = re.findall(r"<h[23][^>]*>([^<]+)", page)
-    assert titles[:2] == ["What is known", "Turn by turn"]
+    assert titles[:2] == ["Results", "Turn by turn"]
     assert titles[2].startswith("1. After 20")
     answer, story = page.split('<section id="turns"')
     assert "Coulomb" in answer
-    assert "The carts as they are known now" in answer
+    assert "The carts as known now" in answer
     decided = deciding_trace(gap, turns[0].recorded)
     assert decided is not None
     assert f"Cart {decided.cart} in {turns[0].recorded[0]}" in story

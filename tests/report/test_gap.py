@@ -204,7 +204,7 @@ def test_a_name_stands_on_top_with_its_numbers():
     text = page_of(make_gap()).text
 
     assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
-    assert "falls from 15.3 % of the motion to 4.1 %; noise alone makes 3.0 %" in text
+    assert "falls from 15.3 % of the motion to 4.1 %; noise alone accounts for 3.0 %" in text
     assert text.index("explains what") < text.rindex("Where the linear model fails")
 
 
@@ -225,7 +225,7 @@ def test_a_stretch_without_a_phase_is_told_in_words():
     (window,) = gap.left
     text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
 
-    assert "(the whole stretch alike)" in text
+    assert "(evenly over the whole stretch)" in text
     assert "throughout" not in text
 
 
@@ -265,19 +265,19 @@ def test_the_page_of_none_speaks_of_no_effects():
     for wrong in (
         "With no effect",
         "Where the linear model fails",
-        "what each model leaves",
+        "the residual of each model",
         "before (ring)",
         "was then tried at every place",
     ):
         assert wrong not in page.text
     assert "with the effects" not in html_of(gap)  # nor in the legends of the figures
     assert tones(gap) == ["good", ""]
-    assert "Error of every run beside its noise" in page.text
+    assert "Error and noise of every run" in page.text
     assert "cart 1 up to" in page.text
     assert "the input up to 0.0500 V" in page.text
     # Of the noise's 3 %: the root of 1.15 - 1, where a search begins.
     assert "by more than about 1.2 % of their motion" in page.text
-    assert page.text.index("What to do next") < page.text.rindex("Error of every run")
+    assert page.text.index("What to do next") < page.text.rindex("Error and noise of every run")
     assert "What to do next." in terminal_verdict(gap)
 
 
@@ -322,7 +322,7 @@ def test_two_explanations_are_both_told():
 
     assert "Dry (Coulomb) friction on cart 2, or quadratic drag on cart 2" in text
     assert "these data cannot tell which" in text
-    assert "What would tell them apart. Steps of three sizes." in text
+    assert "The experiment that would tell them apart. Steps of three sizes." in text
     assert find_effect("quadratic_drag").deciding_run in text
     assert "explains what" not in text
 
@@ -343,10 +343,10 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
     text = page_of(gap).text
 
     assert "explains part of what the linear model leaves out" in text
-    assert "So 4.1 times as much is left" in text
+    assert "The error is still 4.1 times that" in text
     assert "step-b, cart 2, from 2.00 to 2.60 s (velocity near zero)" in text
     assert "Where the model with its effects fails most" in text
-    assert "is left, most of it" not in terminal_verdict(make_gap())
+    assert "its largest part is in" not in terminal_verdict(make_gap())
 
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained"])
@@ -354,13 +354,15 @@ def test_the_force_left_has_a_picture_and_its_formula(verdict):
     """The unexplained force is drawn for each cart, with a formula that is not an effect."""
     page = page_of(make_gap(verdict))
 
-    assert "What force is left" in page.text
+    assert "The unexplained force" in page.text
     assert "Not in the catalogue" in page.text
     assert "f = -0.1 v|v| + 0.02 |u| sign v" in page.text
-    alts = [alt for alt in page.values("aria-label") if alt.startswith("Force left on cart 2")]
+    alts = [
+        alt for alt in page.values("aria-label") if alt.startswith("Unexplained force on cart 2")
+    ]
     assert len(alts) == 1
 
-    assert "What force is left" not in page_of(make_gap()).text
+    assert "The unexplained force" not in page_of(make_gap()).text
 
 
 def test_an_answer_so_far_is_said_to_be_one():

@@ -171,7 +171,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
     ids = Counter(re.findall(r'\sid="([^"]*)"', page))
     assert [id_ for id_, n in ids.items() if n > 1] == []
     assert len(data_of(page)["runs"]) == 36
-    assert "36 runs. The linear model is furthest off in" in page
+    assert "36 runs. The linear model fits worst in" in page
 
 
 def test_what_a_stranger_wrote_is_text():
@@ -197,4 +197,4 @@ def test_without_carts_the_measured_motion_is_there():
     runs = data_of(page)["runs"]
     assert all(not cart["models"] for run in runs for cart in run["carts"])
     assert {run["note"] for run in runs} == {"no model: the carts were not identified"}
-    assert "No model could be held against them" in page
+    assert "No model could be compared with them" in page

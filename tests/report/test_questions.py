@@ -76,14 +76,14 @@ def test_a_damping_that_changed_asks_for_the_amplitudes():
     (question,) = ask(off("zeta_b", 65.0))
     assert (question.id, question.section) == ("zeta_b", "parameters")
     assert question.text.startswith(
-        "zeta_b changed by 65.0 % from the decay to the Bode fit: which"
+        "zeta_b changed by 65.0 % from the decay to the Bode fit. Which"
     )
     assert "saw the larger amplitude" in question.text
 
 
 @pytest.mark.parametrize(
     ("name", "expected"),
-    [("K_1", "stops short of where its springs"), ("omega_1", "which masses and which springs")],
+    [("K_1", "short of its spring equilibrium"), ("omega_1", "Which masses and which springs")],
 )
 def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
     """A gain asks about sticking, a frequency about the carts that were free."""
@@ -96,9 +96,9 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
     """A damping assumed three times too large: its peak is sharper; too small: flatter."""
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
-    assert "is sharper than that" in question.text
+    assert "is sharper than assumed" in question.text
     (question,) = ask(off("zeta_a", 148.0, source="assumed"))
-    assert "is flatter than that" in question.text
+    assert "is flatter than assumed" in question.text
     assert "the program assumed" in question.text
     assert ask(off("zeta_a", 20.0, source="assumed")) == ()
 
@@ -140,7 +140,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
     assert isinstance(stuck, StepGain)
     (question,) = ask(replace(analysis, step_gains=(stuck,)))
     assert question.id == "sticking-1"
-    assert "23.1 to 26.4" in question.text
+    assert "between 23.1 and 26.4" in question.text
 
 
 def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():

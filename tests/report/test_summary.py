@@ -88,7 +88,7 @@ def test_an_independent_check_is_not_called_the_same():
     assert "identified from 23 sine dwells, by" in text
     assert "sweep" not in text.splitlines()[0]  # no number rests on it
     notes = plain_of(parameter_blocks(Page(analysis)))
-    assert "ω_a, ω_b: initial and final estimate rest on the same recordings" in notes
+    assert "ω_a, ω_b: initial and final estimates use the same recordings" in notes
 
 
 def plain_of(blocks) -> str:
@@ -109,8 +109,10 @@ def test_the_sources_of_the_table_are_those_there_are():
         replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
         for row in analysis.rows
     )
-    assert "free swing" in plain_of(parameter_blocks(Page(analysis)))
-    assert "free swing" not in plain_of(parameter_blocks(Page(replace(analysis, rows=without))))
+    assert "free decays of single" in plain_of(parameter_blocks(Page(analysis)))
+    assert "free decays of single" not in plain_of(
+        parameter_blocks(Page(replace(analysis, rows=without)))
+    )
 
 
 def test_a_check_that_nobody_foresaw_is_named_too():
@@ -149,7 +151,7 @@ def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
     assert "No carts were identified" not in advice
     if "sine" in drop:
         assert analysis.fit is None
-        assert "Record sine dwells over the resonances, or a step or sweep with all" in advice
+        assert "Record sine dwells near the resonances, or a step or sweep with all" in advice
     else:
         assert "add a step with all carts free" in advice
     assert every_failed_check_is_named(analysis)

@@ -22,8 +22,8 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
     true = {row.name: row.final.value for row in rows if row.final}
     mine = {"K": f"{true['K']:.3g}", "omega_n": f"{true['omega_n'] / 6.2832:.3g}"}
     shown = page(rows, {"initial": {}, "final": {k: Decimal(v) for k, v in mine.items()}})
-    assert "what you report of ω_n:" in terminal_summary(shown.analysis)
-    assert "what you report" not in terminal_summary(page(rows).analysis)
+    assert "the values you report for ω_n:" in terminal_summary(shown.analysis)
+    assert "the values you report" not in terminal_summary(page(rows).analysis)
     table = reported_table(shown)
     gain, frequency = ([plain(cell.text) for cell in row] for row in table.rows)
     assert gain[2] == mine["K"]

@@ -117,7 +117,7 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
     assert done.returncode == 1
     reasons = {
         "decay-1a": "there is no file 'data/decay-1a.csv'",
-        "step-1": "data/step-1.csv line 41: 'input' is no number: 'x'",
+        "step-1": "data/step-1.csv line 41: 'input' is not a number: 'x'",
     }
     failed = {check["id"] for check in found["checks"] if check["outcome"] == "fail"}
     assert failed == {f"data.{name}" for name in reasons}

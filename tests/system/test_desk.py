@@ -87,7 +87,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         with window.expect_navigation():  # to a page that has its scripts, which take the files
             window.get_by_role("button", name="Open").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("team")
-        stands = window.get_by_label("Where this stands")
+        stands = window.get_by_label("Current state")
 
         window.locator("#drop").set_input_files(FILES)
         expect(window.locator("table.files tbody tr")).to_have_count(len(FILES))
@@ -140,7 +140,9 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window.locator("#details").get_by_role("button", name="Save").click()
         expect(stands).to_contain_text("The report is out of date")
         window.get_by_role("button", name="Hand in", exact=True).click()
-        expect(window.get_by_text("The report in the zip is of the files")).to_be_visible()
+        expect(
+            window.get_by_text("The report in the zip matches your current files")
+        ).to_be_visible()
         assert "Two carts" in (folder / "report" / "report.html").read_text(encoding="utf-8")
         assert fits(window)
         with window.expect_download() as download:
@@ -148,7 +150,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         with zipfile.ZipFile(download.value.path()) as archive:
             assert {NAME, "notes.md", "report/report.pdf"} <= set(archive.namelist())
         window.reload()
-        way = window.get_by_label("The way").get_by_role("listitem")
+        way = window.get_by_label("Steps").get_by_role("listitem")
         expect(way.filter(has_text="Report")).to_contain_text("done")
     submission = load_submission(folder)
     assert submission.title == "Two carts"
@@ -191,7 +193,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
         expect(button).to_have_class("main")  # it is what comes next
         go_to(button)
         window.keyboard.press("Space")
-        stands = window.get_by_label("Where this stands")
+        stands = window.get_by_label("Current state")
         answer = stands.get_by_role("link", name=re.compile("Answer . question"))
         expect(answer.or_(stands.get_by_role("button", name="Hand in"))).to_be_visible()
         if answer.count():
@@ -231,7 +233,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
         note = window.locator("#experiments-1-note")
         note.evaluate("note => { note.value = 'bumped' }")  # typed, and the row not left
         window.locator("#row-0 summary").click()
-        window.locator("#row-0").get_by_role("button", name="Take it out").click()
+        window.locator("#row-0").get_by_role("button", name="Remove").click()
         expect(window.get_by_text("Saved.")).to_be_visible()
         expect(window.locator("#experiments-0-note")).to_have_value("bumped")
         expect(window.locator("#experiments-0-note")).to_be_visible()
@@ -244,7 +246,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
         heading = window.get_by_role("heading", level=1)
         expect(heading).to_have_text(f"{NAME} was changed meanwhile")
         expect(window.get_by_text("Nothing was written")).to_be_visible()
-        window.get_by_role("link", name="Go on").click()
+        window.get_by_role("link", name="Continue with the current file").click()
         expect(heading).to_have_text("team")
         expect(title).to_have_value("typed")
         details.get_by_role("button", name="Save").click()
@@ -298,7 +300,7 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
             expect(within.get_by_role("alert")).to_have_count(shown + 1)
         assert not {"hand-in", "make-report", "make-gap"}.intersection(asked)
         assert violations(window) == []
-        window.get_by_role("button", name="hand in without it").click()  # all the same
+        window.get_by_role("button", name="hand in without them").click()  # all the same
         with window.expect_download() as download:
             window.get_by_role("link", name="Download the zip").click()
         with zipfile.ZipFile(download.value.path()) as archive:
@@ -322,7 +324,7 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
         unfold(window)
         title.fill("typed again")
         window.get_by_role("button", name="Make the report again").click()
-        window.get_by_role("button", name="go on without it").click()
+        window.get_by_role("button", name="continue without them").click()
         expect(window.locator("[data-events]")).to_contain_text("The report")
         expect(title).to_have_value("typed again")
 

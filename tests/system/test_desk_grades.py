@@ -62,12 +62,12 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
     grades = write_class(tmp_path / "grades")
     with DeskServer(folder=grades) as server:
         window = show(server.url, size=LAPTOP)
-        on_screen = window.get_by_role("link", name="Go on with =cmd'C'!A0")
+        on_screen = window.get_by_role("link", name="Continue with =cmd'C'!A0")
         expect(on_screen).to_be_in_viewport()  # the result and the next action come first
         window.get_by_role("link", name="Hz where rad/s is asked").press("Enter")
         expect(window.locator("#teams tbody tr")).to_have_count(5)
         teams = window.locator("#teams tbody th").all_inner_texts()
-        window.get_by_role("link", name="Begin with the first").press("Enter")
+        window.get_by_role("link", name="Start with the first").press("Enter")
         heading = window.get_by_role("heading", level=1)
         expect(heading).to_have_text(teams[0])
         signed(window, "Ada")
@@ -183,7 +183,7 @@ def test_two_at_once_see_what_the_other_did(show):
             expect(bob.locator("tbody td")).to_have_text(both)
             assert fits(bob)
             with bob.expect_navigation():
-                bob.get_by_role("link", name="Go on").click()
+                bob.get_by_role("link", name="Continue with").click()
             expect(bob.locator("#chosen .hand")).to_contain_text("as Ada sees it")
         with Gradebook(place) as book:
             given = book.entry("team-04").overrides["laws"]
@@ -201,7 +201,7 @@ def test_an_anonymous_class_shows_no_name(show, tmp_path):
         window.on("request", lambda request: asked.append(request.url))
         window.reload()
         with window.expect_navigation():
-            window.get_by_role("link", name="Begin with the first").click()
+            window.get_by_role("link", name="Start with the first").click()
         signed(window, "Ada")
         for _ in range(3):
             shown += [window.content(), window.title()]

@@ -45,7 +45,7 @@ def test_ctrl_c_while_a_command_loads_what_it_needs_is_one_line(tmp_path, at):
     done = _pressed(at, "report", "submissions/one-cart", "--no-pdf", "--out", str(out))
     assert done.returncode == 130
     *progress, last = done.stderr.splitlines() or [""]
-    assert last in ("", "stopped; the same command begins anew")
+    assert last in ("", "stopped; repeat the command to start again")
     assert all(" … " in line for line in progress)  # on a machine that is busy
 
 

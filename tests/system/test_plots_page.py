@@ -30,7 +30,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
         window = show(server.url)
         window.get_by_role("button", name="Compare recordings and models").click()
         window.wait_for_url("**/report/compare.html")
-        expect(window.locator(".result")).to_contain_text("The linear model is furthest off in")
+        expect(window.locator(".result")).to_contain_text("The linear model fits worst in")
         assert window.locator("canvas").evaluate_all(DRAWN) == [True, True]  # a plot a cart
 
         # By keys: a second run, one cart of two, the residual, its spectrum.

@@ -113,7 +113,7 @@ def test_ctrl_c_is_answered(tmp_path):
     os.close(ours)
 
     assert running.returncode == 130
-    assert seen.decode().rstrip().endswith("stopped; the same command begins anew")
+    assert seen.decode().rstrip().endswith("stopped; repeat the command to start again")
 
 
 def _read(terminal: int) -> bytes:

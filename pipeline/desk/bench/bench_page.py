@@ -1,4 +1,4 @@
-"""The bench's room: plan, acquire, explore, watch. What runs is decided where it is acquired."""
+"""The bench's room: plan, acquire, explore, watch. The acquiring process decides what runs."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -63,7 +63,7 @@ def explore(ask: Ask) -> Response:
     error = read_number(ask.text("error"), name="to within ± %", above=0, below=100)
     minutes = read_number(ask.text("minutes"), name="minutes", above=0, below=10_000)
     until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
-    read_error_goal(until)  # what is none is said before anything begins
+    read_error_goal(until)  # refuse a bad goal before anything starts
     port = read_port(ask)
     _note_plan(ask)
     ask.desk.benches.start(ask.folder(), port=port, explore=(until, limit))
@@ -101,7 +101,7 @@ def weigh(ask: Ask) -> Response:
 
 
 def show_diary(ask: Ask) -> Response:
-    """Return the diary of the last exploration, which runs no script but its own."""
+    """Return the diary of the last exploration, which may run only its own script."""
     return serve_file(ask.folder(), DIARY)
 
 
@@ -131,9 +131,9 @@ def _show_page(
 
     Parameters
     ----------
-    typed : of a recording that somebody wants.
-    refused : why that is none.
-    weighed : what it would bring.
+    typed : the form of a custom recording.
+    refused : why it is not possible.
+    weighed : its predicted benefit.
     """
     folder = ask.folder()
     session = ask.desk.benches.of(folder)
@@ -170,7 +170,7 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
     kind = KINDS[KINDS.index(typed["kind"])]
     if blank := [TYPED.get(key, key) for key in NEEDED[kind] if not typed[key].strip()]:
-        raise ConfigError(f"{' and '.join(blank)}: what is it to be? The field is empty")
+        raise ConfigError(f"{' and '.join(blank)}: the field is empty")
     carts = submission.system.carts
     wanted = WantedRecording(
         kind=kind,
@@ -200,5 +200,5 @@ def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
 def _find_session(ask: Ask) -> BenchSession:
     session = ask.desk.benches.of(ask.folder())
     if session is None:
-        raise HTTPException(404, "no session was begun here")
+        raise HTTPException(404, "no session was started here")
     return session

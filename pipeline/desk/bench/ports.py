@@ -64,7 +64,9 @@ def read_port(ask: Ask) -> str:
     if not port:
         raise ConfigError("choose the port of the bench, or type one such as COM3 or /dev/ttyACM0")
     if not ask.user.owns and port not in ask.user.ports:
-        raise ConfigError(f"{port}: is not listed for you; there are {', '.join(ask.user.ports)}")
+        raise ConfigError(
+            f"{port}: is not one of your ports, which are {', '.join(ask.user.ports)}"
+        )
     _remember(ask.folder(), port)
     return port
 

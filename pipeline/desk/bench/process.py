@@ -1,8 +1,8 @@
-"""The process in which the desk acquires: whatever the desk does, the bench is told to stop.
+"""The process in which the desk acquires; it stops the bench even if the desk ends.
 
-A line of JSON on stdin says what to record, or how far to explore; each further one is a button
-that somebody pressed. The end of the lines, because the desk is gone, is the Stop button. On stdout
-a line for everything that is to be seen of the session, then one with how it ended.
+The first line of JSON on stdin says what to record or explore; each further line is a pressed
+button. The end of stdin, because the desk is gone, counts as Stop. Stdout has one line for every
+event of the session, then one for its outcome.
 """
 
 import json
@@ -32,7 +32,7 @@ def main() -> None:
         work = _explore if any(given["explore"]) else _acquire
         end = {"over": work(folder, given, state)}
     except KeyboardInterrupt:
-        end = {"over": "Stopped. Begin again to go on where this ended."}
+        end = {"over": "Stopped. Start again to continue."}
     except (PipelineError, OSError) as error:
         end = {"over": str(error), "failed": True}
     finally:
@@ -68,7 +68,7 @@ def _explore(folder: Path, given: dict[str, Any], state: LiveState) -> str:
         goal=read_error_goal(until),
         seconds=read_time(limit),
     )
-    reached = "What you wanted is known" if turns[-1].reached else "Not all you wanted is known"
+    reached = "The goal is reached" if turns[-1].reached else "The goal was not reached"
     return f"{reached}: {with_symbols(turns[-1].said)}."
 
 

@@ -34,22 +34,24 @@ def take_table(ask: Ask) -> Response:
     meant = []
     for wish in wishes:
         if wish.submission not in teams:
-            raise ConfigError(f"line {wish.line}: no submission of this class is called so")
+            raise ConfigError(f"line {wish.line}: no submission of this class has this name")
         meant.append(replace(wish, submission=teams[wish.submission]))
     done = open_book(ask).change_all(meant, by=by)
     said = f"{count(done.teams, 'change')} imported"
     if unchanged := len(meant) - done.teams:
-        said += f", {unchanged} were the same already"
+        said += f", {unchanged} were already the same"
     return ask.back(ask.here, f"{said}.")
 
 
 def release(ask: Ask) -> Response:
     """Let students with accounts read their feedback, or no longer."""
     if not may_release(ask):
-        raise HTTPException(403, "when students read their feedback, the instructor decides")
+        raise HTTPException(
+            403, "only the instructor decides when students can read their feedback"
+        )
     released = ask.text("do") == "release"
     open_book(ask).release(released, by=sign(ask))
-    said = "Students can read their feedback." if released else "Students cannot read it any more."
+    said = "Students can read their feedback." if released else "Students can no longer read it."
     return ask.back(f"{ask.here}#work", said)
 
 
@@ -79,11 +81,11 @@ def regrade(ask: Ask) -> Response:
     """Have the class graded again: what is as it was is not."""
     shown = read_class(ask)
     if not ask.user.owns:
-        raise HTTPException(403, "folders of this computer are named by its owner only")
+        raise HTTPException(403, "only the owner of this computer can enter folders")
     folder = ask.folder()
     typed = {name: ask.text(name) for name in ("paths", "rubric", "lateness")}
     if not typed["paths"] or not typed["rubric"]:
-        raise ConfigError("name the submissions and the rubric")
+        raise ConfigError("enter the submissions and the rubric")
     ask.desk.books.asked[folder] = typed
     ask.start(
         "regrade_class",
@@ -97,7 +99,7 @@ def regrade(ask: Ask) -> Response:
 
 
 def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:
-    """Write an uploaded file to a path; None where there is none."""
+    """Write an uploaded file to a path; None if nothing was uploaded."""
     sent = ask.form.get(name)
     if not isinstance(sent, UploadFile) or not sent.filename:
         return None

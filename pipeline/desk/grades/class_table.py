@@ -58,7 +58,7 @@ def find_team(shown: Class, name: str) -> Listing:
     """Return a team by the name that is shown."""
     team = shown.teams.get(name)
     if team is None:
-        raise HTTPException(404, "no submission of this class is called so")
+        raise HTTPException(404, "no submission of this class has this name")
     return team
 
 
@@ -138,7 +138,7 @@ def show_news(ask: Ask) -> Response:
 
 
 def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
-    """Return what a page tells of changes after one of a number."""
+    """Return the changes after a given one, as a page shows them."""
     changes, told = [], shown.state[1]
     about = ask.query("of")
     if told != since:

@@ -16,13 +16,13 @@ _STATES: Mapping[str, tuple[str, Callable[[Listing], bool]]] = {
     "hand": ("changed by hand", lambda team: bool(team.line.by_hand)),
     "remark": ("with a remark", lambda team: bool(team.line.codes)),
 }
-_SEEN = {"no": "not yet looked at", "yes": "looked at"}
-_ORDERS = {"name": "name", "points": "points, least first", "late": "days late, most first"}
+_SEEN = {"no": "not yet reviewed", "yes": "looked at"}
+_ORDERS = {"name": "name", "points": "points, lowest first", "late": "days late, latest first"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Filter:
-    """What a page asks for; empty is everything.
+    """The filter of a page; empty means everything.
 
     Attributes
     ----------

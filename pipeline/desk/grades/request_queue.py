@@ -58,7 +58,7 @@ def _read_points(typed: str) -> float | None:
         return None
     points = read_points(typed)
     if points is None:
-        raise RequestRefused("the points are a number; leave the field empty and they stay")
+        raise RequestRefused("enter a number of points, or leave the field empty to keep them")
     return points
 
 
@@ -133,7 +133,7 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
     answer = queued.request.events[-1] if queued and queued.request.state == "answered" else None
     why = answer.text if answer else last.why if last else "as graded"
     by = answer.by if answer else last.by if last else "cartlab"
-    typed = ask.text("points") or "as they are"
+    typed = ask.text("points") or "unchanged"
     return ask.page(
         "conflict",
         status=409,

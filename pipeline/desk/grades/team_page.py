@@ -261,7 +261,7 @@ def sign(ask: Ask) -> str:
         return ask.user.name
     typed = ask.text("by") or ask.desk.books.signed
     if not typed:
-        raise ConfigError("say who you are first: what is changed by hand has a name to it")
+        raise ConfigError("enter your name first: every change by hand is signed")
     ask.desk.books.signed = typed
     return typed
 

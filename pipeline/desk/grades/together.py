@@ -69,14 +69,14 @@ def apply(ask: Ask) -> Response:
         wishes = [_wish(ask, shown, asked, str(name), typed=typed) for name in ticked]
         done = open_book(ask).change_all(wishes, by=by)
     except Conflict:
-        text = "Some of these teams were changed after this list was shown. Nothing was changed."
+        text = "Some of these teams have changed since this list was shown. Nothing was changed."
         return _show_page(ask, wrong=text, status=409)
     except ConfigError as error:
         text = capital(str(error).replace(" (--why)", "").replace(" (--by)", ""))
         return _show_page(ask, wrong=f"{text}. Nothing was changed.", status=422)
     said = f"{count(done.teams, 'team')} changed in “{capital(asked.title or asked.id)}”."
     if unchanged := len(wishes) - done.teams:
-        said += f" {unchanged} had the same already."
+        said += f" {unchanged} had these points already."
     return ask.back(_address(ask, done=done.at if done.teams else ""), said, place=_DONE)
 
 
@@ -84,13 +84,13 @@ def _undo(ask: Ask) -> Response:
     """Take back one go; what somebody changed since stays, and is named."""
     shown, book = read_class(ask), open_book(ask)
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
-        raise HTTPException(404, "nothing of this class was changed at that moment")
+        raise HTTPException(404, "there is no such change in this class")
     undone = book.undo_all(ask.text("set"), by=sign(ask))
-    said = f"{count(undone.back, 'team')} taken back."
+    said = f"{count(undone.back, 'team')} undone."
     if undone.kept:
         names = {team.submission: name for name, team in shown.teams.items()}
         kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
-        said += f" Changed since, so as before: {kept}."
+        said += f" Kept, because changed since: {kept}."
     if not ask.query("criterion"):  # from the list on the class page
         return ask.back(f"{ask.here}#sets", said, place=_DONE)
     return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
@@ -124,11 +124,11 @@ def _wish(ask: Ask, shown: Class, asked: Criterion, name: str, *, typed: str) ->
     ConfigError : the team is not in the class, or the points are not a number it can have.
     """
     if name not in shown.teams:
-        raise ConfigError("a team is not in the class any more")
+        raise ConfigError("a team is no longer in the class")
     team = shown.teams[name]
     points = None if typed == _SAME else read_points(typed)
     if typed == _SAME and asked.id not in team.line.judged:
-        raise ConfigError(f"{name}: was never judged here, so a comment needs points")
+        raise ConfigError(f"{name}: has no points here yet, so a comment needs points")
     if points is not None and not 0 <= points <= asked.points:
         raise ConfigError(f"expected 0 to {asked.points:g} points, found {points:g}")
     return WantedPoints(

@@ -58,7 +58,7 @@ def make(ask: Ask) -> Response:
         raise ConfigError(found["wrong"])
     out = _read_folder(ask)
     if not out.parent.is_dir():
-        raise ConfigError(f"{out}: there is no folder {out.parent} to make it in")
+        raise ConfigError(f"{out}: the folder {out.parent} does not exist")
     folders = read_whole_number(ask.text("folders"), name="folders", least=1, most=500)
     seed = read_whole_number(ask.text("seed"), name="seed", least=0, most=2**31)
     ask.desk.jobs.start(
@@ -133,7 +133,7 @@ def show_catalogue(ask: Ask) -> Response:
         }
         for effect, entry in zip(CATALOGUE, catalogue_data(CATALOGUE), strict=True)
     ]
-    return ask.page("effects", title="What a bench may do beyond the linear chain", entries=entries)
+    return ask.page("effects", title="Effects beyond the linear chain", entries=entries)
 
 
 def _free_folder(root: Path) -> Path:
@@ -176,5 +176,5 @@ def _write_picture_url(bench: Mapping[str, str], hide: str) -> str:
 
 
 def _read_folder(ask: Ask) -> Path:
-    wanted = "name a folder for the exercise, not there yet or empty"
+    wanted = "enter a new or empty folder for the exercise"
     return read_path(ask.text("out"), wanted=wanted, inside=ask.user.workshop)

@@ -117,10 +117,10 @@ def read_rubric_path(ask: Ask) -> Path:
     typed = ask.text("file")
     if not typed and ask.request.method == "GET":
         typed = free_name(work_folder(ask.user))
-    wanted = "name the file of the rubric, such as rubric.toml"
+    wanted = "enter a file name for the rubric, such as rubric.toml"
     path = read_path(typed, wanted=wanted, inside=ask.user.workshop)
     if path.suffix != ".toml":
         raise ConfigError(f"{path}: a rubric is a .toml file")
     if not path.parent.is_dir():
-        raise ConfigError(f"{path}: there is no folder {path.parent}")
+        raise ConfigError(f"{path}: the folder {path.parent} does not exist")
     return path

@@ -83,7 +83,7 @@ def _toml_files(root: Path) -> Iterator[Path]:
 
 
 def _shelved(path: Path, name: str) -> ShelvedRubric | None:
-    """Return a file as a rubric; None where it is none."""
+    """Return a file as a rubric; None if it is not valid."""
     try:
         text = rubric_source(path)
     except ConfigError:

@@ -30,7 +30,7 @@ class Mistake:
 
 @dataclass(frozen=True, kw_only=True)
 class TypedRubric:
-    """What somebody typed.
+    """The typed rubric.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ def tell_state(folder: Path) -> Stands:
     except SubmissionError:
         return "needs", "cannot be read"
     if problems or not answers or submission is None:
-        return "none", "not asked yet"
+        return "none", "not run yet"
     last = answers[-1]
     if last.basis != find_basis(submission):
         return "old", "changed since"

@@ -1,4 +1,4 @@
-"""What the program is not sure of, as questions beside their fields that one click answers."""
+"""Show doubts of the program as questions next to their fields, answered by one click."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ def ask_doubts(
     doubts: Mapping[str, Any],
     told: Mapping[str, Any],
 ) -> tuple[Field, ...]:
-    """Return the fields of the set-up, each with what is not sure of it and how to answer.
+    """Return the fields of the set-up, each with its doubt and possible answers.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def _ask(
     taken = [one for one in told["assumed"] if one["key"] == field.path]
     if any(one["support"] == "open" for one in taken) and (answers := _confirm(field, taken)):
         said = listing(list(dict.fromkeys(_name(one, one["taken"]) for one in taken)))
-        return f"not stated, and nothing tells it; taken as {said}", answers
+        return f"not stated, and the data do not show it; assumed: {said}", answers
     return "", ()
 
 
@@ -61,12 +61,12 @@ def _name(one: Mapping[str, str], said: str) -> str:
 def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:
     """Return every way in which the springs that nothing tells may be there (numbers from 1)."""
     if not unknown:
-        return (Answer(label="It is as ticked", value=field.value),)
+        return (Answer(label="The ticks are right", value=field.value),)
     places = [number - 1 for number in unknown]
     if len(places) == 1:
         (place,) = places
         return (
-            Answer(label="There is one", value=_with(field, {place: True})),
+            Answer(label="Spring present", value=_with(field, {place: True})),
             Answer(label="No spring here", value=_with(field, {place: False})),
         )
     only = [
@@ -97,10 +97,10 @@ def _contradict(field: Field, wrong: Sequence[Mapping[str, Any]]) -> tuple[Answe
 def _confirm(field: Field, taken: Sequence[Mapping[str, Any]]) -> tuple[Answer, ...]:
     """Return how to state what was taken."""
     if field.path == "system.springs":
-        return (Answer(label="All are there", value=field.value),)
+        return (Answer(label="All are present", value=field.value),)
     if field.path == "system.input.sign":
         sign = taken[0]["value"]
-        return Answer(label="It is right", value=f"{sign:.0f}"), _turn(sign)
+        return Answer(label="This is right", value=f"{sign:.0f}"), _turn(sign)
     if field.path in ("system.position.unit", "system.input.unit"):
         unit = taken[0]["taken"]
         return (Answer(label=f"It is {unit}", value=unit),)
@@ -108,7 +108,7 @@ def _confirm(field: Field, taken: Sequence[Mapping[str, Any]]) -> tuple[Answer, 
 
 
 def _turn(sign: float) -> Answer:
-    return Answer(label="Turn the sign", value=f"{-sign:.0f}")
+    return Answer(label="Reverse the sign", value=f"{-sign:.0f}")
 
 
 def _with(field: Field, flags: Mapping[int, bool]) -> str:

@@ -30,7 +30,7 @@ from pipeline.submission.toml_file import decoded, parse_toml
 
 # Texts that a packed submission brings, and their most bytes; what is there and sound stays.
 _TEXTS = {NAME: MAX_TOML_BYTES, "notes.md": MAX_NOTES_BYTES}
-_ASIDE = "set-aside"  # where recordings go that are not to be part of it
+_ASIDE = "set-aside"  # folder for recordings that are not part of the submission
 
 
 def take_uploads(
@@ -60,7 +60,7 @@ def take_uploads(
 
 
 def _refuse(name: str, error: Exception) -> Said:
-    return Said(f"{quote(name)}: not taken: {error}", "refused")
+    return Said(f"{quote(name)}: not uploaded: {error}", "refused")
 
 
 def _open(given: BinaryIO | Path) -> AbstractContextManager[BinaryIO]:
@@ -77,7 +77,7 @@ def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tu
 
 
 class _Room:
-    """What a hand-in still takes by its limits; counted once, whoever has the turn adds.
+    """The remaining room within the limits of a submission, counted once per upload.
 
     What was set aside or made by a command lies in the same folder and is no part of a hand-in.
     """
@@ -94,7 +94,7 @@ class _Room:
             raise SubmissionError(f"larger than {MAX_DATA_BYTES:,} bytes")
         if self._files >= HAND_IN.members or self._bytes + len(raw) > HAND_IN.total:
             raise SubmissionError(
-                f"a hand-in has at most {HAND_IN.members:,} files and {HAND_IN.total:,} bytes"
+                f"a submission has at most {HAND_IN.members:,} files and {HAND_IN.total:,} bytes"
             )
         self._files, self._bytes = self._files + 1, self._bytes + len(raw)
 
@@ -105,30 +105,30 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
     if last in _TEXTS:
         _check_text(raw, last)
         if _is_sound(folder, last):
-            raise SubmissionError("there is one already, which stays as it is")
+            raise SubmissionError("it exists already and was not changed")
         room.check(raw)
         write_file(folder / last, raw)
         return None
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
-        raise SubmissionError(f"a recording ends in {', '.join(ENDINGS)}")
+        raise SubmissionError(f"the name of a recording ends in {', '.join(ENDINGS)}")
     seen = "".join(c if c.isprintable() else "-" for c in last)  # blanks of all sorts, marks
     # Bytes, whatever letters it has: systems take 255, some fewer.
     name = seen.encode(errors="ignore")[-120:].decode(errors="ignore")
-    # What stands in no name on some system, and names that Windows keeps for itself.
+    # Characters that some systems refuse, and names that Windows reserves.
     name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
     if re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name):
         name = f"data-{name}"
     names = _list_names(own_folder(folder, "data") / name)
     target = next(path for path in names if not _is_there(path) or _holds(path, raw))
     if _is_there(target):
-        return Said(f"{quote(last)}: exists already", "changed")
+        return Said(f"{quote(last)}: already exists", "changed")
     room.check(raw)
     target.parent.mkdir(exist_ok=True)
     write_file(target, raw)
-    why = "" if seen == last else "; no name may have characters that do not show"
+    why = "" if seen == last else "; names may not contain invisible characters"
     if target.name == last:
         return None
-    return Said(f"{quote(last)}: taken as {target.name}{why}", "changed")
+    return Said(f"{quote(last)}: saved as {target.name}{why}", "changed")
 
 
 def _is_there(path: Path) -> bool:
@@ -160,8 +160,8 @@ def put_aside(file: str, folder: Path) -> str:
     try:
         (folder / file).rename(target)
     except FileNotFoundError:
-        raise SubmissionError(f"{file}: was moved or removed meanwhile") from None
-    return f"{quote(file)} lies in {_ASIDE}/{target.name} now: no report and no zip has it."
+        raise SubmissionError(f"{file}: was moved or removed in the meantime") from None
+    return f"{quote(file)} is now in {_ASIDE}/{target.name}, and not part of the report or the zip."
 
 
 def _check_text(raw: bytes, name: str) -> None:

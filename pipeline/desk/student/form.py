@@ -1,8 +1,8 @@
 """The form of `submission.toml`: its keys as fields, and what was typed back into the file.
 
-What was typed goes into the file as it was typed, digits and all, and the submission's own check
-says what is wrong with it: nothing is checked twice. What explains a field, and how it is typed, is
-what the submission's model says of its key.
+Typed values go into the file unchanged, with all digits. The submission's own check then reports
+mistakes, so nothing is checked twice. The submission's model supplies the help and type of each
+field.
 """
 
 import re
@@ -69,7 +69,7 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One key of the file; `value` as it stands there or was typed, `wrong` what is wrong with it.
+    """One key of the file; `value` is the stored or typed one, `wrong` its problem.
 
     Attributes
     ----------
@@ -363,7 +363,7 @@ def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> No
         if field.path == "authors":
             _set_authors(document, field.value)
         else:
-            # Two keys stay where nothing is said, and their comments.
+            # Two keys stay without a value, because of their comments.
             empty = not field.value and field.path not in ("title", "section")
             _set(document, field.path.split("."), None if empty else _make_item(field))
             _settle(document, field.path)
@@ -433,7 +433,7 @@ def _make_item(field: Field) -> Any:
 
 
 def _make_number(text: str) -> Any:
-    """Return a number with the digits it was typed with; what is none stays text, to be refused."""
+    """Return a number with its typed digits; other text stays text, and is refused later."""
     if re.fullmatch(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?", text):
         return tomlkit.parse(f"x = {text}\n")["x"]
     return tomlkit.item(text)

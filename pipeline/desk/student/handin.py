@@ -58,11 +58,11 @@ def list_missing(folder: Path) -> list[str]:
     files = dict.fromkeys(experiment.file for experiment in submission.experiments)
     found = [problem for file in files if (problem := outside(folder, file)) is not None]
     found += [
-        f"{file} is computed from recordings; name the recording itself"
+        f"{file} is computed from recordings; use the recording itself"
         for file in files
         if _is_made(folder, file)
     ]
-    return found or ([] if files else ["there is no experiment in it yet"])
+    return found or ([] if files else ["it has no experiments yet"])
 
 
 def _is_made(folder: Path, name: str) -> bool:

@@ -48,7 +48,7 @@ def show_whole(ask: Ask) -> Response:
     """Show the page that the team reads, with its figures."""
     own, found = _find_own(ask), _read(ask)
     if found is None:
-        raise HTTPException(404, "your feedback is not out")
+        raise HTTPException(404, "your feedback is not published yet")
     if hides_values(ask.user, found.rubric):
         raise HTTPException(403, REFUSED)
     figures = _open_book(ask).figures(found.entry)
@@ -57,14 +57,14 @@ def show_whole(ask: Ask) -> Response:
     return show_own_page(page)
 
 
-_UNREADABLE = "your grade cannot be read now; tell your instructor"
+_UNREADABLE = "your grade cannot be read at the moment; tell your instructor"
 
 
 def _find_own(ask: Ask) -> OwnGrade:
-    """Return the grade that the address is about: of others' there is none."""
+    """Return the grade of the address, if it is the user's own."""
     number = ask.request.path_params["n"]
     if number >= len(ask.user.grades):
-        raise HTTPException(404, "there is nothing here that is yours to see")
+        raise HTTPException(404, "you have no access to anything here")
     return ask.user.grades[number]
 
 

@@ -30,7 +30,7 @@ def show(ask: Ask) -> Response:
 
 
 def show_questions(ask: Ask) -> Response:
-    """Show what the report asks, each question with the answer that there is."""
+    """Show the questions of the report with the answers so far."""
     return _show_questions(ask)
 
 
@@ -52,10 +52,10 @@ def answer(ask: Ask) -> Response:
                     back=f"{ask.here}questions",
                 )
             if id_ not in [one["id"] for one in read_told(folder)["questions"]]:
-                raise SubmissionError(f"the report asks nothing called {id_!r}")
+                raise SubmissionError(f"the report has no question {id_!r}")
             new = with_answer(notes, id_, words)
             if len(new.encode()) > MAX_NOTES_BYTES:
-                raise SubmissionError(f"{NOTES} would have more than {MAX_NOTES_BYTES:,} bytes")
+                raise SubmissionError(f"{NOTES} would exceed {MAX_NOTES_BYTES:,} bytes")
             write_file(folder / NOTES, new)
     except SubmissionError as error:
         return _show_questions(ask, status=422, refused={id_: (words, str(error))})

@@ -23,13 +23,13 @@ from pipeline.submission.load import NAME, parse_submission
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """What stands in the folder, with what was typed in place of what stands there.
+    """The content of the folder, with typed values in place of stored ones.
 
     Attributes
     ----------
-    text : of `submission.toml`, "" without one; `seen` tells this state of it from others.
-    groups : the set-up, [] where there is none that can be read.
-    wrong : what is wrong with the file and belongs to no field.
+    text : of `submission.toml`, "" without one; `seen` identifies this state.
+    groups : the set-up, [] if it cannot be read.
+    wrong : problems of the file that belong to no field.
     """
 
     text: str

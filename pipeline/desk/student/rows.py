@@ -162,11 +162,11 @@ def look_at_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str
 def _describe_unknown(file: str, look: Mapping[str, Any]) -> Row:
     """Return the row of a file that has no table."""
     if not look["format"]:
-        what = "it cannot be read; mend it, or set it aside"
+        what = "it cannot be read; fix it, or set it aside"
     elif look["kind"]:
         what = f"a {look['kind'].replace('_', ' ')} that is not in submission.toml"
     else:
-        what = "nothing tells what it is; say in the set-up what its columns are"
+        what = "its content is not clear; state its columns in the set-up"
     return Row(file=file, look=look, index=None, problems=(what, *look["remarks"]))
 
 
@@ -187,7 +187,7 @@ def _describe(
     problems = [*look["unusable"]] if look["format"] else ["it cannot be read"]
     problems += [f"state {need} below" for need in look["needs"] if need not in table]
     if _lacks_controller(fields):
-        problems.append("say what controller ran")
+        problems.append("state the controller that ran")
     known = {said for cart, said in look["still"].items() if int(cart) not in carts}
     known.update(problems)
     if "sample_rate" in table:

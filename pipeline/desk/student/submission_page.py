@@ -62,13 +62,13 @@ def set_aside(ask: Ask) -> Response:
     with turn_in(folder):
         document = read_document(submission_text(folder) if (folder / NAME).exists() else "")
         if any(posix(str(table.get("file", ""))) == file for table in list_experiments(document)):
-            raise SubmissionError(f"{file}: {NAME} names it; take it out there first")
+            raise SubmissionError(f"{file}: {NAME} uses it; remove it there first")
         said = put_aside(file, folder)
     return _go_back(ask, [Said(said)], _FILES)
 
 
 def fill(ask: Ask) -> Response:
-    """Write the tables of files that have none."""
+    """Add entries for files without one."""
     return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
 
 
@@ -121,7 +121,7 @@ def answer_together(ask: Ask) -> Response:
 
 
 def start_hand_in(ask: Ask) -> Response:
-    """Have the report made anew where anything was changed since; show what is handed in."""
+    """Make the report again if anything has changed; show the content of the zip."""
     if not sees_check(ask.user, ask.folder()) and last_report.find_state(ask.folder()) != "current":
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
@@ -165,7 +165,7 @@ def _read_shown(ask: Ask) -> dict[str, Any]:
 
 
 def _list_authors(room: Room) -> list[str]:
-    """Return who hands in, as they stand in the form."""
+    """Return the authors in the form."""
     who = [f.value for group in room.groups for f in group.fields if f.path == "authors"]
     return [line for value in who for line in value.splitlines() if line.strip()]
 
@@ -178,7 +178,7 @@ def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[
 
 
 def _fill_tables(ask: Ask, folder: Path) -> list[Said]:
-    """Have the tables of new files written; return what is to be said."""
+    """Write the entries of new files; return the messages."""
     try:
         rows = ask.desk.workers.do("fill_tables", folder=str(folder))
     except Failed as error:
@@ -202,7 +202,7 @@ def _show_page(
     changed: Sequence[Field] = (),
     error: SubmissionError | None = None,
 ) -> Response:
-    """Show the room; with what was typed in place of what stands in the file, where it is wrong."""
+    """Show the room, with typed values in place of stored ones if they are wrong."""
     folder, room = ask.folder(), look_around(ask, changed=changed, error=error)
     named = [row.file for row in room.rows if row.index is not None]
     return ask.page(

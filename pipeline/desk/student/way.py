@@ -10,7 +10,7 @@ Stands = tuple[State, str]  # a state, and its word
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """What the steps are judged by.
+    """The facts behind the states of the steps.
 
     Attributes
     ----------

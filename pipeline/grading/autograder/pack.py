@@ -80,4 +80,4 @@ def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
 def _tasks(rubric: Rubric) -> Iterator[str]:
     yield f"on Gradescope, set the autograder points to {rubric.out_of:g}"
     if rubric.late.percent_per_day:
-        yield "points for lateness are not deducted: set the late policy on Gradescope"
+        yield "nothing is deducted for late work: set the late policy on Gradescope"

@@ -1,1 +1,1 @@
-"""A class at once: workers, isolation, cluster."""
+"""Grade a whole class: workers, isolation, cluster."""

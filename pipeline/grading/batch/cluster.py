@@ -1,7 +1,7 @@
-"""The same tasks on a Dask cluster: the hand-ins travel along, every machine has its own workers.
+"""Run the grading tasks on a Dask cluster; submissions are sent with the tasks.
 
-Each Dask worker keeps worker processes as a single machine does (`runner.Grader`): a hand-in
-that crashes or hangs takes one of them down, never the Dask worker.
+Each Dask worker keeps worker processes, as a single machine does (`runner.Grader`). A submission
+that crashes or hangs ends one of these processes, never the Dask worker.
 """
 
 import tempfile
@@ -22,25 +22,25 @@ from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import packed, unpacked
 
 _CONNECT_LIMIT = 20  # s
-_AHEAD = 2  # tasks under way for every thread of the cluster: none waits, few are in memory
+_AHEAD = 2  # tasks per thread of the cluster: threads never wait, and memory stays small
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 def run_on(address: str) -> Executor:
-    """Return what runs tasks on the cluster of a scheduler, `tcp://HOST:PORT` or `tls://…`.
+    """Return a function that runs tasks on a scheduler's cluster (`tcp://HOST:PORT`, `tls://…`).
 
     Raises
     ------
-    ConfigError : unencrypted to another machine (a scheduler runs what it is sent), or nobody
-        answers, or there are no certificates, or the cluster runs another version.
+    ConfigError : the address is another machine's without encryption (a scheduler runs any code
+        it receives), nobody answers, certificates are missing, or the cluster's version differs.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:
         raise ConfigError(f"{address}: expected a scheduler's address, tcp://HOST:PORT or tls://…")
     if parts.scheme == "tcp" and parts.hostname not in _LOOPBACK:
         raise ConfigError(
-            f"{address}: a scheduler runs whatever it is sent, so on another machine it needs "
-            "encryption: start it with TLS certificates and name it tls://…"
+            f"{address}: a scheduler runs any code it receives, so on another machine it needs "
+            f"encryption: start it with TLS certificates and use its address tls://…"
         )
     if parts.scheme == "tls" and Security().get_connection_args("client")["ssl_context"] is None:
         raise ConfigError(
@@ -57,7 +57,7 @@ def run_on(address: str) -> Executor:
                 client.wait_for_workers(1, timeout=_CONNECT_LIMIT)
             except TimeoutError:
                 raise ConfigError(f"{address}: the scheduler has no workers") from None
-            # Runs on one cluster at once have graders of their own, with their own rubric.
+            # Runs that share a cluster each have their own graders and rubric.
             graders = f"cartlab-graders-{uuid4()}"
             client.register_plugin(Graders(setup), name=graders)
             try:
@@ -76,7 +76,7 @@ class Graders(WorkerPlugin):
         self._code = code_version()
 
     def setup(self, worker: DaskWorker) -> None:
-        """Make a folder for hand-ins; processes start with the first of them."""
+        """Make a folder for submissions; processes start with the first task."""
         self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
         self._idle: SimpleQueue[Grader] = SimpleQueue()
         self._all: list[Grader] = []
@@ -89,7 +89,7 @@ class Graders(WorkerPlugin):
         self._folder.cleanup()
 
     def grade(self, task: Task, archive: bytes) -> Grading:
-        """Write the hand-in down and grade it in a process of its own."""
+        """Write the submission to disk and grade it in a separate process."""
         try:
             process = self._idle.get_nowait()
         except Empty:
@@ -115,7 +115,7 @@ def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
 
 
 def _threads(client: Client) -> int:
-    """Return how many tasks the cluster can run at once just now."""
+    """Return how many tasks the cluster can run at once at the moment."""
     workers = client.scheduler_info(n_workers=-1)["workers"]
     return sum(worker["nthreads"] for worker in workers.values())
 
@@ -123,7 +123,7 @@ def _threads(client: Client) -> int:
 def _through(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
-    """Yield the outcomes as they come; a worker that is lost has its tasks done by another."""
+    """Yield the outcomes as they come; tasks of a lost worker go to another."""
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}
     answers = as_completed(loop=client.loop)

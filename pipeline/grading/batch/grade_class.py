@@ -1,4 +1,4 @@
-"""The whole of `cartlab grade`: intake, grading, the gradebook, and what is written from it."""
+"""The whole of `cartlab grade`: intake, grading, gradebook and output files."""
 
 import os
 import re
@@ -37,11 +37,11 @@ _NAMED = 8  # submissions in a remark
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """How many there were, which could not be graded (id, reason), how many share recordings.
+    """Counts of a run, and the submissions that could not be graded (id, reason).
 
-    Of those that failed the next run tries `unsettled` again; for `lacks_room` of them the disk
-    was full. `remarks` are what the person at the command line should know besides, `changes` what
-    is another than in the class list before.
+    The next run tries the `unsettled` ones again; `lacks_room` of them failed for a full disk.
+    `remarks` are further messages for the command line, `changes` the differences from the last
+    class list.
     """
 
     total: int
@@ -55,22 +55,24 @@ class Summary:
     @property
     def counted(self) -> str:
         """The numbers, in words."""
-        shared = f", {self.sharing} with recordings that another has too" if self.sharing else ""
+        shared = (
+            f", {self.sharing} with recordings that another also contains" if self.sharing else ""
+        )
         return f"{self.total - len(self.failed)} of {self.total} graded{shared}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Options:
-    """How a class is graded.
+    """Options for grading a class.
 
     Attributes
     ----------
     jobs : processes on this machine; cluster : or the address of a Dask scheduler.
-    time_limit, memory_limit : of each hand-in, in s and bytes.
-    figures : draw those of the feedback.
-    anonymous : leave names out of what is written, as a rubric may ask for itself.
+    time_limit, memory_limit : for each submission, in s and bytes.
+    figures : draw the figures of the feedback.
+    anonymous : leave names out of all files; a rubric may also require this.
     gradebook : a database URL; default: `gradebook.sqlite` in the folder of the results.
-    lateness : a table that says who was late.
+    lateness : a table of late submissions.
     """
 
     jobs: int = 1
@@ -83,7 +85,7 @@ class Options:
     lateness: Path | None = None
 
     def setup(self, rubric: Rubric, *, scratch: Path) -> Setup:
-        """Return what of it grades each hand-in."""
+        """Return the options that concern the grading of each submission."""
         return Setup(
             rubric=rubric,
             scratch=scratch,
@@ -145,7 +147,7 @@ def grade_class(
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,
-        failed=tuple(sorted(failed)),  # the order of the names would tell
+        failed=tuple(sorted(failed)),  # the order would reveal the names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
         lacks_room=len(batch.lacks_room),
@@ -155,14 +157,16 @@ def grade_class(
 
 
 def _refuse_submission(out: Path) -> None:
-    """Refuse to write into what is to be graded: it would be another submission afterwards."""
+    """Refuse to write into a folder of submissions, which would change them."""
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():
-            raise ConfigError(f"{out}: is in a submission; name a folder outside of it with --out")
+            raise ConfigError(
+                f"{out}: is inside a submission; choose a folder outside it with --out"
+            )
 
 
 def _refuse_another_class(out: Path, *, assignment: str) -> None:
-    """Refuse to write the class of another rubric's name over this one, points by hand and all."""
+    """Refuse to overwrite a class with one of another rubric, including points by hand."""
     try:
         with Gradebook(out) as book:
             before = book.assignment
@@ -170,19 +174,19 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
         return  # no class there yet
     if before != assignment:
         raise ConfigError(
-            f"{out}: holds the class of {before}.toml, and a rubric of another name is another "
-            f"class: call the rubric {before}.toml to go on with it, or name another --out"
+            f"{out}: holds the class of {before}.toml, and a rubric with another name is another "
+            f"class: name the rubric {before}.toml to continue this class, or choose another --out"
         )
 
 
 def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
-    """Return what calls submissions by other names; asked once the class list is made."""
+    """Return a function that gives submissions their pseudonyms, for use after the class list."""
     names = cache(lambda: pseudonyms_in(book))
     return lambda name: names().get(name, STRANGER)
 
 
 def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
-    """Return what shows how far it is, and of no submission that it is done."""
+    """Return a progress function that shows no submission names."""
     names = {hand_in.id for hand_in in hand_ins}
     return lambda done, total, last: progress(done, total, "" if last in names else last)
 
@@ -190,35 +194,36 @@ def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
 def _beside(
     passed: Sequence[str], unknown: Sequence[str], *, late_file: Path | None, hidden: bool
 ) -> Iterator[str]:
-    """Yield which folders were passed over, and who of the late table is not in the class."""
+    """Yield messages on skipped folders and on unknown names in the late table."""
     if not hidden:
         yield from passed
     elif passed:
-        yield f"{count(len(passed), 'folder')} passed over: they look like results of a grading"
+        yield f"{count(len(passed), 'folder')} skipped: they look like results of a grading"
     if unknown and late_file:
         who = count(len(unknown), "name") if hidden else ", ".join(unknown)
         yield f"{late_file.name}: no such submission: {who}"
 
 
 def _told(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
-    """Yield whether the rubric's springs are the benches', and what became of the class before."""
+    """Yield messages on springs that the rubric lacks and on changes to the class list."""
     grades = (entry.grade for entry in book.entries())
     if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         yield asked
     hidden = book.rubric.anonymous
     for before, now in batch.moved.items():
-        yield f"{shown(before)} is now called {shown(now)}; the points it was given by hand go on"
+        yield f"{shown(before)} is now called {shown(now)}; its points given by hand are kept"
     for name, before, now in batch.taken_over:
         whose = "" if hidden else f", {_people(now)} in place of {_people(before)}"
         yield (
-            f"{shown(name)} is now by others{whose}: where both count, give one folder another name"
+            f"{shown(name)} now has other authors{whose}: if both submissions count, rename one "
+            f"folder"
         )
     if not batch.kept:
         return
     kept = sorted(map(shown, batch.kept))
     yield f"not in this run, kept as they were: {_names(kept)} (cartlab remove takes one off)"
     if others := sorted(map(shown, set(book.by_other_rubrics()) & set(batch.kept))):
-        yield f"graded by the rubric as it was before, grade them again: {_names(others)}"
+        yield f"graded with an earlier version of the rubric; grade them again: {_names(others)}"
 
 
 def _people(authors: Sequence[str]) -> str:
@@ -230,7 +235,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
-    """Return the submissions of the class list so far; making no gradebook."""
+    """Return the submissions of the current class list, without creating a gradebook."""
     try:
         with Gradebook(place, assignment=assignment) as book:
             return [member.submission for member in book.listed()]
@@ -249,7 +254,7 @@ def _executor(options: Options) -> Executor:
 
 
 def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
-    """Yield the fingerprints of the rubric's examples and of those shipped for as many carts."""
+    """Yield the fingerprints of the rubric's examples and the shipped ones with as many carts."""
     for example in rubric.examples:
         try:
             data = read_data(load_submission(folder / example))
@@ -267,9 +272,9 @@ def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
 
 @contextmanager
 def scratch_in(out: Path) -> Iterator[Path]:
-    """Make a scratch folder that is removed at the end; only whoever is alone there may ask.
+    """Make a scratch folder and remove it at the end; the caller must hold the folder's lock.
 
-    What is left of runs that were stopped is removed first.
+    Remains of stopped runs are removed first.
     """
     for left in sorted(out.iterdir()):
         if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():

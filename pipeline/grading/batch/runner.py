@@ -1,4 +1,4 @@
-"""Grade a batch: find what is new, hand it to workers, compare recordings across all of it."""
+"""Grade a batch: find new submissions, send them to workers, compare all recordings."""
 
 import hashlib
 import json
@@ -27,7 +27,7 @@ Executor = Callable[[Sequence[Task], Setup], Iterator[Grading]]
 
 
 def silent(done: int, total: int, what: str) -> None:
-    """Say nothing of a batch that nobody watches."""
+    """Ignore progress."""
 
 
 def grade_batch(
@@ -39,19 +39,19 @@ def grade_batch(
     examples: Callable[[], Iterable[bytes]] = tuple,
     progress: Progress = silent,
 ) -> Batch:
-    """Grade what the gradebook does not know yet; every outcome is in it as soon as it is had.
+    """Grade submissions that the gradebook does not know; store each outcome at once.
 
-    The class is all that the gradebook lists: what is not among `hand_ins` stays as it was, and is
-    compared with them as before.
+    The class is everything the gradebook lists. Submissions that are not in `hand_ins` keep their
+    grades, and their recordings are still compared.
 
-    Stopped at any moment and started again, it ends as if it had not been.
+    A run that is stopped and started again gives the same result.
 
     Parameters
     ----------
-    execute : what runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    examples : packed fingerprints of recordings that were handed out with the task; asked for
-        only where recordings are shared.
-    progress : called with how many are done, of how many, and what was done last.
+    execute : runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
+    examples : returns packed fingerprints of recordings given out with the assignment; called
+        only if recordings are shared.
+    progress : called with the number done, the total, and the last submission done.
     """
     rows, new = _known_and_new(hand_ins, setup=setup, book=book)
     unsettled, no_room = set[str](), set[str]()
@@ -84,7 +84,7 @@ def grade_batch(
 def _known_and_new(
     hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
 ) -> tuple[dict[str, Member], list[Task]]:
-    """Return those of which the grade is known, or that nobody can open, and tasks for the rest."""
+    """Return outcomes that are known or cannot be opened, and tasks for the rest."""
     basis = code_version(), setup.rubric.model_dump_json(), setup.figures
     rows, new = {}, []
     for hand_in in hand_ins:
@@ -101,13 +101,13 @@ def _known_and_new(
 
 
 def run_here(*, jobs: int) -> Executor:
-    """Return what runs tasks in so many worker processes on this machine."""
+    """Return a function that runs tasks in `jobs` worker processes on this machine."""
 
     def execute(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
         waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
         for task in tasks:
             waiting.put(task)
-        # At most one outcome a worker waits to be stored: memory stays flat.
+        # At most one outcome per worker waits to be stored, so that memory stays flat.
         answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
         graders = [Grader(setup) for _ in range(min(jobs, len(tasks)))]
@@ -132,7 +132,7 @@ def run_here(*, jobs: int) -> Executor:
 
 
 class Grader:
-    """A process that grades: a crash of it, or a limit passed, is the outcome of that hand-in."""
+    """A grading process; a crash or exceeded limit becomes the outcome of the submission."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
@@ -161,7 +161,7 @@ class Grader:
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
             return self._failed(task, reasons.get(end.how, str(end)), detail=end.said)
         except Failed as error:
-            self.close()  # after a fault a fresh process is surer
+            self.close()  # after a fault a new process is safer
             return self._failed(task, str(error))
         outcome = read_grading(plain)
         if not outcome.settled:
@@ -171,7 +171,7 @@ class Grader:
         return outcome
 
     def close(self) -> None:
-        """End the process; the next task starts another."""
+        """End the process; the next task starts a new one."""
         self._process.close()
 
     def _failed(
@@ -200,13 +200,13 @@ def _work(
             return grader.close()
         try:
             answers.put(grader.run(task, stop=stop))
-        except Exception as error:  # said where the outcomes are waited for
+        except Exception as error:  # raised again by the thread that collects the outcomes
             answers.put(error)
             return
 
 
 def code_version() -> str:
-    """Return what changes whenever a grade may: a hash of code, words and what it computes with."""
+    """Return a hash of code, words and libraries, which changes whenever a grade might."""
     root = Path(pipeline.__file__).parent
     computes_with = (f"{name} {version(name)}" for name in ("numpy", "scipy", "h5py"))
     versions = [pipeline.__version__, *computes_with]
@@ -217,7 +217,7 @@ def code_version() -> str:
 
 
 def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
-    """Return the task of a hand-in; its key covers all that the outcome depends on."""
+    """Return the task of a submission; its key covers everything the outcome depends on."""
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
     everything = json.dumps([*basis, plain], sort_keys=True)
@@ -235,10 +235,10 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 def _shared(
     rows: Sequence[Member], book: Gradebook, *, examples: Callable[[], Iterable[bytes]]
 ) -> dict[str, Flag]:
-    """Return the flags for recordings that stand in two submissions of this or earlier batches."""
+    """Return the flags for recordings found in two submissions of this or earlier batches."""
     batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
-    here = {(prints.authors, prints.fingerprints) for prints in batch}  # under another name, too
+    here = {(prints.authors, prints.fingerprints) for prints in batch}  # also under another name
     earlier = [
         prints
         for prints in book.prints()
@@ -253,9 +253,9 @@ def _shared(
 
 
 def _is_before(earlier: Member, now: Member | None) -> bool:
-    """Tell what a team handed in before, or this very batch graded otherwise: that is no news.
+    """Return whether `earlier` is a version of `now`: same team or, in this class, same data.
 
-    Where only the ids of its authors were mended, the recordings tell.
+    If only the authors' ids were corrected, the recordings decide.
     """
     if now is None:
         return False

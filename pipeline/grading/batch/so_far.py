@@ -1,8 +1,8 @@
-"""The class list so far beside a run: who stays on it, and who goes on under another name.
+"""Match a run with the current class list: unchanged, renamed and replaced submissions.
 
-A folder's name is whoever's who packs it, and two that are called alike both get longer ones. So a
-submission is known by more than its name: the number that a platform has for who handed it in,
-its files, its people and their recordings.
+Folder names depend on the person who packs them, and equal names are both extended. So a
+submission is recognised by more than its name: the platform's number of its account, its files,
+its authors and their recordings.
 """
 
 from collections.abc import Mapping
@@ -16,14 +16,14 @@ from pipeline.grading.similarity.shared import same_recordings
 
 @dataclass(frozen=True, kw_only=True)
 class SoFar:
-    """What became of the class list so far.
+    """Changes to the current class list.
 
     Attributes
     ----------
-    kept : lines that the run says nothing of.
-    moved : the new name of each submission that goes on under another.
-    taken_over : (submission, authors before, authors now) where those are others, who have not
-        what was given by hand.
+    kept : lines that are not in the run.
+    moved : the new name of each renamed submission.
+    taken_over : (submission, authors before, authors now) where the authors differ; they do not
+        inherit points given by hand.
     """
 
     kept: Mapping[str, Member]
@@ -32,7 +32,7 @@ class SoFar:
 
 
 def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
-    """Return what the run with these rows makes of the class list so far."""
+    """Return how a run with these rows changes the current class list."""
     now = {name.casefold(): name for name in rows}
     left: dict[str, Member] = {}
     new, moved = dict(rows), {}
@@ -43,7 +43,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
             left[line.submission] = line
         else:
             del new[name]
-            if name != line.submission:  # in capitals, say
+            if name != line.submission:  # in capitals, for example
                 moved[line.submission] = name
     before = {one.submission: one for one in book.prints([one.grading for one in left.values()])}
     moved |= _matched(before, new)
@@ -60,7 +60,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
 
 
 def _others(before: Member, now: Member) -> bool:
-    """Tell whether a submission is another team's now; who is not named is nobody else."""
+    """Return whether a submission now belongs to another team; unnamed authors do not count."""
     return _strangers(before, now) and not same_number(before.owner, now.owner)
 
 
@@ -69,7 +69,7 @@ def _strangers(before: Member, now: Member) -> bool:
 
 
 def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
-    """Return which submission goes on as which: those first that have the most in common."""
+    """Match old with new submissions, those with the most in common first."""
     pairs = [
         (evidence, old, new)
         for old in before
@@ -84,12 +84,12 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
 
 
 def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
-    """Return what says that two are one submission, the strongest first."""
+    """Return the evidence that two are the same submission, strongest first."""
     if _others(before, now):
         return ()
     both = before.people & now.people
     names = [f"-{row.submission}" for row in (before, now)]
-    # Of those who are not named many may hand in the same: nothing, or what cartlab new wrote.
+    # Several unnamed teams may submit the same: nothing, or the files of `cartlab new`.
     kin = both or any(a.endswith(b) for a, b in (names, names[::-1]))
     prints = before.fingerprints and now.fingerprints
     (_, was, number), (_, is_, number_now) = (read_owner(r.owner) for r in (before, now))
@@ -97,6 +97,6 @@ def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
         same_number(before.owner, now.owner),
         bool(kin) and before.content == now.content != "",
         bool(both and prints) and same_recordings(before, now),
-        # Anybody can write other people's ids into a file, but not under their number.
+        # Anybody can write other people's ids into a file, but not use their platform number.
         bool(both) and before.people == now.people and (was != is_ or number == number_now),
     )

@@ -1,4 +1,4 @@
-"""The process that grades one hand-in after another, so that a bad one can be stopped."""
+"""The process that grades one submission after another, and can be stopped."""
 
 import base64
 import re
@@ -31,13 +31,13 @@ _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """How to grade: the same for all hand-ins of a batch.
+    """How to grade, the same for all submissions of a batch.
 
     Attributes
     ----------
-    scratch : where hand-ins are copied to while they are graded.
-    time_limit : s for each hand-in; memory_limit : bytes beyond what the worker needs itself.
-    figures : draw those of the feedback, too.
+    scratch : folder for copies of the submissions during grading.
+    time_limit : s for each submission; memory_limit : bytes beyond the worker's own need.
+    figures : draw the figures of the feedback.
     """
 
     rubric: Rubric
@@ -49,9 +49,9 @@ class Setup:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One hand-in to grade; see `intake.HandIn` and, for the key, `batch.Grading`.
+    """One submission to grade; see `intake.HandIn` and, for the key, `batch.Grading`.
 
-    `digest` is of the files that the key is of, "" where nobody asks whether those are graded.
+    `digest` is the hash of the files in the key; "" if it need not be checked.
     """
 
     id: str
@@ -63,7 +63,7 @@ class Task:
 
 
 def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
-    """Open, analyse and grade one hand-in; whatever is wrong with it is the outcome's reason."""
+    """Open, analyse and grade one submission; any problem becomes the reason of the outcome."""
     authors: tuple[str, ...] = ()
     reason = detail = ""
     settled, no_room = True, False
@@ -98,16 +98,16 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 settled=not detail,
                 detail=detail,
             )
-    except Changed:  # by whoever synchronises the folder, say
-        reason, settled = "its files changed while the class was graded: grade it again", False
+    except Changed:  # by a synchronised folder, for example
+        reason, settled = "its files changed during the grading: grade it again", False
     except PipelineError as error:
         reason = str(error)
-    except OSError as error:  # a full disk, a folder gone: perhaps not the hand-in's fault
+    except OSError as error:  # a full disk or a lost folder may not be the submission's fault
         reason = f"cannot be read ({error.strerror or error}); the next run tries again"
         settled, no_room = False, lacks_room(error)
     except MemoryError:
         reason, settled = OUT_OF_MEMORY, False
-    except Exception as error:  # of ours, or of a library: a mended one is to have its try
+    except Exception as error:  # a bug of ours or a library: retry once it is fixed
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
         detail, settled = _traceback(), False
     outcome = failed(
@@ -117,7 +117,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
 
 
 def named_authors(folder: Path) -> tuple[str, ...]:
-    """Return the ids under `[[authors]]` line by line, so that no slip elsewhere hides them.
+    """Read the ids under `[[authors]]` line by line, even if the file has mistakes elsewhere.
 
     Raises
     ------
@@ -137,9 +137,9 @@ def named_authors(folder: Path) -> tuple[str, ...]:
 def _figures(
     submission: Submission, graded: Graded, rubric: Rubric
 ) -> tuple[tuple[tuple[str, str], ...], str]:
-    """Return the figures; or none and why: a grade stands whatever happens to its pictures."""
+    """Return the figures, or none and the reason: a failed figure must not affect the grade."""
     from pipeline.grading.publish.feedback_figures import (
-        draw_figures,  # costs half a second at first
+        draw_figures,  # takes half a second to import
         draw_records,
     )
 
@@ -167,7 +167,7 @@ def failed(
     settled: bool = True,
     detail: str = "",
 ) -> Grading:
-    """Return the outcome of a hand-in that could not be graded; each of its lines is a reason."""
+    """Return the outcome of a submission that could not be graded, with one reason per line."""
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
     people = tuple(authors)
@@ -192,7 +192,7 @@ def plain_grading(outcome: Grading) -> dict[str, Any]:
 
 
 def read_grading(plain: Mapping[str, Any]) -> Grading:
-    """Return the outcome of which `plain_grading`, and JSON, made this."""
+    """Read back an outcome from `plain_grading`, after JSON."""
     return Grading(
         **{
             **plain,
@@ -206,7 +206,7 @@ def read_grading(plain: Mapping[str, Any]) -> Grading:
 def _prepare(
     rubric: str, scratch: str, *, figures: bool
 ) -> Callable[[dict[str, Any], object], dict[str, Any]]:
-    """Return what grades a hand-in by a rubric, given as JSON."""
+    """Return a function that grades submissions by a rubric, given as JSON."""
     asked = Rubric.model_validate_json(rubric)
 
     def grade(task: dict[str, Any], _: object) -> dict[str, Any]:

@@ -1,1 +1,1 @@
-"""What was graded, changed, and by whom."""
+"""The gradebook: gradings, changes, and who made them."""

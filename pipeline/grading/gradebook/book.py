@@ -1,7 +1,7 @@
-"""The gradebook: every grading kept, what counts now, and points given by hand.
+"""The gradebook: all gradings, the current class list, and points given by hand.
 
-Grading puts each submission in as it comes, in a transaction of its own; a batch that ran to its
-end becomes the class list. Results carry no dates: those are here, and in `cartlab history`.
+Each submission is stored when it is graded, in its own transaction; a complete batch becomes the
+class list. Results contain no dates: those are here, and in `cartlab history`.
 """
 
 import json
@@ -60,15 +60,14 @@ if TYPE_CHECKING:
 
 
 class Gradebook:
-    """A store of outcomes and the class list made of them.
+    """A store of outcomes, and the class list made from them.
 
     Parameters
     ----------
     place : a folder, a SQLite file or any SQLAlchemy URL.
-    assignment : whose class list it is about, so that one database can hold several; default: the
-        one that was graded last.
-    create : make a gradebook where there is none.
-    now : the clock that says when something was put in.
+    assignment : selects one of several class lists in the database; default: the last graded.
+    create : create the gradebook if it is missing.
+    now : the clock for the times of entries.
 
     Raises
     ------
@@ -88,7 +87,7 @@ class Gradebook:
         self._assignment = assignment
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Close the database."""
         self._database.close()
 
     def __enter__(self) -> Self:
@@ -100,16 +99,16 @@ class Gradebook:
     # ------------------------------------------------------------------ while grading
 
     def known(self, key: str, *, figures: bool = True) -> Grading | None:
-        """Return the newest grading of this key, None where there is none; or without figures."""
+        """Return the newest grading of this key, with figures if asked, or None."""
         with self._database.reading() as connection:
             return known_grading(connection, key, assignment=self._assignment or "", drawn=figures)
 
     def put(self, grading: Grading) -> None:
-        """Add a grading: durable on return, and nothing of it there before.
+        """Add a grading in one transaction that is durable on return.
 
         Raises
         ------
-        ValueError : its grade is none.
+        ValueError : its grade is not valid.
         """
         grade = read_grade(grading.grade)
         with self._database.writing() as connection:
@@ -133,14 +132,14 @@ class Gradebook:
                 add_row(connection, findings, kept)
 
     def prints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
-        """Return all fingerprints that differ, or those of some gradings, see `Entry.grading`.
+        """Return all different fingerprints, or those of some gradings (see `Entry.grading`).
 
-        Those of a first version count too: what was replaced may have been passed on before.
+        Replaced versions count too, because their recordings may have been passed on.
         """
         return read_prints(self._database, numbers, assignment=self._assignment or "")
 
     def listed(self) -> Iterator[Member]:
-        """Return the class list so far, without fingerprints; nothing where no batch ended yet."""
+        """Return the current class list without fingerprints; empty before the first batch."""
         with self._database.reading() as connection:
             last = self._newest(connection)
             lines = [] if last is None else lines_of(connection, last)
@@ -149,17 +148,17 @@ class Gradebook:
     def finish(
         self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
     ) -> list[str]:
-        """Make a batch that ran to its end the class list; one that changes nothing adds nothing.
+        """Make a complete batch the class list, unless it changes nothing.
 
-        Returns what is another than in the class list before, a phrase each: the rubric first.
+        Returns the differences from the last class list, one phrase each, the rubric first.
 
         Parameters
         ----------
-        shown : what to call a submission in these phrases; asked when the class list is made.
+        shown : returns the name of a submission in these phrases; called after the list is made.
 
         Raises
         ------
-        KeyError : an outcome of the batch was never put in.
+        KeyError : an outcome of the batch is not in the gradebook.
         """
         listed, points, by_hand = [], {}, set()
         with self._database.writing() as connection:
@@ -196,11 +195,11 @@ class Gradebook:
 
     @property
     def assignment(self) -> str:
-        """Whose class list it is.
+        """The assignment of the class list.
 
         Raises
         ------
-        ConfigError : no batch ran to its end yet.
+        ConfigError : no batch is complete yet.
         """
         with self._database.reading() as connection:
             return self._last(connection).assignment
@@ -211,13 +210,13 @@ class Gradebook:
 
         Raises
         ------
-        ConfigError : no batch ran to its end yet.
+        ConfigError : no batch is complete yet.
         """
         with self._database.reading() as connection:
             return read_rubric(self._last(connection))
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the class list in the order of its submissions, some at a time in memory."""
+        """Yield the class list in order, keeping only some submissions in memory."""
         with self._database.reading() as connection:
             last = self._last(connection)
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
@@ -233,11 +232,11 @@ class Gradebook:
             yield from found
 
     def entry(self, team: str) -> Entry:
-        """Return the line of a submission, named by its id or by one of its authors.
+        """Return the line of a submission, given its id or one of its authors.
 
         Raises
         ------
-        ConfigError : there is none, or several.
+        ConfigError : no submission matches, or several.
         """
         with self._database.reading() as connection:
             last, row = self._find(connection, team)
@@ -246,12 +245,12 @@ class Gradebook:
             )
 
     def to_frame(self) -> "pd.DataFrame":
-        """Return the class list, one row a submission and criterion; see `class_frame`."""
+        """Return the class list, one row per submission and criterion; see `class_frame`."""
         lines = (Line.of(entry.grade) for entry in self.entries())
         return class_frame(lines, rubric=self.rubric)
 
     def by_other_rubrics(self) -> list[str]:
-        """Return the submissions of the class list that its rubric did not grade."""
+        """Return the submissions of the class list that another rubric graded."""
         with self._database.reading() as connection:
             return by_other_rubrics(connection, self._last(connection))
 
@@ -261,13 +260,13 @@ class Gradebook:
             return read_figures(connection, entry.grading)
 
     def findings(self, entry: Entry) -> str:
-        """Return what the checks found in a submission; "" where that was not kept."""
+        """Return the results of the checks of a submission; "" if they were not kept."""
         mine = select(findings.c.found).where(findings.c.grading_id == entry.grading)
         with self._database.reading() as connection:
             return connection.scalar(mine) or ""
 
     def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
-        """Return the submission's id and all that ever happened to it, see `read_events`.
+        """Return a submission's id and its whole history, see `read_events`.
 
         Raises
         ------
@@ -278,13 +277,13 @@ class Gradebook:
             return row.name, read_events(connection, row.submission_id, named=named)
 
     def remove(self, teams: Sequence[str]) -> list[str]:
-        """Take submissions off the class list and return their names.
+        """Remove submissions from the class list and return their names.
 
-        What happened to them stays in their history; graded again, they are back.
+        Their history stays. If they are graded again, they return to the list.
 
         Raises
         ------
-        ConfigError : one is not on it, or there are several.
+        ConfigError : a name matches no submission on it, or several.
         """
         with self._database.writing() as connection:
             found = [self._find(connection, team) for team in teams]
@@ -316,12 +315,12 @@ class Gradebook:
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
     ) -> HandPoints:
-        """Give a criterion points by hand, which every later grading keeps; None takes them back.
+        """Give a criterion points by hand, kept by every later grading; None removes them.
 
         Raises
         ------
-        ConfigError : there is no such submission or criterion, the points are none that it can
-            have, or who and why are not said.
+        ConfigError : there is no such submission or criterion, the points are not possible, or
+            the person or reason is missing.
         """
         with self._database.writing() as connection:
             last, row = self._find(connection, team)
@@ -333,7 +332,7 @@ class Gradebook:
     def _give(
         self, connection: Connection, row: Row, asked: WantedPoints, *, by: str, rubric: Rubric
     ) -> HandPoints:
-        """Add an override of the submission of a line."""
+        """Add an override for the submission of a line."""
         criterion, points = asked.criterion, asked.points
         why, by = asked.why.strip(), by.strip()
         if not why or not by:
@@ -372,7 +371,7 @@ class Gradebook:
         if row is None:
             what = f"no grading of {self._assignment!r}" if self._assignment else "no grading"
             raise ConfigError(
-                f"{self._database.name}: {what} ran to its end yet: run cartlab grade again"
+                f"{self._database.name}: {what} is complete yet: run cartlab grade again"
             )
         return row
 
@@ -384,12 +383,14 @@ class Gradebook:
         found = [row.position for row in _named(team, rows)]
         if len(found) != 1:
             hint = f"no such submission{nearest(team, [row.name for row in rows])}"
-            raise ConfigError(f"{team}: {'is in several submissions: name one' if found else hint}")
+            raise ConfigError(
+                f"{team}: {'is in several submissions: give the name of one' if found else hint}"
+            )
         line = class_list(last).where(entries.c.position == found[0])
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
-        """Return a team on the class list, or one that was graded and is not on it."""
+        """Return a team on the class list, or one that was graded but is not on it."""
         try:
             return self._find(connection, team)[1]
         except ConfigError:
@@ -403,7 +404,7 @@ class Gradebook:
             return found.popitem()[1]
 
     def _newest(self, connection: Connection) -> Row | None:
-        """Return the batch of this assignment, or of any, that ended last; None before one did."""
+        """Return the latest complete batch of this assignment, or of any, or None."""
         newest = select(batches).order_by(batches.c.id.desc()).limit(1)
         if self._assignment is not None:
             newest = newest.where(batches.c.assignment == self._assignment)
@@ -411,6 +412,6 @@ class Gradebook:
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of this name, or else of which this is an author, however typed."""
+    """Return the rows with this name, or else with this author (in any spelling)."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]

@@ -1,4 +1,4 @@
-"""What is another since the class list before: the rubric, and whose points."""
+"""Differences from the last class list: the rubric and the points."""
 
 from collections.abc import Callable, Container, Mapping
 from typing import Any
@@ -10,15 +10,15 @@ from pipeline.grading.words import points_text
 
 
 def rubric_changes(before: str, now: str) -> list[str]:
-    """Return what is another in a rubric, kept as JSON, a phrase each."""
+    """Return the differences between two rubrics stored as JSON, one phrase each."""
     if before == now:
         return []
     try:
         rubrics = [Rubric.model_validate_json(text) for text in (before, now)]
     except ValidationError:
-        return ["the rubric before is of another version of cartlab"]
+        return ["the earlier rubric was written by another version of cartlab"]
     old, new = ({c.id: c for c in rubric.criteria} for rubric in rubrics)
-    changes = [f"criterion {id_} is gone" for id_ in old if id_ not in new]
+    changes = [f"criterion {id_} was removed" for id_ in old if id_ not in new]
     for id_, criterion in new.items():
         if id_ not in old:
             changes.append(f"criterion {id_} is new")
@@ -26,7 +26,7 @@ def rubric_changes(before: str, now: str) -> list[str]:
             differing = _differing(old[id_].model_dump(), criterion.model_dump())
             changes += [f"{id_}: {change}" for change in differing]
     if not changes and list(old) != list(new):
-        changes.append("the criteria stand in another order")
+        changes.append("the order of the criteria changed")
     old, new = (rubric.model_dump(exclude={"criteria"}) for rubric in rubrics)
     return changes + _differing(old, new)
 
@@ -38,7 +38,7 @@ def points_changes(
     by_hand: Container[str] = (),
     shown: Callable[[str], str] = str,
 ) -> list[str]:
-    """Return whose points are another, and who is new or gone; `shown` says what to call them."""
+    """Return changed points, new and removed submissions; `shown` gives the names to print."""
     in_order = sorted(now.items(), key=lambda one: shown(one[0]))
     changes = [
         f"{shown(name)}: {points_text(before[name])} → {points_text(points)}"
@@ -47,7 +47,7 @@ def points_changes(
         if name in before and points != before[name]
     ]
     changes += [f"{shown(name)} is new" for name, _ in in_order if name not in before]
-    return changes + [f"{shown(name)} is gone" for name in before if name not in now]
+    return changes + [f"{shown(name)} was removed" for name in before if name not in now]
 
 
 def _differing(before: Mapping[str, Any], now: Mapping[str, Any], at: str = "") -> list[str]:

@@ -1,11 +1,11 @@
-"""The class as a table: a line a submission, or a row a submission and criterion."""
+"""The class as a table: one line per submission, or one row per submission and criterion."""
 
 from collections.abc import Iterable
 from functools import cached_property
 from math import nan
 from typing import TYPE_CHECKING
 
-from typing_extensions import TypedDict  # pydantic takes no other before Python 3.12
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from pipeline.grading.grade import CODES, Code, Grade, GradeOverride, GradeTable, Outcome
 from pipeline.grading.rubric import Rubric
@@ -20,7 +20,7 @@ _COLUMNS = (
 
 
 class Judged(TypedDict):
-    """What a criterion came to."""
+    """The result of a criterion."""
 
     id: str
     outcome: Outcome
@@ -28,15 +28,15 @@ class Judged(TypedDict):
 
 
 class Flagged(TypedDict):
-    """A mistake that was named."""
+    """A named mistake."""
 
     code: Code
 
 
 class Line(GradeTable):
-    """What the pages and tables of a class need of one `grade.json`.
+    """The part of one `grade.json` that the pages and tables of a class need.
 
-    Not its values and messages: to read those of 2,000 submissions takes a third of a second.
+    Values and messages are left out: reading them for 2,000 submissions takes a third of a second.
     """
 
     submission: str
@@ -58,7 +58,7 @@ class Line(GradeTable):
         return cls.model_validate(grade.model_dump(include=set(cls.model_fields)))
 
     def sharing(self) -> "Line":
-        """Return the line, now that recordings stand in other submissions too."""
+        """Return the line with the flag for recordings that other submissions also contain."""
         codes = {flag["code"] for flag in self.flags} | {"shared_data"}
         flags = tuple(Flagged(code=code) for code in CODES if code in codes)
         return self.model_copy(update={"flags": flags})
@@ -70,21 +70,21 @@ class Line(GradeTable):
 
     @property
     def codes(self) -> tuple[Code, ...]:
-        """Those of its flags, each once."""
+        """The codes of its flags, each once."""
         return tuple(dict.fromkeys(flag["code"] for flag in self.flags))
 
     @property
     def by_hand(self) -> tuple[str, ...]:
-        """Criteria with points given by hand."""
+        """The criteria with points given by hand."""
         return tuple(given.criterion for given in self.overrides)
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
-    """Return what to ask the instructor where recordings want springs that the rubric has not.
+    """Return a question to the instructor if recordings need springs that the rubric lacks.
 
     Parameters
     ----------
-    graded : of every submission that was graded, the springs it asks for.
+    graded : the springs that each graded submission needs.
     """
     every = list(graded)
     asking = [springs for springs in every if springs]
@@ -92,20 +92,20 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
         return ""
     names = ", ".join(dict.fromkeys(name for springs in asking for name in springs))
     return (
-        f"the recordings of {len(asking)} of {len(every)} submissions ask for springs that the "
-        f"rubric has not ({names}), and were judged with them: is its [system] that of the benches?"
+        f"the recordings of {len(asking)} of {len(every)} submissions need springs that the "
+        f"rubric lacks ({names}), and were judged with them: does its [system] match the benches?"
     )
 
 
 def class_frame(lines: Iterable[Line], *, rubric: Rubric) -> "pd.DataFrame":
-    """Return the class, one row a submission and criterion of the rubric.
+    """Return the class, one row per submission and criterion.
 
-    Of the submission: `submission`, `authors`, `status`, `days_late`, `total` (the points that
-    count, lateness off), `total_out_of`, `remarks` (codes of flags); lists are separated by blanks,
-    as in `grades.csv`. Of the criterion: `criterion`, `outcome`, `points`, `out_of`, `by_hand`; one
-    that was never judged has no outcome, and NaN points.
+    Columns of the submission: `submission`, `authors`, `status`, `days_late`, `total` (after the
+    deduction for lateness), `total_out_of`, `remarks` (codes of flags). Lists are separated by
+    blanks, as in `grades.csv`. Columns of the criterion: `criterion`, `outcome`, `points`,
+    `out_of`, `by_hand`. A criterion that was never judged has no outcome and NaN points.
     """
-    import pandas as pd  # a fifth of a second, and grading a submission needs none of it
+    import pandas as pd  # imported late: it takes 0.2 s and grading does not need it
 
     rows = []
     for line in lines:

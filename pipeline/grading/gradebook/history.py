@@ -1,4 +1,4 @@
-"""All that ever happened to a submission, in order: graded, listed, overridden."""
+"""The history of a submission in order: gradings, class lists, overrides."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -31,12 +31,12 @@ class Event:
     ----------
     at : ISO 8601, UTC.
     what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
-        overrides; `removed`: off the class list; `override`: by hand, `points` None where it was
-        taken back; `comment`: by hand, beside points that stay automatic; `asked`, `answered`,
+        overrides; `removed`: from the class list; `override`: by hand, `points` None if undone;
+        `comment`: by hand, while points stay automatic; `asked`, `answered`,
         `reopened`: another look at a criterion, `points` where the answer gave others.
-    points, out_of : of the submission, or of the one criterion that the event is about.
-    text : flags, why, or the answer.
-    by : who, of an override and of a request; "" for a student who is not to be named.
+    points, out_of : of the submission, or of the criterion concerned.
+    text : flags, reason or answer.
+    by : the person behind an override or request; "" for a student who stays anonymous.
     """
 
     at: str
@@ -51,7 +51,7 @@ class Event:
 
 
 def read_events(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
-    """Return the events of one submission, oldest first; `named` tells what else it was called."""
+    """Return the events of one submission, oldest first; `named` gives its other names."""
     found = [
         *_graded(connection, submission),
         *_overridden(connection, submission),
@@ -84,7 +84,7 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
 
 
 def _requested(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
-    """Yield who asked for another look, and what was answered."""
+    """Yield the requests for another look and their answers."""
     mine = select(request_events).where(request_events.c.submission_id == submission)
     for row in connection.execute(mine.order_by(request_events.c.id)):
         asked = row.what == "asked"
@@ -99,7 +99,7 @@ def _requested(connection: Connection, submission: int, *, named: bool) -> Itera
 
 
 def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
-    """Yield the class lists in which something was new, and those it is no longer in."""
+    """Yield the class lists with a change of the submission, and those without it."""
     own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
     of_batch = batches.c.id, batches.c.at, batches.c.rubric
     columns = *of_batch, entries.c.points, entries.c.out_of, entries.c.shared
@@ -114,8 +114,8 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
         if points is None:
             if before is not None:
                 now = _other_name(connection, submission, of=previous, among=batch)
-                goes_on = f"goes on as {now}" if named else "goes on under another name"
-                text = "off the class list" + (f": {goes_on}" if now else "")
+                goes_on = f"continues as {now}" if named else "continues under another name"
+                text = "removed from the class list" + (f": {goes_on}" if now else "")
                 yield Event(at=at, what="removed", points=None, text=text)
             before = None
             continue
@@ -123,7 +123,7 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
         if before is None and (
             then := _other_name(connection, submission, of=batch, among=previous)
         ):
-            said.append(f"was {then} before" if named else "had another name before")
+            said.append(f"was {then} before" if named else "was renamed")
         if judged_by and rubric != judged_by:
             said += [f"rubric: {change}" for change in rubric_changes(judged_by, rubric)]
         if ((points, out_of, shared), rubric) != (before, judged_by):
@@ -134,7 +134,7 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
 def _other_name(
     connection: Connection, submission: int, *, of: int | None, among: int | None
 ) -> str:
-    """Return what a submission of one class list is called in another where only its people are."""
+    """Return the name in another class list of a submission that only shares its authors."""
 
     def listed(batch: int | None) -> dict[int, tuple[str, tuple[str, ...]]]:
         rows = select(submissions.c.id, submissions.c.name, gradings.c.authors)
@@ -158,7 +158,7 @@ def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
 
 
 def history_text(submission: str, events: Sequence[Event]) -> str:
-    """Return a history as lines to read."""
+    """Return a history as lines of text."""
     return "\n".join(
         [submission, *(f"{to_the_second(event.at)}  {event_words(event)}" for event in events)]
     )
@@ -170,7 +170,7 @@ def to_the_second(at: str) -> str:
 
 
 def event_words(event: Event) -> str:
-    """Return what an event was, with points, who and why."""
+    """Return an event in words, with points, person and reason."""
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
@@ -185,7 +185,7 @@ def event_words(event: Event) -> str:
 
 
 def _request_words(event: Event) -> str:
-    """Return a step of a request for another look; what people wrote is put on one line."""
+    """Return a step of a request in words; typed text is put on one line."""
     by = f"by {event.by}" if event.by else "by the team"
     points = "" if event.points is None else f"{event.points:g} by hand, "
     said = " ".join(event.text.split())

@@ -1,4 +1,4 @@
-"""A gradebook that several people look at and change at the same time."""
+"""A gradebook that several people read and change at the same time."""
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -35,7 +35,7 @@ State = tuple[int, int, int]
 
 
 class Conflict(ConfigError):
-    """A change rests on what is no longer so; `now` is what somebody else gave, if anything."""
+    """A change is based on an outdated state; `now` is what somebody else gave, if anything."""
 
     def __init__(self, text: str, *, now: HandPoints | None) -> None:
         super().__init__(text)
@@ -44,16 +44,16 @@ class Conflict(ConfigError):
 
 @dataclass(frozen=True, kw_only=True)
 class Listing:
-    """A line of the class list as it counts.
+    """A line of the class list with its current grade.
 
     Attributes
     ----------
-    line : under another name where a page is anonymous.
+    line : under a pseudonym if the page is anonymous.
     submission : its name in the gradebook.
-    seen : who marked the grading as looked at, or "".
-    shared : the flag for recordings that stand in other submissions too.
-    first_key : of what was first handed in under this name.
-    made_of : what the line was worked out from.
+    seen : who marked the grading as reviewed, or "".
+    shared : the flag for recordings that other submissions also contain.
+    first_key : key of the first version submitted under this name.
+    made_of : the data from which the line was computed.
     """
 
     line: Line
@@ -67,7 +67,7 @@ class Listing:
 
 @dataclass(frozen=True, kw_only=True)
 class ClassNow:
-    """The class list as it counts."""
+    """The class list with current grades."""
 
     rubric: Rubric
     listings: tuple[Listing, ...]
@@ -75,13 +75,13 @@ class ClassNow:
 
 @dataclass(frozen=True, kw_only=True)
 class TeamNow:
-    """All of one submission, at one moment.
+    """All data of one submission at one moment.
 
     Attributes
     ----------
-    versions : by criterion what its points rest on; to be sent along with a change of them.
-    changed : criteria that were ever given points by hand.
-    seen : who marked it as looked at, or "".
+    versions : the state behind the points of each criterion, sent along with a change.
+    changed : criteria that ever had points by hand.
+    seen : who marked it as reviewed, or "".
     """
 
     rubric: Rubric
@@ -94,13 +94,13 @@ class TeamNow:
 
 @dataclass(frozen=True, kw_only=True)
 class Together:
-    """Points that a person gave several submissions in one go: all at the same moment.
+    """Points that a person gave to several submissions at once, with the same time.
 
     Attributes
     ----------
-    at : ISO 8601, UTC, to the microsecond; by it they are found again.
-    criterion, why : of one of them.
-    teams : so many got something new.
+    at : ISO 8601, UTC, to the microsecond; identifies the set.
+    criterion, why : of one of the changes.
+    teams : number of submissions changed.
     """
 
     at: str
@@ -112,7 +112,7 @@ class Together:
 
 @dataclass(frozen=True, kw_only=True)
 class Undone:
-    """What was given back in one go; `kept` are submissions that somebody changed since."""
+    """The result of undoing a set; `kept` are submissions that somebody has changed since."""
 
     at: str
     back: int
@@ -121,11 +121,11 @@ class Undone:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """What points by hand would make of a submission.
+    """A submission as points by hand would change it.
 
     Attributes
     ----------
-    version : of the criterion now; to be sent along with the change.
+    version : of the criterion now; sent along with the change.
     """
 
     submission: str
@@ -135,17 +135,17 @@ class Tried:
 
 
 class OpenBook(Gradebook):
-    """A gradebook of which several processes show the newest, and change no more than they saw."""
+    """A gradebook shared by several processes; each changes only a state that it has seen."""
 
     def state(self) -> State:
-        """Return numbers that change whenever something else is to be shown."""
+        """Return numbers that change whenever the content changes."""
         with self._database.reading() as connection:
             last = self._last(connection).id
             newest = (connection.scalar(select(func.max(t.c.id))) or 0 for t in (overrides, looks))
             return (last, *newest)  # type: ignore[return-value]
 
     def class_now(self, before: ClassNow | None = None) -> ClassNow:
-        """Return the class; of what it was before, lines that rest on the same stay."""
+        """Return the class; lines of the earlier one that are still valid are reused."""
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
@@ -181,11 +181,11 @@ class OpenBook(Gradebook):
             return ClassNow(rubric=rubric, listings=tuple(listed[at] for at in rests_on))
 
     def team(self, name: str) -> TeamNow:
-        """Return all of a submission.
+        """Return all data of a submission.
 
         Raises
         ------
-        ConfigError : there is none of this name.
+        ConfigError : there is no submission with this name.
         """
         with self._database.reading() as connection:
             last, row = self._find(connection, name)
@@ -212,17 +212,17 @@ class OpenBook(Gradebook):
         by: str,
         seen: str,
     ) -> HandPoints:
-        """Give points by hand as `override` does, where nobody else did since.
+        """Give points by hand like `override`, unless somebody else has changed them since.
 
-        The points that the criterion has already are not given: `why` is a comment beside them.
+        If the criterion has these points already, `why` is only added as a comment.
 
         Parameters
         ----------
-        seen : what the change rests on, from `TeamNow.versions`.
+        seen : the state that the person saw, from `TeamNow.versions`.
 
         Raises
         ------
-        Conflict : somebody else changed them, or the submission was graded anew.
+        Conflict : somebody else changed them, or the submission was graded again.
         """
         with self._database.changing() as connection:
             last, row = self._find(connection, team)
@@ -240,7 +240,7 @@ class OpenBook(Gradebook):
             return self._give(connection, row, asked, by=by, rubric=rubric)
 
     def undo(self, team: str, criterion: str, *, by: str, seen: str) -> HandPoints:
-        """Give a criterion what it had before its last change; twice: what it had after.
+        """Undo the last change of a criterion; a second call redoes it.
 
         Raises
         ------
@@ -257,12 +257,12 @@ class OpenBook(Gradebook):
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
-        """Give points by hand, all of them or, where one cannot be, none.
+        """Give points by hand, either all of them or none.
 
         Raises
         ------
-        ConfigError : with the line of the table, if they are from one.
-        Conflict : one of them rests on what is no longer so.
+        ConfigError : points are not possible; with the line of the table, if there is one.
+        Conflict : one of them is based on an outdated state.
         """
         new = 0
         with self._database.changing() as connection:
@@ -295,9 +295,9 @@ class OpenBook(Gradebook):
         return Together(at=at, by=by, teams=new)
 
     def try_all(self, wishes: Sequence[WantedPoints]) -> list[Tried]:
-        """Return what points by hand would make of submissions, without giving them.
+        """Return submissions as points by hand would change them, without giving the points.
 
-        Those that are not in the class are left out.
+        Submissions that are not in the class are left out.
         """
         wished = {wish.submission: wish for wish in wishes}
         with self._database.reading() as connection:
@@ -310,9 +310,9 @@ class OpenBook(Gradebook):
             ]
 
     def undo_all(self, at: str, *, by: str) -> Undone:
-        """Give back what all criteria had that were changed in one go.
+        """Undo a set of changes made at once.
 
-        What somebody changed since stays as it is now.
+        Criteria that somebody has changed since stay as they are.
         """
         back, kept = 0, []
         with self._database.changing() as connection:
@@ -331,7 +331,7 @@ class OpenBook(Gradebook):
         return Undone(at=now, back=back, kept=tuple(kept))
 
     def changed_together(self, *, least: int = 2) -> list[Together]:
-        """Return what was given to at least so many submissions in one go, the newest first."""
+        """Return the sets of changes to at least so many submissions at once, newest first."""
         with self._database.reading() as connection:
             last = self._last(connection)
             of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
@@ -344,14 +344,14 @@ class OpenBook(Gradebook):
             return [Together(**row) for row in connection.execute(mine).mappings()]
 
     def mark(self, team: str, *, by: str, seen: bool) -> None:
-        """Say that somebody looked at a submission as it is graded now, or did not."""
+        """Mark the current grading of a submission as reviewed, or as not reviewed."""
         with self._database.writing() as connection:
             _, row = self._find(connection, team)
             values = {"grading_id": row.id, "at": self._at(), "by": by, "seen": seen}
             connection.execute(insert(looks).values(values))
 
     def changes_since(self, number: int) -> list[tuple[str, HandPoints]]:
-        """Return the submission and content of each override after one of a number."""
+        """Return the submission and content of each override after a given number."""
         with self._database.reading() as connection:
             mine = _overrides().where(
                 overrides.c.id > number,
@@ -361,7 +361,7 @@ class OpenBook(Gradebook):
         return [(row.name, _read_override(row)) for row in rows]
 
     def reasons(self) -> dict[str, list[str]]:
-        """Return the reasons that overrides were given for, by criterion, the commonest first."""
+        """Return the reasons of overrides by criterion, the most common first."""
         with self._database.reading() as connection:
             mine = (
                 select(overrides.c.criterion, overrides.c.why)
@@ -380,7 +380,7 @@ class OpenBook(Gradebook):
 
 
 def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
-    """Return a line of the class as it counts; few have points by hand, and need all of a grade."""
+    """Return a line with its current grade; only lines with points by hand need the whole grade."""
     shared = read_flag(row.shared)
     if given:
         return Line.of(as_it_counts(row, given.values(), shared=shared, rubric=rubric).grade)
@@ -389,7 +389,7 @@ def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -
 
 
 def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
-    """Return all that was ever given by hand in a class: by submission, by its own number."""
+    """Return all points ever given by hand in a class, by the number of the submission."""
     of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
     given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
     mine = _overrides().where(overrides.c.submission_id.in_(of_class))
@@ -399,7 +399,7 @@ def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints
 
 
 def _first_keys(connection: Connection, batch: Row) -> dict[int, str]:
-    """Return, by submission, the key of what was first handed in."""
+    """Return, by submission, the key of the first version."""
     of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
     firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(of_class))
     firsts = firsts.group_by(gradings.c.submission_id)
@@ -408,7 +408,7 @@ def _first_keys(connection: Connection, batch: Row) -> dict[int, str]:
 
 
 def _seen(connection: Connection, batch: Row) -> dict[int, str]:
-    """Return who marked a grading as looked at, the newest mark of each."""
+    """Return who marked each grading as reviewed, by its newest mark."""
     of_list = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     mine = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
     marks = {row.grading_id: row for row in connection.execute(mine)}
@@ -416,13 +416,13 @@ def _seen(connection: Connection, batch: Row) -> dict[int, str]:
 
 
 def _overrides() -> Select:
-    """Return the query for all that was given by hand, in order."""
+    """Return the query for all points given by hand, in order."""
     columns = overrides.c.id, overrides.c.submission_id, submissions.c.name
     return select(*columns, *OVERRIDE).join(submissions).order_by(overrides.c.id)
 
 
 def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
-    """Return what a criterion had by hand before its last change, of all that it ever had."""
+    """Return the points by hand that a criterion had before its last change."""
     last = earlier[-1] if earlier else None
     if last is None or (last.points is None and not last.comment):
         return WantedPoints(submission=team, criterion=criterion, points=None, why="taken back")
@@ -436,7 +436,7 @@ def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
 
 
 def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
-    """Whether nothing is asked for but what was given last."""
+    """Return whether a wish only repeats the last change."""
     if newest is None:
         return False
     given = newest.points, newest.comment, newest.why
@@ -444,18 +444,18 @@ def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
 
 
 def points_of(grade: Grade, criterion: str) -> float | None:
-    """Return the points of a criterion, None where it was never judged."""
+    """Return the points of a criterion, None if it was never judged."""
     return next((own.points for own in grade.criteria if own.id == criterion), None)
 
 
 def _changed_at(batch: Row, at: str) -> Select:
-    """Return the query for all that a class was given by hand at one moment."""
+    """Return the query for all points given by hand at one moment in a class."""
     of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
     return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(of_class))
 
 
 def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
-    """Return what a line of the class would be with points by hand."""
+    """Return a line of the class as points by hand would change it."""
     shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
     rows = connection.execute(_overrides().where(own)).all()
     ever = [_read_override(one) for one in rows]
@@ -472,7 +472,7 @@ def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric
 
 
 def _read_override(row: Row) -> HandPoints:
-    """Return what a row of that says."""
+    """Read one row of that query."""
     return HandPoints(**{column.name: row._mapping[column.name] for column in OVERRIDE})
 
 
@@ -486,7 +486,7 @@ def _version(row: Row, newest: Row | None) -> str:
 
 
 def find_version(connection: Connection, row: Row, criterion: str) -> tuple[str, HandPoints | None]:
-    """Return what the points of a criterion rest on, and what was given by hand last."""
+    """Return the state behind the points of a criterion, and the last points by hand."""
     newest = _newest_overrides(connection, row.submission_id).get(criterion)
     return _version(row, newest), _read_override(newest) if newest is not None else None
 
@@ -495,5 +495,5 @@ def _check_seen(connection: Connection, row: Row, criterion: str, seen: str) -> 
     version, given = find_version(connection, row, criterion)
     if seen != version:
         raise Conflict(
-            f"{criterion}: was changed, or graded anew, after this page was shown", now=given
+            f"{criterion}: was changed or graded again after this page was shown", now=given
         )

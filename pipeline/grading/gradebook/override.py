@@ -1,4 +1,4 @@
-"""Points given by hand: who, when and why, one or many at once, and the grade with them in."""
+"""Points given by hand, one or many at once, and their effect on the grade."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +12,7 @@ from pipeline.grading.gradings import go_with
 from pipeline.grading.references.tolerance import exact, late_deduction
 from pipeline.grading.rubric import Rubric
 
-_HEADS = ("submission", "criterion", "points", "why")  # of a table with points for many
+_HEADS = ("submission", "criterion", "points", "why")  # columns of a table of points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -21,10 +21,10 @@ class HandPoints:
 
     Attributes
     ----------
-    points : None where the automatic points hold, again or with a comment.
+    points : None if the automatic points count, again or with a comment.
     at : ISO 8601, UTC.
-    authors : Of the submission at the time. The override follows these people.
-    comment : Whether `why` is only a comment for the team: the points stay automatic.
+    authors : of the submission at that time. The override follows these people.
+    comment : whether `why` is only a comment for the team and the points stay automatic.
     """
 
     criterion: str
@@ -36,36 +36,36 @@ class HandPoints:
     comment: bool = False
 
     def concerns(self, authors: tuple[str, ...]) -> bool:
-        """Whether the submission is still that of the people it was given to."""
+        """Return whether the submission still belongs to the same people."""
         return go_with(self.authors, authors)
 
 
 def read_points(text: str) -> float | None:
-    """Return points as typed, None for "auto".
+    """Return typed points, None for "auto".
 
     Raises
     ------
-    ConfigError : it is neither.
+    ConfigError : the text is neither.
     """
     if text.strip().casefold() == "auto":
         return None
     try:
         return float(text.replace(",", "."))
     except ValueError:
-        raise ConfigError(f"{text}: points are a number, or auto") from None
+        raise ConfigError(f"{text}: expected a number of points, or auto") from None
 
 
 @dataclass(frozen=True, kw_only=True)
 class WantedPoints:
-    """Points, or a comment, that somebody wants for one criterion of a submission.
+    """A change that a person requests: points or a comment for one criterion of a submission.
 
     Attributes
     ----------
     points : None for the automatic points, again or with a comment.
-    comment : Whether `why` is only a comment for the team.
-    line : Of the table that asks for it; 0 without a table.
-    seen : The state that the person saw, from `TeamNow.versions`; "" for the current one.
-    at : When; "" for now. All points given in one go have the same moment.
+    comment : whether `why` is only a comment for the team.
+    line : of the table that requests it; 0 without a table.
+    seen : the state that the person saw, from `TeamNow.versions`; "" for the current one.
+    at : the time; "" for now. Points given together have the same time.
     """
 
     submission: str
@@ -78,9 +78,9 @@ class WantedPoints:
     at: str = ""
 
     def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":
-        """Return what a comment asks for beside all that was given before.
+        """Return the change that a comment makes, given all earlier ones.
 
-        Points that are by hand already stay so, and the comment is their reason.
+        Points that are by hand already stay, and the comment becomes their reason.
         """
         newest = None
         for one in earlier:
@@ -95,7 +95,7 @@ def read_wishes(path: Path) -> list[WantedPoints]:
 
     Raises
     ------
-    ConfigError : it is no such table, with the line.
+    ConfigError : it is not such a table; the message has the line.
     """
     table = read_table(path)
     missing = [name for name in _HEADS if name not in table.columns]
@@ -133,9 +133,9 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 
 
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
-    """Return the grade with points given by hand, by criterion, and lateness off the sum.
+    """Return the grade with points given by hand and the deduction for lateness.
 
-    A criterion that was never judged, as the submission could not be graded, is added.
+    If the submission could not be graded, the criterion is added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
     if not given:
@@ -175,7 +175,7 @@ def _with_comment(criterion: Criterion, why: str) -> Criterion:
 
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
-    points = min(points, criterion.out_of)  # the rubric may have asked for more at the time
+    points = min(points, criterion.out_of)  # the criterion may have had more points at that time
     if points == criterion.points:
         return _with_comment(criterion, why)
     changed = {

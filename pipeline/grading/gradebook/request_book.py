@@ -36,7 +36,7 @@ _MOST_SHOWN = 50  # requests of a kind on one page
 
 @dataclass(frozen=True, kw_only=True)
 class OwnFeedback:
-    """What the authors of a submission read: their grade, and their requests by criterion."""
+    """The authors' view of a submission: grade, and requests by criterion."""
 
     rubric: Rubric
     entry: Entry
@@ -45,7 +45,7 @@ class OwnFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class Queued:
-    """A request as TAs see it; `version` is what an answer rests on."""
+    """A request as TAs see it; `version` is sent along with an answer."""
 
     entry: Entry
     request: Request
@@ -54,11 +54,11 @@ class Queued:
 
 @dataclass(frozen=True, kw_only=True)
 class Queue:
-    """The requests of a class: those that wait, oldest first, and the others, newest first.
+    """The requests of a class: waiting ones, oldest first, and the others, newest first.
 
     Attributes
     ----------
-    n_waiting, n_settled : how many there are; no more than a page of each is listed.
+    n_waiting, n_settled : total numbers; at most one page of each is listed.
     """
 
     rubric: Rubric
@@ -69,7 +69,7 @@ class Queue:
 
 
 class RequestBook(OpenBook):
-    """A gradebook whose students read their feedback and ask for another look."""
+    """A gradebook whose students read feedback and ask for another look."""
 
     @property
     def released(self) -> bool:
@@ -78,14 +78,14 @@ class RequestBook(OpenBook):
             return is_released(connection, self._last(connection).assignment)
 
     def release(self, released: bool, *, by: str) -> None:
-        """Let students read the feedback of the class, or no longer."""
+        """Let students read the feedback of the class, or hide it again."""
         with self._database.writing() as connection:
             assignment = self._last(connection).assignment
             values = {"assignment": assignment, "at": self._at(), "by": by, "released": released}
             add_row(connection, releases, values)
 
     def n_waiting(self) -> int:
-        """Return how many requests of the class wait for an answer."""
+        """Return the number of requests of the class that wait for an answer."""
         with self._database.reading() as connection:
             last = self._newest(connection)
             return 0 if last is None else len(find_requests(connection, last)[0])
@@ -112,7 +112,7 @@ class RequestBook(OpenBook):
             )
 
     def request_states(self, team: str) -> dict[str, str]:
-        """Return, by criterion, how the requests of a submission stand."""
+        """Return the states of the requests of a submission, by criterion."""
         with self._database.reading() as connection:
             _, row = self._find(connection, team)
             requests = read_requests(connection, row.submission_id, row.authors)
@@ -125,8 +125,8 @@ class RequestBook(OpenBook):
 
         Parameters
         ----------
-        submission : its very name; no author's name will do.
-        assignment : whose class list it must be; "": whichever is there.
+        submission : its exact name, not that of an author.
+        assignment : the required assignment of the class list; "" accepts any.
 
         Raises
         ------
@@ -150,9 +150,9 @@ class RequestBook(OpenBook):
 
         Raises
         ------
-        RequestRefused : it cannot be asked for, or there is no reason.
+        RequestRefused : a request is not possible here, or the reason is missing.
         """
-        why = read_words(why, wanted="say what should be looked at, and why")
+        why = read_words(why, wanted="write what was judged wrongly, and why")
         with self._database.changing() as connection:
             found = self._find_released(connection, submission, assignment)
             if found is None:
@@ -161,12 +161,12 @@ class RequestBook(OpenBook):
             requests = read_requests(connection, row.submission_id, row.authors)
             known = requests.get(criterion)
             if known is not None and known.state != "reopened":
-                raise RequestRefused("another look at this criterion was asked for already")
+                raise RequestRefused("you asked for another look at this criterion already")
             if criterion not in points_lost(_entry(connection, last, row).grade, read_rubric(last)):
-                raise RequestRefused("another look is for criteria that lost points")
+                raise RequestRefused("you can ask only where points were lost")
             if sum(one.state == "asked" for one in requests.values()) >= MOST_OPEN:
                 raise RequestRefused(
-                    f"{MOST_OPEN} requests of yours wait already: ask again after an answer"
+                    f"{MOST_OPEN} of your requests are waiting: ask again after an answer"
                 )
             asked = RequestEvent(criterion=criterion, what="asked", text=why, by=by)
             self._add(connection, row, asked)
@@ -183,25 +183,27 @@ class RequestBook(OpenBook):
         by: str,
         seen: str,
     ) -> None:
-        """Answer a request and, where points are given, change them: both, or neither.
+        """Answer a request and change its points, if any are given, in one transaction.
 
         Parameters
         ----------
-        points : None, or those that the criterion has: they stay.
-        text : what the students read; the reason of the points too.
-        seen : what the answer rests on, from `Queued.version`.
+        points : None, or the current points, to keep them.
+        text : what the students read; also the reason for the points.
+        seen : the state that the TA saw, from `Queued.version`.
 
         Raises
         ------
         Conflict : somebody else answered or changed the points, or the submission was graded again.
-        RequestRefused : there is no answer, or it is not a request that waits.
+        RequestRefused : the answer is empty, or the request is not waiting.
         ConfigError : the criterion cannot have these points.
         """
         text = read_words(text, wanted="write an answer for the students")
         with self._database.changing() as connection:
             last, row, request = self._find_request(connection, submission, criterion, seen=seen)
             if request.state != "asked":
-                raise RequestRefused("this request was answered already; reopen it for another")
+                raise RequestRefused(
+                    "this request has an answer already; reopen it to answer again"
+                )
             if points == points_of(_entry(connection, last, row).grade, criterion):
                 points = None
             if points is not None:
@@ -225,7 +227,7 @@ class RequestBook(OpenBook):
         with self._database.changing() as connection:
             _, row, request = self._find_request(connection, submission, criterion, seen=seen)
             if request.state != "answered":
-                raise RequestRefused("only a request that was answered can be reopened")
+                raise RequestRefused("only an answered request can be reopened")
             reopened = RequestEvent(criterion=criterion, what="reopened", text="", by=by)
             self._add(connection, row, reopened)
 
@@ -234,7 +236,7 @@ class RequestBook(OpenBook):
     def _find_released(
         self, connection: Connection, submission: str, assignment: str
     ) -> tuple[Row, Row] | None:
-        """Return the class list and a line of it, where students may read it."""
+        """Return the class list and one of its lines, if students may read it."""
         last = self._newest(connection)
         if last is None or assignment not in ("", last.assignment):
             return None
@@ -248,7 +250,7 @@ class RequestBook(OpenBook):
     def _find_request(
         self, connection: Connection, submission: str, criterion: str, *, seen: str
     ) -> tuple[Row, Row, Request]:
-        """Return the class list, the line and the request, if that is as somebody saw it."""
+        """Return the class list, the line and the request, if it is unchanged since seen."""
         last, row = self._find(connection, submission)
         request = read_requests(connection, row.submission_id, row.authors).get(criterion)
         if request is None:
@@ -270,16 +272,16 @@ class RequestBook(OpenBook):
         )
 
     def _add(self, connection: Connection, row: Row, said: RequestEvent) -> None:
-        """Add an event of a request, as of now and of the authors of now."""
+        """Add an event to a request, with the current time and authors."""
         if not said.by.strip():
-            raise RequestRefused("say who you are: a request and an answer have a name to them")
+            raise RequestRefused("enter your name: requests and answers are signed")
         authors = last_named(connection, row.submission_id)
         event = replace(said, at=self._at(), authors=authors)
         add_row(connection, request_events, {**asdict(event), "submission_id": row.submission_id})
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
-    """Return the criteria of the rubric that have not all their points, judged or not."""
+    """Return the criteria of the rubric without full points, judged or not."""
     points = {criterion.id: criterion.points for criterion in grade.criteria}
     return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
 

@@ -1,4 +1,4 @@
-"""Requests for another look: events of a criterion, of which the newest says how it stands."""
+"""Requests for another look: events of a criterion, the newest of which sets the state."""
 
 import re
 from collections import defaultdict
@@ -19,12 +19,12 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import go_with
 from pipeline.words.text import clean
 
-MOST_LETTERS = 1_000  # of a reason or an answer: a paragraph, read within a minute
-MOST_OPEN = 4  # of one submission at a time: a team with more doubts should talk to a TA
+MOST_LETTERS = 1_000  # of a reason or an answer: one paragraph
+MOST_OPEN = 4  # waiting, per submission: with more doubts, a team should talk to a TA
 
 
 class RequestRefused(ConfigError):
-    """A request or an answer cannot be taken; the text says why to the person who wrote it."""
+    """A request or an answer is refused; the text tells its author why."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,10 +33,10 @@ class RequestEvent:
 
     Attributes
     ----------
-    text : the reason, or the answer; "" where it was reopened.
-    points : that an answer gave; None where they stayed.
+    text : the reason or the answer; "" for `reopened`.
+    points : given with an answer; None if unchanged.
     at : ISO 8601, UTC.
-    authors : of the submission at the time; the request goes with them.
+    authors : of the submission at that time; the request follows them.
     """
 
     criterion: str
@@ -53,11 +53,11 @@ EVENT = [request_events.c[f.name] for f in fields(RequestEvent)]
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """All that was asked and answered about one criterion of a submission, oldest first.
+    """All questions and answers on one criterion of a submission, oldest first.
 
     Attributes
     ----------
-    number : of the newest event in the gradebook; an answer rests on it.
+    number : of the newest event in the gradebook, sent along with an answer.
     """
 
     criterion: str
@@ -66,14 +66,14 @@ class Request:
 
     @property
     def state(self) -> Literal["asked", "answered", "reopened"]:
-        """What happened last: `asked` waits for an answer, `reopened` may be asked once more."""
+        """The last event: `asked` waits for an answer; after `reopened` the team may ask again."""
         return self.events[-1].what
 
 
 def read_requests(
     connection: Connection, submission: int, authors: tuple[str, ...]
 ) -> dict[str, Request]:
-    """Return the requests of a submission by criterion, those of its authors of now."""
+    """Return the requests of a submission's current authors, by criterion."""
     mine = select(request_events.c.id, *EVENT).where(request_events.c.submission_id == submission)
     events: dict[str, list[RequestEvent]] = defaultdict(list)
     numbers: dict[str, int] = {}
@@ -89,10 +89,10 @@ def read_requests(
 
 
 def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
-    """Return the requests of a class list, those that wait first, by their newest events.
+    """Return the newest event of each request of a class list, waiting requests first.
 
     Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
-    submission. Those that wait come oldest first, the others newest first.
+    submission. Waiting requests come oldest first, the others newest first.
     """
     of = request_events.c.submission_id
     newest = select(func.max(request_events.c.id)).group_by(of, request_events.c.criterion)
@@ -128,7 +128,7 @@ def _in_class(batch: Row) -> Select:
 
 
 def hide_people(text: str, people: Iterable[str]) -> str:
-    """Return words without the names of those who wrote them, as far as they are known."""
+    """Return a text without the known names of its authors."""
     known = "|".join(re.escape(one) for one in people if one)
     return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
 
@@ -140,11 +140,11 @@ def is_released(connection: Connection, assignment: str) -> bool:
 
 
 def read_words(text: str, *, wanted: str) -> str:
-    """Return what somebody wrote, without characters that no page can show.
+    """Return a typed text without characters that cannot be shown.
 
     Raises
     ------
-    RequestRefused : there is nothing, or too much.
+    RequestRefused : the text is empty or too long.
     """
     text = clean(text).strip()
     if not text:

@@ -1,4 +1,4 @@
-"""Rows of a gradebook as what they stand for."""
+"""Convert rows of a gradebook to objects and back."""
 
 import hashlib
 import json
@@ -24,8 +24,8 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import Grading, Member
 from pipeline.grading.rubric import Rubric
 
-_PAGE = 100  # rows read at a time: memory stays flat, and a writer need not wait long
-# What a grading has in columns of its name.
+_PAGE = 100  # rows read at a time, so that memory stays flat and writers wait briefly
+# Attributes of a grading that have columns of the same name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
 OVERRIDE = [overrides.c[f.name] for f in fields(HandPoints)]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
@@ -40,17 +40,17 @@ _MEMBER = (
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
-    """A line of the class list, as it counts now.
+    """A line of the class list with its current grade.
 
     Attributes
     ----------
-    grade : with shared data flagged, points given by hand, and lateness off those.
-    automatic : points by criterion, before those given by hand.
-    overrides, comments : by criterion, those in force.
-    owner : who handed it in, as the learning platform calls them, or "".
-    key : of all that it depends on, as handed in.
+    grade : with the flag for shared data, points given by hand, and the deduction for lateness.
+    automatic : automatic points by criterion.
+    overrides, comments : current ones by criterion.
+    owner : the account that submitted it, as the learning platform names it, or "".
+    key : hash of everything the grading depends on.
     grading : its number in the gradebook.
-    first_key : of what was first handed in under this name: unknown to who has not seen it.
+    first_key : key of the first version under this name, which strangers cannot guess.
     """
 
     submission: str
@@ -72,12 +72,12 @@ def add_row(connection: Connection, table: Table, values: dict) -> int:
 
 
 def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """Return numbers of rows as many at a time as are read at once."""
+    """Split numbers of rows into pages."""
     return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
 
 
 def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
-    """Return the query for the newest grading of a key: assignments may have one rubric's text."""
+    """Return the query for the newest grading of a key; assignments may share a rubric's text."""
     mine = chosen.where(gradings.c.key == key, submissions.c.assignment == assignment)
     return mine.order_by(gradings.c.id.desc()).limit(1)
 
@@ -88,7 +88,7 @@ def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
 def known_grading(
     connection: Connection, key: str, *, assignment: str, drawn: bool
 ) -> Grading | None:
-    """Return the newest grading of a key, perhaps with figures; None where there is none."""
+    """Return the newest grading of a key, with figures if asked, or None."""
     newest = _newest(_OF_GRADING.join(submissions), key, assignment=assignment)
     row = connection.execute(newest.add_columns(gradings.c.id)).mappings().one_or_none()
     if row is None:
@@ -115,10 +115,7 @@ def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]
 def read_prints(
     database: Database, numbers: Sequence[int] | None = None, *, assignment: str
 ) -> Iterator[Member]:
-    """Yield whose fingerprints there are, of all gradings or those of these numbers.
-
-    Each that differs, of every submission under its authors.
-    """
+    """Yield the different fingerprints with their owners, of all or of these gradings."""
     chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)
     if numbers is None:
@@ -156,7 +153,7 @@ def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
 
     Raises
     ------
-    KeyError : there is none.
+    KeyError : the key has no grading.
     """
     newest = _newest(select(*_ENTRY).join(submissions), key, assignment=assignment)
     row = connection.execute(newest).one_or_none()
@@ -176,7 +173,7 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
 
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
-    """Return the grade as it counts: shared data flagged, points given by hand."""
+    """Return the current grade, with the flag for shared data and points given by hand."""
     mine = select(*OVERRIDE).where(overrides.c.submission_id == row.submission_id)
     rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
     first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
@@ -197,7 +194,7 @@ def as_it_counts(
     rubric: Rubric,
     first_key: str = "",
 ) -> Entry:
-    """Return a line with all overrides that there ever were of its submission."""
+    """Return a line with its current grade, given all overrides of its submission."""
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
     given = {key: override for key, override in newest.items() if override.points is not None}
     comments = {key: override for key, override in newest.items() if override.comment}
@@ -217,7 +214,7 @@ def as_it_counts(
 
 
 def lines_of(connection: Connection, batch: Row) -> list[dict]:
-    """Return a class list as it was put in."""
+    """Return a class list as stored."""
     columns = [column for column in entries.c if column.name != "batch_id"]
     mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
     return [dict(row._mapping) for row in connection.execute(mine)]
@@ -240,9 +237,9 @@ def add_list(
 
 
 def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
-    """Return the submissions of a class list that were graded by another rubric than it has.
+    """Return the submissions of a class list that were graded with a different rubric.
 
-    A grading is by the rubric of the first list that it stands in.
+    A grading belongs to the rubric of the first list that contains it.
     """
     mine = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     first = (
@@ -266,12 +263,12 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
 
 
 def _asked(rubric: str) -> dict:
-    """Return what a kept rubric asks, without how it is shown."""
+    """Return the requirements of a stored rubric, without its presentation."""
     return json.loads(rubric) | {"title": "", "anonymous": False}
 
 
 def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
-    """Return the authors that a submission named last: a broken one names nobody."""
+    """Return the last known authors of a submission, because a broken one names none."""
     named = select(gradings.c.authors).where(
         gradings.c.submission_id == submission, gradings.c.authors != ()
     )
@@ -279,10 +276,9 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
 
 
 def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
-    """Put in, for who goes on under another name, what people gave or asked under the old one.
+    """Copy points by hand and requests of a renamed submission to its new name.
 
-    That is points by hand and requests: all that is not there yet, so that it stays right when the
-    name changes back.
+    Only missing entries are copied, so that the name can also change back.
     """
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
@@ -302,7 +298,7 @@ def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: 
 
 
 def read_flag(text: str) -> Flag | None:
-    """Return the flag for shared data of a line of the class list, None where there is none."""
+    """Return the flag for shared data of a line of the class list, or None."""
     return Flag.model_validate_json(text) if text else None
 
 
@@ -311,11 +307,12 @@ def read_rubric(batch: Row) -> Rubric:
 
     Raises
     ------
-    ConfigError : another version of cartlab put it there.
+    ConfigError : another version of cartlab wrote it.
     """
     try:
         return Rubric.model_validate_json(batch.rubric)
     except ValidationError:
         raise ConfigError(
-            "the gradebook's rubric is of another version of cartlab: run cartlab grade again"
+            "the gradebook's rubric was written by another version of cartlab: run cartlab grade "
+            "again"
         ) from None

@@ -1,7 +1,7 @@
-"""The tables of a gradebook, and how to reach the database they are in.
+"""The tables of a gradebook, and the connection to its database.
 
-Every table is append-only: what once was graded, overridden or listed stays, and where the engine
-has triggers (SQLite, PostgreSQL) it refuses to change or delete a row. The newest is what counts.
+Every table is append-only: gradings, overrides and lists stay. On SQLite and PostgreSQL, triggers
+refuse to change or delete a row. The newest row counts.
 """
 
 import json
@@ -48,55 +48,55 @@ from pipeline.output import OWNER_ONLY
 from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
-_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of files; anything else is a folder
+_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of database files; anything else is a folder
 _VERSION = "1"
-_TURN = 0x6361_7274  # a number for PostgreSQL's lock that nobody else has
+_TURN = 0x6361_7274  # a unique number for PostgreSQL's lock
 _PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
 
 
-# What SQLAlchemy and the drivers raise for an address that means nothing.
+# Errors of SQLAlchemy and the drivers for a meaningless address.
 _SENSELESS = (ArgumentError, ValueError, TypeError)
 _NO_ADDRESS = (
-    "the gradebook's address is no database URL: write postgresql://NAME@HOST/DATABASE or "
+    "the gradebook's address is not a database URL: write postgresql://NAME@HOST/DATABASE or "
     f"sqlite:////FOLDER/{FILE}"
 )
 
 
 class Words(TypeDecorator):
-    """Text that every database takes: no NUL, no half of a character."""
+    """Text that every database accepts: no NUL, no incomplete characters."""
 
     impl, cache_ok = Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return what is kept."""
+        """Return the value to store."""
         return value.replace("\0", "�").encode("utf-8", "replace").decode() if value else value
 
 
 class Names(TypeDecorator):
-    """A list of texts, kept as JSON."""
+    """A list of texts, stored as JSON."""
 
     impl, cache_ok = Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return what is kept."""
+        """Return the value to store."""
         return json.dumps(value)
 
     def process_result_value(self, value: Any, dialect: object) -> Any:
-        """Return what was meant."""
+        """Return the stored value."""
         return tuple(json.loads(value))
 
 
 class Deflated(TypeDecorator):
-    """Long text, kept small."""
+    """Long text, stored compressed."""
 
     impl, cache_ok = LargeBinary, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return what is kept."""
+        """Return the value to store."""
         return zlib.compress(value.encode())
 
     def process_result_value(self, value: Any, dialect: object) -> Any:
-        """Return what was meant."""
+        """Return the stored value."""
         return zlib.decompress(value).decode()
 
 
@@ -118,7 +118,7 @@ submissions = Table(
     UniqueConstraint("assignment", "name"),
 )
 
-# One row each time a submission is graded; `key` is of all that the grade depends on.
+# One row for each grading of a submission; `key` is a hash of everything the grade depends on.
 gradings = Table(
     "gradings",
     metadata,
@@ -151,7 +151,7 @@ figures = Table(
     Column("svg", Deflated, nullable=False),
 )
 
-# What the checks found in a grading: by it another rubric's points are known without grading again.
+# Results of the checks of a grading; another rubric's points follow without grading again.
 findings = Table(
     "findings",
     metadata,
@@ -159,8 +159,8 @@ findings = Table(
     Column("found", Deflated, nullable=False),
 )
 
-# A batch that ran to its end, and its class list: for each submission the grading that counts,
-# the flag for data shared with others, and the points given out at the time.
+# A complete batch and its class list: for each submission the grading that counts, the flag for
+# shared data, and its points at that time.
 batches = Table(
     "batches",
     metadata,
@@ -183,8 +183,8 @@ entries = Table(
     Index("entries_by_submission", "submission_id"),
 )
 
-# The newest of a criterion counts; without points the automatic ones hold, with a comment beside
-# them or, as taken back, alone.
+# The newest row of a criterion counts. Without points the automatic ones count: with a comment, or,
+# if points were undone, without.
 overrides = Table(
     "overrides",
     metadata,
@@ -200,7 +200,7 @@ overrides = Table(
     Index("overrides_by_submission", "submission_id"),
 )
 
-# Who looked at a grading; the newest counts, so that a mark can be taken back.
+# Marks of reviewed gradings; the newest row counts, so that a mark can be undone.
 looks = Table(
     "looks",
     metadata,
@@ -212,8 +212,8 @@ looks = Table(
     Index("looks_by_grading", "grading_id"),
 )
 
-# Requests for another look at a criterion: `asked`, `answered`, `reopened`. The newest event of one
-# says how it stands; an answer has points only where it gave others.
+# Requests for another look at a criterion: `asked`, `answered`, `reopened`. The newest event sets
+# the state; an answer has points only if it changed them.
 request_events = Table(
     "request_events",
     metadata,
@@ -229,7 +229,7 @@ request_events = Table(
     Index("request_events_by_submission", "submission_id"),
 )
 
-# Whether students may read the feedback of an assignment; the newest counts.
+# Whether students may read the feedback of an assignment; the newest row counts.
 releases = Table(
     "releases",
     metadata,
@@ -240,7 +240,7 @@ releases = Table(
     Column("released", Boolean, nullable=False),
 )
 
-_REFUSE = "a gradebook is only added to"
+_REFUSE = "entries of a gradebook cannot be changed"
 event.listen(
     metadata,
     "before_create",
@@ -278,12 +278,12 @@ class Database:
 
     Parameters
     ----------
-    place : a folder that holds `gradebook.sqlite`, such a file, or any SQLAlchemy URL.
-    create : make the tables where there are none; else a gradebook must be there.
+    place : a folder with `gradebook.sqlite`, such a file, or any SQLAlchemy URL.
+    create : create missing tables; otherwise the gradebook must exist.
 
     Raises
     ------
-    ConfigError : the place cannot be reached, holds no gradebook, or one of another version.
+    ConfigError : the place cannot be reached, or contains no gradebook of this version.
     """
 
     def __init__(self, place: str | Path, *, create: bool) -> None:
@@ -298,15 +298,15 @@ class Database:
                     raise ConfigError(f"{self.name}: holds no gradebook")
                 _check_version(connection, name=self.name)
                 whole = _is_whole(connection)
-        except _SENSELESS as error:  # the driver reads the address when it first connects
+        except _SENSELESS as error:  # the driver reads the address only when it connects
             raise ConfigError(_NO_ADDRESS) from error
-        if not whole:  # of a version that had fewer tables or columns
+        if not whole:  # written by a version with fewer tables or columns
             with self.writing() as connection:
                 _create(connection)
 
     @property
     def name(self) -> str:
-        """Where it is, without any password."""
+        """The place, without any password."""
         url = self._engine.url
         if url.get_backend_name() == "sqlite":
             return url.database or ""
@@ -314,19 +314,19 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Read; keep it short, a writer waits for it."""
+        """Read; keep it short, because writers wait for it."""
         with self._translated(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Write all or nothing; durable once it ends."""
+        """Write all or nothing; durable at the end."""
         with self._translated(), self._writer.begin() as connection:
             yield connection
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """Write with nobody else who does: what is read here is so until this ends."""
+        """Write while nobody else can, so that everything read here stays valid until the end."""
         with self.writing() as connection:
             _take_turns(connection)
             yield connection
@@ -351,7 +351,7 @@ class Database:
             connection.exec_driver_sql("VACUUM" if sqlite else f"VACUUM FULL {tables}")
 
     def close(self) -> None:
-        """Let go of the connections."""
+        """Close the connections."""
         self._engine.dispose()
 
     @contextmanager
@@ -364,9 +364,9 @@ class Database:
 
 
 def _create(connection: Connection) -> None:
-    """Make the tables that are not there; two runs that begin at once make them one by one."""
+    """Create missing tables, safely also when two runs start at once."""
     _take_turns(connection)
-    # Where all is there nothing is made anew: whoever may only read and add could not.
+    # Complete gradebooks are not touched: a user may have the right to read and add only.
     if not _is_whole(connection):
         metadata.create_all(connection)
         if _lacks_comments(connection):
@@ -385,7 +385,7 @@ def _lacks_comments(connection: Connection) -> bool:
 
 
 def _take_turns(connection: Connection) -> None:
-    if connection.dialect.name == "postgresql":  # SQLite's write lock is held already
+    if connection.dialect.name == "postgresql":  # SQLite already holds its write lock
         connection.execute(select(func.pg_advisory_xact_lock(_TURN)))
 
 
@@ -394,7 +394,7 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
         is_file = Path(place).suffix in _SUFFIXES and not Path(place).is_dir()
         file = Path(place) if is_file else Path(place) / FILE
         if not create and not file.is_file():
-            raise ConfigError(f"{place}: holds no {FILE}; name the --out folder of cartlab grade")
+            raise ConfigError(f"{place}: holds no {FILE}; give the --out folder of cartlab grade")
         address = URL.create("sqlite", database=str(file))
     else:
         address = place
@@ -403,7 +403,7 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
     except _SENSELESS as error:
         raise ConfigError(_NO_ADDRESS) from error
     try:
-        if url.drivername == "postgresql":  # what is called so depends on SQLAlchemy's version
+        if url.drivername == "postgresql":  # the default driver depends on SQLAlchemy's version
             url = url.set(drivername="postgresql+psycopg")
         if url.get_backend_name() != "sqlite":
             return create_engine(url, pool_pre_ping=True)
@@ -424,11 +424,11 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
 
 
 def _keep_private(file: Path) -> None:
-    """Make a gradebook's file for its owner alone; what SQLite puts beside it is so too.
+    """Make a gradebook's file readable for its owner only; SQLite's side files follow.
 
-    One that is there keeps what its owner gave a group, and is closed to everybody else.
+    An existing file keeps the rights of its group and is closed to everybody else.
     """
-    with suppress(OSError):  # SQLite says what is wrong with the place; a file may be another's
+    with suppress(OSError):  # SQLite reports problems; the file may belong to another user
         os.close(os.open(file, os.O_RDWR | os.O_CREAT, OWNER_ONLY))
         mode = file.stat().st_mode
         if mode & stat.S_IRWXO:
@@ -436,14 +436,14 @@ def _keep_private(file: Path) -> None:
 
 
 def _prepare_sqlite(connection, _record) -> None:
-    connection.isolation_level = None  # we begin transactions ourselves, DDL included
+    connection.isolation_level = None  # we start transactions ourselves, including DDL
     connection.execute("PRAGMA foreign_keys = ON")
-    connection.execute("PRAGMA secure_delete = ON")  # what was erased is overwritten
-    connection.execute("PRAGMA synchronous = FULL")  # what was put outlives a power cut
+    connection.execute("PRAGMA secure_delete = ON")  # erased data are overwritten
+    connection.execute("PRAGMA synchronous = FULL")  # committed data survive a power cut
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    """Take the write lock at once: two that read and then both write would wait for each other."""
+    """Take the write lock at once, so that two readers that then write cannot deadlock."""
     options = connection.get_execution_options()
     if options.get("isolation_level") == "AUTOCOMMIT":
         return
@@ -457,6 +457,6 @@ def _check_version(connection: Connection, *, name: str) -> None:
         connection.execute(insert(settings).values(name="schema", value=_VERSION))
     elif found != _VERSION:
         raise ConfigError(
-            f"{name}: is a gradebook of version {found}, this cartlab has {_VERSION}: "
-            "grade into another folder, or use the cartlab that made it"
+            f"{name}: is a gradebook of version {found}, and this cartlab uses {_VERSION}: grade "
+            f"into another folder, or use the cartlab that wrote it"
         )

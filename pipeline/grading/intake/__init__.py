@@ -1,1 +1,1 @@
-"""Archives, folders and platforms' downloads to submissions."""
+"""Turn archives, folders and platforms' downloads into submissions."""

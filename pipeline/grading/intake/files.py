@@ -1,7 +1,7 @@
-"""Open a hand-in: its files in a folder of our own, the submission in it found, nothing followed.
+"""Copy the files of a hand-in to a private folder and find the submission; follow no links.
 
-Graded is a copy, on this machine as on a cluster: regular files only, so that what is graded, what
-is hashed and what travels is the same.
+The copy is graded, on this machine or a cluster. It has regular files only, so that the same files
+are graded, hashed and sent.
 """
 
 import hashlib
@@ -30,17 +30,17 @@ from pipeline.words.numbers import first_few
 _DEEPEST = 12  # folders below the hand-in's
 _ARCHIVES_IN_ARCHIVES = 3
 _CHUNK = 1 << 20
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in archives of ours: same files, same bytes
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in our archives: same files, same bytes
 
 
 class Changed(Exception):
-    """The files of a hand-in are not those that its key is of."""
+    """The files of a hand-in do not match its key."""
 
 
 def digest(sources: Sequence[Path], *, without: Collection[str] = ()) -> str:
     """Return the SHA-256 of everything in a hand-in that could be graded.
 
-    What cannot be read stands in it as such: the hand-in's row will say so.
+    Unreadable files are part of the hash as such, and the row of the hand-in reports them.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _line(name: str, path: Path) -> bytes:
 
 
 def packed(sources: Sequence[Path]) -> bytes:
-    """Return a hand-in as one archive, to travel to another machine."""
+    """Return a hand-in as one archive, to send to another machine."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, path in _files(sources):
@@ -73,7 +73,7 @@ def packed(sources: Sequence[Path]) -> bytes:
 
 
 def unpacked(archive: bytes, into: Path) -> None:
-    """Write the files that `packed` put together into a folder."""
+    """Write the files of a `packed` archive into a folder."""
     with zipfile.ZipFile(io.BytesIO(archive)) as opened:
         opened.extractall(into)
 
@@ -81,16 +81,15 @@ def unpacked(archive: bytes, into: Path) -> None:
 def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") -> Path:
     """Copy or unpack a hand-in into a folder and return the folder of the submission in it.
 
-    Archives are looked into where there is no `submission.toml` beside them.
+    Archives are opened if there is no `submission.toml` next to them.
 
     Parameters
     ----------
-    digest : what the copy's must be; "" where anything is right.
+    digest : the required digest of the copy; "" to accept any.
 
     Raises
     ------
-    SubmissionError : there is none, or more than one to choose from, there are too many files, or
-        an archive is bad.
+    SubmissionError : there is no submission, or several, or too many files, or a bad archive.
     OSError : this computer cannot read or copy a file.
     Changed : the copy has another digest.
     """
@@ -106,7 +105,7 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
         raise Changed
     if len(files) > HAND_IN.members:
         raise SubmissionError(
-            f"more than {HAND_IN.members:,} files; hand in {NAME}, notes.md and the files they name"
+            f"more than {HAND_IN.members:,} files; submit {NAME}, notes.md and the files they name"
         )
     left = HAND_IN
     for _ in range(_ARCHIVES_IN_ARCHIVES):
@@ -131,11 +130,10 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
 
-    Of too large files the smallest are taken: data files are small, films are not.
-    `submission.toml` comes first: without it nothing could be said of the others. Of too many files
-    one more than may be is taken, so that they are refused, here as on another machine. A recording
-    that is larger than may be is among them, so that it is refused, not missed. Bytes that are no
-    text in a name are replaced.
+    If the files are too large together, the smallest are kept: data files are small, films are not.
+    `submission.toml` comes first, because it explains the others. Of too many files, one more than
+    the limit is kept, so that they are refused on every machine. A recording above the size limit
+    is kept too, so that it is refused and not just missing. Invalid bytes in names are replaced.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:
@@ -170,7 +168,7 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
 
 
 def _less(limits: UnpackLimits, folder: Path) -> UnpackLimits:
-    """Return what is left of the limits beside what is in a folder."""
+    """Return the limits, reduced by the files already in a folder."""
     sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
 
@@ -180,7 +178,7 @@ def _below(folder: Path) -> list[Path]:
 
     Raises
     ------
-    OSError : a folder cannot be read; `rglob` would take it for empty.
+    OSError : a folder cannot be read; `rglob` would treat it as empty.
     """
 
     def refuse(error: OSError) -> None:
@@ -192,7 +190,7 @@ def _below(folder: Path) -> list[Path]:
 
 
 def _submissions(folder: Path) -> list[Path]:
-    """Return the submission files at the least depth, that of a wrapping folder not counted."""
+    """Return the submission files at the least depth, not counting a wrapping folder."""
     tomls = [path for path in _below(folder) if path.name == NAME]
     depth = min((len(path.parts) for path in tomls), default=0)
     return [path for path in tomls if len(path.parts) == depth]
@@ -206,14 +204,14 @@ def _the_one(tomls: Sequence[Path], into: Path) -> Path:
     if len(tomls) > 1:
         names = " and ".join(quote(path.relative_to(into).as_posix()) for path in tomls[:2])
         more = f" and {len(tomls) - 2} more" if len(tomls) > 2 else ""
-        raise SubmissionError(f"which one is to be graded? There are {names}{more}")
+        raise SubmissionError(f"which one should be graded? There are {names}{more}")
     return tomls[0].parent
 
 
 def _gather_loose(folder: Path) -> None:
-    """Put the files beside `submission.toml` into `data/` as well, if there is no such folder.
+    """Copy the files next to `submission.toml` into `data/`, if there is no such folder.
 
-    A platform to which the files are uploaded one by one does not keep their folders.
+    A platform that takes files one by one does not keep their folders.
     """
     data = folder / "data"
     if not os.path.lexists(data):
@@ -229,5 +227,5 @@ def _nothing_in(into: Path) -> str:
         return f"no {NAME} in it: it is empty"
     named = first_few([quote(path.name) for path in files], 3)
     strange = [path.name for path in files if path.suffix.lower() in STRANGE_ARCHIVES]
-    hint = f"; {quote(strange[0])} cannot be opened, pack a zip file" if strange else ""
+    hint = f"; {quote(strange[0])} cannot be opened; submit a zip file" if strange else ""
     return f"no {NAME} in it, only {named}{hint}"

@@ -1,4 +1,4 @@
-"""Find the hand-ins in what a TA has: folders, trees, zip files, a platform's download."""
+"""Find the hand-ins in folders, trees, zip files and platforms' downloads."""
 
 import os
 import re
@@ -29,28 +29,28 @@ from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 from pipeline.words.progress import Progress, silent
 
-_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without saying how much: a day begun
-_LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes: a folder's name, on every system
+_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without its amount: counted as one day
+_LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes of a folder name, on every system
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
-_RESULTS = ("class.html", "feedback/.made.json")  # of a grading: its folder is no hand-in
+_RESULTS = ("class.html", "feedback/.made.json")  # files of a grading's output folder
 _PARTS_OF_RESULTS = ("feedback", "gradescope")
-_DATA = "data"  # where a submission has its recordings: the name of nobody's hand-in
+_DATA = "data"  # the folder of recordings, never the name of a hand-in
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
 @dataclass(frozen=True, kw_only=True)
 class HandIn:
-    """What one team handed in, not opened yet.
+    """The files that one team submitted, not opened yet.
 
     Attributes
     ----------
-    id : unique in the batch, fit for a folder's name.
-    sources : one folder, or files of which archives are to be unpacked.
-    owner : who handed it in, as the learning platform calls them, with the number that it knows
-        them by: "Jane Doe (moodle 1024)"; or "".
-    handed_in : when, in ISO 8601, where the platform says so; or "".
-    problem : why it cannot be opened, where that is plain already.
-    parent : the folder around it, until its id is settled.
+    id : unique in the batch, and valid as a folder name.
+    sources : one folder, or files, including archives still to unpack.
+    owner : the account that submitted it, with the platform's name and number:
+        "Jane Doe (moodle 1024)"; or "".
+    handed_in : the time in ISO 8601, if the platform gives it; or "".
+    problem : why it cannot be opened, if already known.
+    parent : the folder around it, until its id is fixed.
     """
 
     id: str
@@ -64,7 +64,7 @@ class HandIn:
 
 @dataclass(frozen=True, kw_only=True)
 class _Walk:
-    """What is no hand-in where folders are looked through, and whom to tell of what was none."""
+    """The folders to skip during a search for hand-ins, and the function that reports them."""
 
     skip: set[Path]
     say: Progress
@@ -83,13 +83,13 @@ def find_hand_ins(
     Parameters
     ----------
     scratch : where archives of a whole class are unpacked.
-    skip : folders that are no hand-ins, such as the one results go to.
-    known : ids of the class so far: one of several "team-1", by itself, keeps the id it had.
-    say : told of every folder that was passed over for the results of a grading.
+    skip : folders that are not hand-ins, such as the output folder.
+    known : ids of the current class, so that one of several "team-1" keeps its id.
+    say : reports every folder that is skipped as the results of a grading.
 
     Raises
     ------
-    ConfigError : a path is not there, or there is nothing in it.
+    ConfigError : a path does not exist, or contains nothing to grade.
     """
     walk = _Walk(skip={path.resolve() for path in skip} | {scratch.resolve()}, say=say)
     found: list[HandIn] = []
@@ -97,7 +97,7 @@ def find_hand_ins(
         here = _at(path, scratch=scratch / f"class-{number}", walk=walk)
         if not here:
             raise ConfigError(
-                f"{path}: nothing to grade in it: no folder or zip file with a {NAME}"
+                f"{path}: nothing to grade: it has no folder or zip file with a {NAME}"
             )
         found += here
     return tuple(sorted(_with_ids(found, known=known), key=lambda hand_in: hand_in.id))
@@ -112,7 +112,7 @@ def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
         raise ConfigError(f"{path}: there is no such file or folder")
     if path.suffix.lower() != ".zip":
         raise ConfigError(
-            f"{path}: neither a folder nor a zip file; name the folder with the {NAME}"
+            f"{path}: neither a folder nor a zip file; give the folder with the {NAME}"
         )
     if not _holds_a_class(path):
         return [_archive(path)]
@@ -128,7 +128,7 @@ def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
 def _with_refused(
     found: Sequence[HandIn], refused: Mapping[PurePosixPath, str], *, folder: Path
 ) -> list[HandIn]:
-    """Return the hand-ins of an archive with what was refused of them, and those refused whole."""
+    """Return the hand-ins of an archive with refused members, and those refused completely."""
     whose = {
         source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
     }
@@ -148,7 +148,7 @@ def _with_refused(
 
 
 def _holds_a_class(archive: Path) -> bool:
-    """Tell a download of many hand-ins from the archive of one student."""
+    """Return whether an archive is a download of many hand-ins, not one student's."""
     whole = member_names(archive, limits=CLASS)
     names = whole or names_in_pieces(archive)
     tops = {part for path in names for part in path.parts[:2]}
@@ -167,7 +167,7 @@ def _holds_a_class(archive: Path) -> bool:
 
 
 def _in_folder(folder: Path, *, walk: _Walk, top: bool = True, depth: int = 0) -> list[HandIn]:
-    """Return the hand-ins in a folder; one that cannot be looked into is itself one."""
+    """Return the hand-ins in a folder; an unreadable folder counts as one hand-in."""
     try:
         return _looked_into(folder, walk=walk, top=top, depth=depth)
     except OSError as error:
@@ -205,7 +205,7 @@ def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[Ha
             without.append(_single(entry))
     if not found and any(entry.name.lower() == _DATA for entry in entries):
         return [_single(folder)]  # a submission that lacks its file
-    # Beside one submission, a folder without any is a student's own pictures or drafts.
+    # Next to a submission, a folder without one holds a student's own pictures or drafts.
     return found + without if top or len(found) > 1 else found
 
 
@@ -215,7 +215,7 @@ def _is_submission(folder: Path) -> bool:
 
 
 def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
-    """Whether an entry is none of the students': debris, results, hidden without a submission."""
+    """Return whether to skip an entry: debris, results, or hidden without a submission."""
     if not entry.is_dir() or entry.name == "__MACOSX":
         return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
     if os.access(entry / NAME, os.F_OK):
@@ -225,10 +225,10 @@ def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
     results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
     if not all(os.access(results / name, os.F_OK) for name in _RESULTS):
         return False
-    if results not in walk.skip:  # a student's own folder may look so
+    if results not in walk.skip:  # a student's own folder may look like one
         walk.say(
-            f"{quote(f'{entry.parent.name}/{entry.name}')} is passed over: it looks like the "
-            f"results of a grading; if it is a hand-in, take {_RESULTS[0]} out of it"
+            f"{quote(f'{entry.parent.name}/{entry.name}')} is skipped: it looks like the results "
+            f"of a grading; if it is a submission, remove {_RESULTS[0]} from it"
         )
     return True
 
@@ -245,7 +245,7 @@ def _single(entry: Path) -> HandIn:
         return HandIn(
             id=entry.stem,
             parent=entry.parent.name,
-            problem=f"{quote(entry.name)} is a link; hand in the files themselves",
+            problem=f"{quote(entry.name)} is a link; submit the files themselves",
         )
     if entry.is_dir():
         return HandIn(id=entry.name, parent=entry.parent.name, sources=(entry,))
@@ -260,8 +260,8 @@ def _archive(path: Path) -> HandIn:
 def _folder_inside(archive: Path) -> str:
     """Return the name of the folder in an archive that is the submission.
 
-    "" for its top, and where several could be: which is meant nobody knows. Where this computer
-    cannot read it now, its row will say so.
+    "" for the top level, and if several are possible. If this computer cannot read the archive now,
+    its row reports that.
     """
     try:
         tomls = [path for path in member_names(archive) if path.name == NAME]
@@ -276,12 +276,12 @@ def _folder_inside(archive: Path) -> str:
 
 
 def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[HandIn]:
-    """Return a hand-in for every student, whatever number of files they uploaded."""
-    # Further down, a student may have put metadata of their own.
+    """Return one hand-in per student, for any number of uploaded files."""
+    # Metadata further down may be a student's own.
     metadata = gradescope_metadata(folder) if top else {}
     by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
-        # Canvas makes no folders: one named so is an archive that somebody has unpacked.
+        # Canvas makes no folders: such a folder is an archive that somebody has unpacked.
         own = path.name if upload.platform == "canvas" and path.is_dir() else ""
         by_student[upload.owner, upload.user, own][path] = upload
     found = []
@@ -324,7 +324,7 @@ def _name_inside(sources: Sequence[Path]) -> str:
 
 
 def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[HandIn]:
-    """Give every hand-in its folder's name; where two are the same, the parent's before it."""
+    """Name every hand-in after its folder; if two names are equal, prefix the parent's."""
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]
     often, before = Counter(name.casefold() for name in names), set(known)
@@ -345,7 +345,7 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
 
 
 def _fit(name: str) -> str:
-    """Return a name that is a folder's on every system, and nothing but text on a terminal."""
+    """Return a name that is valid as a folder on every system and harmless on a terminal."""
     text = unicodedata.normalize("NFC", name)
     text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
     text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID]

@@ -1,6 +1,6 @@
-"""How late each hand-in is: by the rubric's deadline, or a table with a line for each.
+"""Find how late each hand-in is, from the rubric's deadline or a table.
 
-The table has the columns `submission` and `days_late`: extensions, too, are a line in it.
+The table has the columns `submission` and `days_late`. An extension is also a line in it.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,11 +16,11 @@ from pipeline.submission.complaints import quote
 
 _DAY = 86_400.0  # s
 _HEADS = ["submission", "days_late"]
-_LONGEST = 3_650.0  # days: more is a slip of the keyboard
+_LONGEST = 3_650.0  # days: more must be a typing error
 
 
 def read_late_table(path: Path) -> dict[str, float]:
-    """Return days late by submission, in small letters.
+    """Return days late by submission name in lower case.
 
     Raises
     ------
@@ -38,7 +38,7 @@ def read_late_table(path: Path) -> dict[str, float]:
         if days.get(who.casefold(), late) != late:
             raise ConfigError(
                 f"{path.name} line {line}: {late:g} days late here, and "
-                f"{days[who.casefold()]:g} in a line before of the same: leave one of them"
+                f"{days[who.casefold()]:g} in an earlier line: keep one of them"
             )
         if who:
             days[who.casefold()] = late
@@ -48,9 +48,9 @@ def read_late_table(path: Path) -> dict[str, float]:
 def settle_lateness(
     hand_ins: Iterable[HandIn], *, late: Late, table: Mapping[str, float]
 ) -> tuple[list[HandIn], list[str]]:
-    """Return the hand-ins with their lateness, and who of the table is none of them.
+    """Return the hand-ins with their lateness, and the unknown names of the table.
 
-    The table goes before the deadline, and that before the mark a platform makes.
+    The table takes precedence over the deadline, and the deadline over a platform's mark.
     """
     settled, known = [], set()
     for hand_in in hand_ins:

@@ -1,4 +1,4 @@
-"""Who handed in a file, and whether late, by the names learning platforms give their downloads.
+"""Read owner and lateness from the file names of learning platforms.
 
 Canvas (`lib/content_zipper.rb`): `doejane_LATE_1024_77001_lab3.zip`, graded without names
 `LATE_anon_x7Yb2_77001_lab3.zip`, a resubmitted file `lab3-1.zip`. Moodle
@@ -17,8 +17,7 @@ from typing import Literal
 
 Platform = Literal["canvas", "moodle", "gradescope"]
 
-# Whatever follows is a file's name, a line's end in it too: so no name is gone through again from
-# each of its letters.
+# The rest is the file's name, including line ends. Matching everything avoids repeated searches.
 _CANVAS = re.compile(
     r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)", re.DOTALL
 )
@@ -44,9 +43,9 @@ _MOST_METADATA = 10_000_000  # bytes
 
 @dataclass(frozen=True, kw_only=True)
 class Upload:
-    """What a name says: whose, late or not, and the file's name as the student had it.
+    """The content of a name: owner, lateness, and the student's own file name.
 
-    `number` is the platform's for this upload, larger for a later one.
+    `number` is the platform's number of this upload, larger for a later one.
     """
 
     platform: Platform
@@ -58,7 +57,7 @@ class Upload:
 
 
 def parse_name(name: str) -> Upload | None:
-    """Return what the name of a downloaded file or folder says; None where no platform made it."""
+    """Read the name of a downloaded file or folder; None if no platform made it."""
     if found := _MOODLE.fullmatch(name):
         return Upload(
             platform="moodle",
@@ -86,14 +85,14 @@ def parse_name(name: str) -> Upload | None:
 def current(uploads: Mapping[Path, Upload]) -> list[Path]:
     """Return the files of one student without those that a later attempt replaces.
 
-    Canvas appends `-1`, `-2` to the name of a file that is handed in again.
+    Canvas appends `-1`, `-2` to the name of a file that is submitted again.
     """
     names = {upload.file for upload in uploads.values()}
     attempts: dict[str, list[tuple[int, int, Path]]] = defaultdict(list)
     for path, upload in uploads.items():
         again = _ATTEMPT.fullmatch(upload.file)
         first = f"{again['stem']}{again['suffix']}" if again else upload.file
-        # `run-2.csv` is a second attempt only where `run.csv` is there as well.
+        # `run-2.csv` is a second attempt only if `run.csv` exists too.
         if again and first in names:
             attempts[first].append((int(again["attempt"]), upload.number, path))
         else:
@@ -102,36 +101,36 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
 
 
 def owner_text(name: str, platform: Platform, user: str) -> str:
-    """Return who handed in, as kept in the gradebook: "Jane Doe (moodle 1024)".
+    """Return the owner as stored in the gradebook: "Jane Doe (moodle 1024)".
 
-    Whose number it is matters: another platform's student may have the same.
+    The platform is part of it, because another platform may use the same number.
     """
     return f"{name} ({platform} {user})" if user.isdigit() else name
 
 
 def read_owner(owner: str) -> tuple[str, str, str]:
-    """Return name, platform and number of what `owner_text` made, "" where they are not said."""
+    """Read name, platform and number from an `owner_text`; missing ones are ""."""
     found = _OWNER.fullmatch(owner)
     assert found is not None
     return found["name"], found["platform"] or "", found["number"] or ""
 
 
 def same_number(a: str, b: str) -> bool:
-    """Tell whether two such texts have the same number of the same platform."""
+    """Return whether two owners have the same number on the same platform."""
     (_, *of_a), (_, *of_b) = read_owner(a), read_owner(b)
     return of_a == of_b and bool(of_a[1])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sent:
-    """What Gradescope's metadata say of a submission: names, and when, in ISO 8601, or ""."""
+    """Gradescope's metadata of a submission: names, and the time in ISO 8601 or ""."""
 
     names: str
     at: str
 
 
 def gradescope_metadata(folder: Path) -> dict[str, Sent]:
-    """Return what is known by `submission_…`, from the metadata file if there is one."""
+    """Return the metadata by `submission_…`, if there is a metadata file."""
     import yaml  # only a Gradescope download needs it
 
     sent: dict[str, Sent] = {}
@@ -161,7 +160,7 @@ def gradescope_metadata(folder: Path) -> dict[str, Sent]:
 
 
 def _time(text: str) -> str:
-    """Return a time as Ruby writes it in ISO 8601; "" where it is none."""
+    """Return a time written by Ruby in ISO 8601; "" if it is not a time."""
     found = _TIME.fullmatch(text)
     if found is None:
         return ""

@@ -1,4 +1,4 @@
-"""Unpack what strangers packed: never outside the folder, never more than fits."""
+"""Unpack archives from strangers: never outside the folder, never above the limits."""
 
 import io
 import lzma
@@ -21,35 +21,35 @@ from pipeline.errors import SubmissionError, lies_in_the_name
 from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
-_RATIO_FROM = 1_000_000  # bytes; a smaller file may be as empty as it likes
-_END_OF_ZIP = 66_000  # bytes; there a comment may stand, which is read at once
-# The record at the end says where the table of contents stands (4.3.16), or that another does.
+_RATIO_FROM = 1_000_000  # bytes; smaller files may have any ratio
+_END_OF_ZIP = 66_000  # bytes; may contain a comment, and is read at once
+# The record at the end gives the place of the table of contents (4.3.16), or refers to another.
 _PLACE, _ELSEWHERE = 16, 0xFFFFFFFF
 DEEPEST = 40  # folders in folders; a submission needs three
 _AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
-# What stands before each member, up to its name (APPNOTE.TXT 4.3.7), with the name's length.
+# The header of each member up to its name (APPNOTE.TXT 4.3.7), with the length of the name.
 _HEAD = 30  # bytes
 _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
-# There a colon begins a stream, a last dot is dropped, and `nul.csv` is a device.
+# On Windows a colon starts a stream, a final dot is dropped, and `nul.csv` is a device.
 _NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|com\d|lpt\d)(\..*)?$')
 
 _DEBRIS_FOLDERS = ("__MACOSX",)
 _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
-# Archives that nothing here opens; a hand-in in one of them is told to be a zip file.
+# Archives that cannot be opened here; the message asks for a zip file.
 STRANGE_ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tbz", ".tgz", ".xz", ".zst")
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnpackLimits:
-    """What an archive may be.
+    """Limits of an archive.
 
     Attributes
     ----------
-    ratio : of a file's size to its packed size.
-    directory : bytes of the table of contents, which is read as a whole.
-    whole : one bad member refuses the archive; else only itself.
+    ratio : unpacked to packed size of a file.
+    directory : bytes of the table of contents, which is read at once.
+    whole : one bad member refuses the whole archive, not only itself.
     """
 
     members: int = 2_000
@@ -67,7 +67,7 @@ CLASS = UnpackLimits(
 
 @dataclass(kw_only=True)
 class _Budget:
-    """What is left of the limits while an archive is read."""
+    """The remaining limits while an archive is read."""
 
     limits: UnpackLimits
     members: int = field(init=False)
@@ -78,7 +78,7 @@ class _Budget:
 
 
 def is_debris(path: PurePosixPath) -> bool:
-    """Tell the files that macOS and Windows leave behind from what was handed in."""
+    """Return whether a file is one that macOS or Windows leaves behind."""
     name = path.name.lower()
     return (
         any(part in _DEBRIS_FOLDERS for part in path.parts)
@@ -88,14 +88,14 @@ def is_debris(path: PurePosixPath) -> bool:
 
 
 def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosixPath, str]:
-    """Unpack a zip archive into a new folder; return what was refused: member and reason.
+    """Unpack a zip archive into a new folder; return refused members and reasons.
 
     Only regular files are written.
 
     Raises
     ------
     SubmissionError : not a zip archive, broken, encrypted, or larger than the limits; one line.
-    OSError : this computer cannot read or write, whatever is in the archive: its disk is full, say.
+    OSError : this computer cannot read or write, for example because its disk is full.
     """
     shown = quote(archive.name)
     if archive.is_file() and not archive.stat().st_size:
@@ -111,13 +111,13 @@ def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosix
 
 
 def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PurePosixPath]:
-    """Return the files that may be unpacked and are no debris; none where it is no archive.
+    """Return the files that may be unpacked, without debris; empty if it is not an archive.
 
     Raises
     ------
     OSError : this computer cannot read it now.
     """
-    if not archive.is_file():  # a pipe would be waited for
+    if not archive.is_file():  # reading a pipe would wait
         return []
     try:
         with _opened(archive, limits=limits) as opened:
@@ -133,9 +133,9 @@ def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PureP
 
 
 def names_in_pieces(archive: Path) -> list[PurePosixPath]:
-    """Return the names that stand before the members of an archive whose table of contents is lost.
+    """Return member names from the headers of an archive without a table of contents.
 
-    Those in archives within it too: enough to tell what it was, not to unpack it.
+    Names in inner archives are included: enough to recognise the archive, not to unpack it.
     """
     if not archive.is_file() or not archive.stat().st_size:
         return []
@@ -154,7 +154,7 @@ class _TooLarge(_Refused):
     """An archive beyond the limits."""
 
 
-# All that reading an archive of any bytes raises.
+# All errors that reading arbitrary bytes as an archive can raise.
 _TROUBLE = (
     _Refused,
     zipfile.BadZipFile,
@@ -169,30 +169,29 @@ _TROUBLE = (
 
 
 def _let_through(error: Exception) -> None:
-    """Raise what no archive can cause."""
+    """Raise errors that no archive can cause."""
     if isinstance(error, OSError) and not lies_in_the_name(error):
         raise error
 
 
 def _why(error: Exception) -> str:
-    """Return what is wrong with an archive, in one line."""
+    """Return the problem of an archive, in one line."""
     if isinstance(error, _Refused):
         return str(error)
     if isinstance(error, NotImplementedError):
-        return "packed in a way that is not supported"
-    if isinstance(error, OSError | RuntimeError):  # the disk's complaint, or a decoder's
+        return "its compression is not supported"
+    if isinstance(error, OSError | RuntimeError):  # from the disk or a decoder
         said = getattr(error, "strerror", None) or _line(error)
         return f"cannot be unpacked ({said})"
     said = _line(error)
-    more = "" if said == "File is not a zip file" else f" ({said})"  # which says it once more
-    return f"not a whole zip archive{more}"
+    more = "" if said == "File is not a zip file" else f" ({said})"  # which only repeats it
+    return f"not a complete zip archive{more}"
 
 
 class _Bounded(io.BufferedReader):
-    """A file of which only so many bytes are read at once.
+    """A file that limits the bytes of a single read.
 
-    `zipfile` reads the table of contents as a whole, and it takes the length from whichever of
-    three records it follows.
+    `zipfile` reads the table of contents at once, with a length from one of three records.
     """
 
     def __init__(self, path: Path, *, most: int) -> None:
@@ -202,12 +201,12 @@ class _Bounded(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self._most:
             raise _TooLarge(f"a table of contents of {size:,} bytes")
-        return super().read(size)  # without a size: the end of the file, for the comment in it
+        return super().read(size)  # without a size: the end of the file, with its comment
 
 
 @contextmanager
 def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]:
-    """Open an archive that is not too large and whose contents fit the memory."""
+    """Open an archive whose size and table of contents are within the limits."""
     size = archive.stat().st_size
     if size > limits.total:
         raise _TooLarge(f"{size:,} bytes, the limit is {limits.total:,}")
@@ -218,9 +217,9 @@ def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]
 
 
 def _is_cut(file: IO[bytes], contents: int) -> bool:
-    """Whether the contents at the end are those of an archive within: they say another place.
+    """Return whether the table of contents is an inner archive's, so that the file is cut.
 
-    That which unpacks itself says so too, and begins with a program.
+    Its stated place is then wrong, as in a self-extracting archive, which starts with a program.
     """
     file.seek(0)
     if not _MEMBER.match(file.read(_HEAD)):
@@ -244,7 +243,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
             refused.setdefault(_inside(info.filename), str(error))
             continue
         if not info.is_dir() and not is_debris(path):
-            members[path] = info  # of two with one name, the later
+            members[path] = info  # of two with the same name, the later counts
     for path, info in members.items():
         target = into / path
         try:
@@ -262,7 +261,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
         except _TROUBLE as error:
             if budget.limits.whole:
                 raise
-            target.unlink(missing_ok=True)  # half of it may be there
+            target.unlink(missing_ok=True)  # it may be half written
             refused.setdefault(path, _why(error))
     return refused
 
@@ -275,7 +274,7 @@ def _copy(
     budget: _Budget,
     shown: str,
 ) -> None:
-    """Copy a member, counting what truly comes out: its header may say anything."""
+    """Copy a member and count the bytes, because its header may be false."""
     size = 0
     while chunk := packed.read(_CHUNK):
         size += len(chunk)
@@ -290,7 +289,7 @@ def _copy(
 
 
 def _path(info: zipfile.ZipInfo) -> PurePosixPath:
-    """Return where a member goes, below the folder it is unpacked into."""
+    """Return the path of a member below the target folder."""
     name = _decoded(info).replace("\\", "/")
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
@@ -299,18 +298,18 @@ def _path(info: zipfile.ZipInfo) -> PurePosixPath:
         raise _Refused(f"{quote(name)} is not a regular file")
     path = PurePosixPath(name)
     if path.is_absolute() or ".." in path.parts or (name[1:2] == ":" and name[:1].isalpha()):
-        raise _Refused(f"{quote(name)} leaves the archive")
+        raise _Refused(f"{quote(name)} points outside the archive")
     if not path.parts or "\0" in name:
         raise _Refused("a file without a name")
     if sys.platform == "win32" and any(_NOT_ON_WINDOWS.search(part) for part in path.parts):
-        raise _Refused(f"{quote(name)} is no name of a file on Windows")
+        raise _Refused(f"{quote(name)} is not a valid file name on Windows")
     if len(path.parts) > DEEPEST:
-        raise _Refused(f"{quote(name)} lies more than {DEEPEST} folders deep")
+        raise _Refused(f"{quote(name)} is more than {DEEPEST} folders deep")
     return path
 
 
 def _decoded(info: zipfile.ZipInfo) -> str:
-    """Return the name as it was meant: macOS packs UTF-8 without saying so."""
+    """Return the name in the right encoding: macOS packs UTF-8 without declaring it."""
     name = info.filename
     if not info.flag_bits & _UTF8_NAME:
         try:
@@ -321,7 +320,7 @@ def _decoded(info: zipfile.ZipInfo) -> str:
 
 
 def _inside(name: str) -> PurePosixPath:
-    """Return where a refused member would lie, whatever way out of the archive it names."""
+    """Return the path of a refused member inside the archive, without ways out of it."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     return PurePosixPath(unicodedata.normalize("NFC", "/".join(parts) or "nameless"))
 

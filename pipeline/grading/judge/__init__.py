@@ -1,1 +1,1 @@
-"""The checks of one submission, what each earns, and the grade."""
+"""The checks of one submission, their points, and the grade."""

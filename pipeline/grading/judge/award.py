@@ -1,4 +1,4 @@
-"""From verdicts to points: what each criterion waits for, what remarks cost, the rubric's step."""
+"""From verdicts to points: required criteria, costs of remarks, rounding to the step."""
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -18,7 +18,7 @@ def award(
     *,
     rubric: Rubric,
 ) -> tuple[Criterion, ...]:
-    """Return the points of criteria of a rubric; there is a verdict on each."""
+    """Return the points of the criteria of a rubric, given a verdict on each."""
     done: dict[str, Criterion] = {}
     for wanted in criteria:
         waits_for = (done[p] for p in wanted.requires if p in done)
@@ -45,11 +45,11 @@ def award(
 def _waiting(parent: Criterion) -> Verdict:
     how = "not passed" if parent.outcome == "fail" else "skipped"
     on = f"{parent.id!r} ({parent.title or parent.id})"
-    return Verdict(share=None, message=f"Not checked: it builds on {on}, which was {how}.")
+    return Verdict(share=None, message=f"Not checked: it depends on {on}, which was {how}.")
 
 
 def _outcome(share: Fraction | None, points: Fraction, *, out_of: Fraction) -> Outcome:
-    """Return how a criterion went, by the points it is given: what rounding forgives has passed."""
+    """Return the outcome of a criterion by its rounded points."""
     if share is None:
         return "skip"
     return "pass" if points == out_of else "fail" if points == 0 else "partial"

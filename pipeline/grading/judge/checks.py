@@ -1,4 +1,4 @@
-"""The checks of a rubric: each gives a share of the points, and says why."""
+"""The checks of a rubric: each returns a share of the points and a message."""
 
 from collections.abc import Callable, Mapping
 from decimal import Decimal
@@ -25,11 +25,11 @@ from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.words.numbers import first_few
 
-_NAMED = 4  # so many are named in a message
+_NAMED = 4  # at most so many names in a message
 
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
-    """Judge one criterion on its own; what it requires is seen to elsewhere."""
+    """Judge one criterion on its own; `requires` is handled in `award.py`."""
     return _JUDGES[criterion.check](criterion, work)
 
 
@@ -39,10 +39,10 @@ def judge(criterion: asked.Criterion, work: Work) -> Verdict:
 def _required(_: asked.RequiredPieces, work: Work) -> Verdict:
     pieces, missing = asked_pieces(work.rubric), work.missing
     if not pieces:
-        return Verdict(share=ALL, message="Nothing in particular was asked for.")
+        return Verdict(share=ALL, message="Nothing in particular is required.")
     unread = first_few(list(work.analysis.unreadable), _NAMED)
-    here = "All that was asked for is here" + (
-        f", without {unread}, not readable" if unread else ""
+    here = "Everything required is here" + (
+        f", except {unread}, which cannot be read" if unread else ""
     )
     return Verdict(
         share=ALL - Fraction(len(missing), len(pieces)),
@@ -60,7 +60,7 @@ def _data(_: asked.DataQuality, work: Work) -> Verdict:
         message="; ".join(f"{run}: {why.rstrip('.')}" for run, why in list(bad.items())[:_NAMED])
         + "."
         if bad
-        else "The recordings hold what they should.",
+        else "The recordings are sound.",
         found={"problems": dict(bad)},
     )
 
@@ -69,7 +69,7 @@ def _data(_: asked.DataQuality, work: Work) -> Verdict:
 
 
 def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
-    """Reported against recomputed; a parameter that is not reported earns nothing."""
+    """Judge reported against recomputed parameters; a missing one earns nothing."""
     table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
     known: Mapping[str, Reference] = getattr(work.references, criterion.check)
     names = matching(criterion.parameters, work.rubric.names)
@@ -80,7 +80,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         reasons = [s.reason for s in work.analysis.skipped]
         if off_scale(work.analysis):
             reasons = [OFF_SCALE]
-        why = reasons[0] if reasons else "these are first guesses, and no recording decides them"
+        why = reasons[0] if reasons else "these are first guesses, which no recording decides"
         return Verdict(share=None, message=f"Not checked: {why}.")
     deviations, off, wrong = [], [], set()
     for name in judged:
@@ -124,7 +124,7 @@ def _deviation(error: Fraction, name: str) -> Deviation:
 
 
 def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
-    """The two tables against each other, rounding of both off; guessed dampings are left out."""
+    """Judge the two tables against each other, within rounding; guessed dampings do not count."""
     initial, final = work.reported.initial, work.reported.final
     names = matching(criterion.parameters, work.rubric.names)
     both = [
@@ -151,9 +151,9 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 
 
 def between(initial: Decimal, final: Decimal) -> Fraction:
-    """Return how far two typed numbers are apart, in percent, the rounding of each off.
+    """Return the difference of two typed numbers in percent, beyond the rounding of each.
 
-    Two of one sign agree, whichever it is: that it is wrong is told elsewhere.
+    Two negative numbers can agree: a wrong sign is reported elsewhere.
     """
     if initial * final <= 0:
         return NO_CREDIT
@@ -172,7 +172,7 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     if laws is None:
         return Verdict(share=None, message="Not checked: the final table is not complete.")
     broken = [law for law in laws if law.widening > 0]
-    meanings = dict.fromkeys(law.meaning for law in broken)  # two may mean the same
+    meanings = dict.fromkeys(law.meaning for law in broken)  # two laws may have the same meaning
     worst = max((law.widening for law in laws), default=Fraction(0))
     return Verdict(
         share=ALL - worst / MOST_WIDENING,
@@ -192,9 +192,7 @@ def _state_space(criterion: asked.StateModel, work: Work) -> Verdict:
     if space is None or not (space.A and space.B):
         return Verdict(share=NONE, message="A and B are not both reported.")
     if not (entries := work.entries):
-        return Verdict(
-            share=None, message="Not checked: neither a table nor a fit to compare with."
-        )
+        return Verdict(share=None, message="Not checked: there is no table or fit to compare with.")
     deviations = tuple(
         Deviation(error=e.error, by="number" if e.kind == "stiffness" else e.kind) for e in entries
     )

@@ -22,18 +22,18 @@ Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
 
 def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
-    """Return the controller and its gains, or why there is nothing to judge."""
+    """Return the controller and its gains, or the reason why they cannot be judged."""
     feedback = work.reported.feedback
     if feedback is None or not feedback.gains:
         return Verdict(share=NONE, message="No gains are reported.")
     if work.controller is None or work.controller.gains is None:
-        return Verdict(share=None, message="Not checked: the carts are not identified.")
+        return Verdict(share=None, message="Not checked: the carts were not identified.")
     return work.controller, work.controller.gains
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Best:
-    """The share of the model on which the gains earn most, and what they do on it."""
+    """The model on which the gains earn most: the share of the points and the response."""
 
     share: Fraction
     numbers: LoopNumbers
@@ -53,7 +53,7 @@ def _best(
 
 
 def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
-    """What the gains do on the carts, against the goal; the better of the models counts."""
+    """Judge the gains on the carts against the goal; the best of the models counts."""
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop
@@ -100,7 +100,7 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
 
 
 def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
-    """The overshoot and settling time reported, against what the gains give."""
+    """Judge the reported overshoot and settling time against a simulation with the gains."""
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop
@@ -124,7 +124,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
     return Verdict(
         share=share,
         models=best.models,
-        message="What the gains give."
+        message="They match the gains."
         if share == 1
         else f"Simulated on your carts with these gains: {does(best.numbers)}.",
         expected=expected,
@@ -138,7 +138,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
 
 
 def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
-    """The prefilter, against one over the static gain of the loop with these gains."""
+    """Judge the prefilter against the reciprocal of the loop's static gain."""
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop
@@ -159,7 +159,7 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     return Verdict(
         share=share,
         models=best.models,
-        message="One over the static gain of the loop, as it should be."
+        message="It is the reciprocal of the loop's static gain, as it should be."
         if share == 1
         else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
         expected={"prefilter": right},
@@ -169,10 +169,10 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
 
 
 def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
-    """The closed loop that ran, simulated; the best of several runs counts."""
+    """Judge the recorded closed loop against its simulation; the best of several runs counts."""
     runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
     if not runs:
-        return Verdict(share=NONE, message="No closed-loop run was handed in.")
+        return Verdict(share=NONE, message="No closed-loop run was submitted.")
     if off_scale(work.analysis):
         return Verdict(share=None, message=f"Not checked: {OFF_SCALE}.")
     closed: dict[str, list[float]] = {}
@@ -191,7 +191,7 @@ def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
         share=earned(criterion, [deviation]),
         models=((deviation,),),
         message=f"{run}: model and measurement differ by {errors[run]:.3g} % of the motion."
-        + (" The gains that ran are not those reported." if _others_ran(work) else ""),
+        + (" The gains used in the run are not the reported ones." if _others_ran(work) else ""),
         expected={"nrmse_percent": criterion.full_percent},
         found={"nrmse_percent": errors[run]},
     )

@@ -1,4 +1,4 @@
-"""What a remark costs at least: the share of a criterion that the rubric names for its flag."""
+"""The least cost of a remark: a share of its criterion, set by the rubric for each flag."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.words import WORDS
 
-# The check that a remark is about; one on a table of parameters names its table in the evidence.
+# The check that a remark concerns; for parameters the evidence names the table.
 _ABOUT: Mapping[Code, str] = {
     "initial_final_disagree": "initial_final",
     "wrong_state_space": "state_space",
@@ -27,9 +27,9 @@ _REDUCED = "data"  # a table that the students reduced themselves is one of thei
 def charge(
     verdict: Verdict, criterion: asked.Criterion, flags: Sequence[Flag], *, rubric: Rubric
 ) -> Verdict:
-    """Return a verdict that keeps no more than the dearest remark on its criterion leaves.
+    """Return a verdict reduced by the most expensive remark on its criterion.
 
-    Several remarks on one criterion cost what the dearest does, not their sum.
+    Several remarks on one criterion cost as much as the most expensive one, not their sum.
     """
     mine = [flag for flag in flags if concerns(flag, criterion, names=rubric.names)]
     dearest = max(mine, key=lambda flag: rubric.flags.of(flag.code), default=None)
@@ -48,7 +48,7 @@ def charge(
 
 
 def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:
-    """Whether a remark is about what a criterion judges."""
+    """Return whether a remark concerns what a criterion judges."""
     if flag.code in _ABOUT:
         return _ABOUT[flag.code] == criterion.check
     tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}
@@ -60,10 +60,10 @@ def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> boo
 
 
 def find_remarks(grade: Grade, criterion: asked.Criterion, rubric: Rubric) -> list[Flag]:
-    """Return the remarks of a grade that are about a criterion."""
+    """Return the remarks of a grade that concern a criterion."""
     return [flag for flag in grade.flags if is_about(flag, criterion, rubric)]
 
 
 def is_about(flag: Flag, criterion: asked.Criterion, rubric: Rubric) -> bool:
-    """Whether a remark is about a criterion; shared recordings are about none."""
+    """Return whether a remark concerns a criterion; shared recordings concern no criterion."""
     return flag.code != "shared_data" and concerns(flag, criterion, names=rubric.names)

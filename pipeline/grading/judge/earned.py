@@ -1,7 +1,7 @@
-"""What a criterion earns: its tolerances, applied to how far each of its numbers is off.
+"""The points of a criterion: its tolerances applied to the errors of its numbers.
 
-Nothing else reads a tolerance. So what was found once is weighed again under another rubric with
-the same result as grading again, see `reweigh.py`.
+Only this file reads tolerances. So stored errors can be weighed again under another rubric with the
+same result as grading again, see `reweigh.py`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from pipeline.grading.references.tolerance import credit
 
 ALL, NONE = Fraction(1), Fraction(0)  # shares of the points
 Tolerance = Literal["number", "exact", "damping", "overshoot", "settling"]
-# The keys of a criterion: up to the first all is earned, from the second on nothing.
+# Keys of a criterion: full points up to the first, none from the second on.
 TOLERANCES: Mapping[Tolerance, tuple[str, str]] = {
     "number": ("full_percent", "none_percent"),
     "exact": ("full_percent", "none_percent"),
@@ -26,13 +26,13 @@ TOLERANCES: Mapping[Tolerance, tuple[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Deviation:
-    """How far a number is off, and which tolerance judges it.
+    """The error of a number, and the tolerance that judges it.
 
     Attributes
     ----------
     error : in the unit of the tolerance (percent, or percentage points).
-    by : `exact` is a zero or a one of a state model. It is given away where it is right, and
-        counts like any other number where it is wrong.
+    by : `exact` is a zero or a one of a state model. It does not count if it is right, and counts
+        like any other number if it is wrong.
     """
 
     error: Fraction
@@ -48,7 +48,7 @@ def earned_by(criterion: asked.Criterion, deviation: Deviation) -> Fraction:
 def earned(criterion: asked.Criterion, deviations: Sequence[Deviation]) -> Fraction:
     """Return the share that numbers earn together; at least one.
 
-    Gains must meet all of the goal, so the worst counts. Elsewhere numbers share the points evenly.
+    Gains must meet the whole goal, so the worst number counts. Otherwise all count equally.
     """
     shares = [earned_by(criterion, deviation) for deviation in deviations]
     if isinstance(criterion, asked.Gains):

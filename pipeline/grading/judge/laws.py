@@ -1,8 +1,8 @@
 """The laws that a final table obeys, judged over the box of its rounding.
 
 Two carts have eight transfer-function parameters for seven physical ones, three carts fifteen for
-ten: what is left over must agree. A law holds where some corner of the box lies on either side of
-it, or on its right side. Everything is evaluated at all corners at once.
+ten, so the extra ones must agree. A law holds if the corners of the box lie on both sides of it, or
+one on its right side. All corners are evaluated at once.
 """
 
 from collections.abc import Mapping
@@ -18,14 +18,14 @@ from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
 
-MOST_WIDENING = 4  # tolerances; a law that then still fails is simply broken
-_PER_TOLERANCE = 2  # steps in which the box is widened by one
-_REDUNDANT = (2, 3)  # carts whose numbers follow from one another
+MOST_WIDENING = 4  # in tolerances; a law that still fails is broken
+_PER_TOLERANCE = 2  # steps for widening the box by one tolerance
+_REDUNDANT = (2, 3)  # numbers of carts with redundant parameters
 
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """One law, and how far the box of the rounding must be widened until it holds.
+    """One law, and how far the box of the rounding must be widened for it to hold.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Law:
 def judge_laws(
     final: Mapping[str, Decimal], *, n: int, frequency_percent: float, damping_percent: float
 ) -> list[Law] | None:
-    """Judge every law of a final table; None where the table is not complete."""
+    """Judge every law of a final table; None if the table is incomplete."""
     names = parameter_names(n)
     if any(name not in final for name in names):
         return None
@@ -73,7 +73,7 @@ def judge_laws(
 def _evaluate(
     final: Mapping[str, Decimal], half: Mapping[str, float], *, n: int
 ) -> dict[str, tuple[str, bool]]:
-    """Return (what it means, whether it holds) of every law, over the corners of a box."""
+    """Return (meaning, whether it holds) of every law, over the corners of a box."""
     results: dict[str, tuple[str, bool]] = {}
     value = {name: float(typed) for name, typed in final.items()}
     for name in parameter_names(n):
@@ -87,7 +87,7 @@ def _evaluate(
         found = recover_from_parameters(_corners(value, half, n=n))
         for name, (one, other) in found.routes.items():
             holds = bool((one - other).min() <= 0 <= (one - other).max())
-            results[f"redundancy.{name}"] = ("two routes to one number agree", holds)
+            results[f"redundancy.{name}"] = ("two ways to the same number agree", holds)
         kappas = {"kappa" if n == 2 else f"kappa_{i}": x for i, x in enumerate(found.couplings, 2)}
         for name, number in {**kappas, "k_1": found.k[0], f"k_{n + 1}": found.k[n]}.items():
             what = "the coupling of two carts" if name in kappas else name
@@ -96,7 +96,7 @@ def _evaluate(
             omega = np.sqrt(found.stiffness_terms[cart - 1])
             zeta = found.damping_terms[cart - 1] / (2 * omega)
             for name, numbers in ((f"omega_{cart}", omega), (f"zeta_{cart}", zeta)):
-                real = numbers[np.isfinite(numbers)]  # none where omega² is negative
+                real = numbers[np.isfinite(numbers)]  # without those where omega² is negative
                 low = float(np.min(real, initial=np.inf))
                 high = float(np.max(real, initial=-np.inf))
                 holds = low <= value[name] + half[name] and high >= value[name] - half[name]

@@ -1,8 +1,8 @@
-"""Points under another rubric, from what the checks found: no recording is read again.
+"""Compute points under another rubric from stored results, without reading recordings.
 
-A grading keeps, for every criterion, how far each number is off (exactly, as a fraction). Points,
-tolerances, what remarks cost, lateness and the step are applied to that anew, by the code that
-grades. What decides how far a number is off needs the recordings again: see `needs_recordings`.
+A grading keeps the error of each number exactly, as a fraction. The grading code then applies the
+new points, tolerances, costs of remarks, lateness and step. A change of the errors themselves needs
+the recordings: see `needs_recordings`.
 """
 
 import json
@@ -17,13 +17,13 @@ from pipeline.grading.judge.work import Verdict
 from pipeline.grading.references.tolerance import late_deduction
 from pipeline.grading.rubric import Rubric
 
-# Keys that decide what is compared with what; changed, the recordings are judged again.
+# Keys that change what is compared; after such a change the recordings are needed.
 _OF_RUBRIC = ("system", "design", "required", "examples")
 _OF_CRITERION = ("check", "parameters", "sigmas", "frequency_percent", "damping_percent")
 
 
 def findings_text(verdicts: Mapping[str, Verdict]) -> str:
-    """Return what the checks found as text, by criterion; same findings, same bytes."""
+    """Return the results of the checks as text, by criterion; same results, same bytes."""
     plain = {
         id_: {
             "share": None if verdict.share is None else str(verdict.share),
@@ -36,7 +36,7 @@ def findings_text(verdicts: Mapping[str, Verdict]) -> str:
 
 
 def read_findings(text: str) -> dict[str, Verdict]:
-    """Return what `findings_text` made a text of, without messages."""
+    """Read results from a `findings_text`, without messages."""
     return {
         id_: Verdict(
             share=None if plain["share"] is None else Fraction(plain["share"]),
@@ -54,8 +54,8 @@ def read_findings(text: str) -> dict[str, Verdict]:
 def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
     """Return the points of a grade under another rubric, before points given by hand.
 
-    Outcomes and points are those of grading again; messages are left empty. A criterion without
-    findings is left out.
+    Outcomes and points equal those of grading again; messages are empty. Criteria without stored
+    results are left out.
     """
     if grade.status == "failed":
         nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
@@ -77,7 +77,7 @@ def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) ->
 
 
 def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
-    """Return a finding with the share that the criterion's tolerances give it."""
+    """Return a stored result with its share under the criterion's tolerances."""
     if not finding.models:
         return Verdict(share=finding.share, message="")
     best = max(earned(wanted, model) for model in finding.models)
@@ -85,10 +85,10 @@ def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
 
 
 def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
-    """Return the keys of a rubric that changed and that only grading again can apply.
+    """Return the changed keys of a rubric that take effect only by grading again.
 
-    `criteria.ID` is a criterion that was never judged; `criteria.ID.KEY` is one that was judged
-    by other numbers.
+    `criteria.ID` is a criterion that was never judged; `criteria.ID.KEY` is one judged by other
+    numbers.
     """
     found = [key for key in _OF_RUBRIC if getattr(before, key) != getattr(now, key)]
     if before.late.due != now.late.due:
@@ -100,7 +100,7 @@ def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
             continue
         was = old[criterion.id]
         for key in _OF_CRITERION:
-            # `damping_percent` and `frequency_percent` are those of the laws alone.
+            # Only the laws have `damping_percent` and `frequency_percent`.
             if getattr(was, key, None) != getattr(criterion, key, None):
                 found.append(f"criteria.{criterion.id}.{key}")
     return found

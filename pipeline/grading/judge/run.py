@@ -1,4 +1,4 @@
-"""Grade one submission: its own recordings are analysed anew, nothing it brings is believed."""
+"""Grade one submission by a new analysis of its recordings; its own results are not trusted."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -35,12 +35,12 @@ from pipeline.workflow import analyse
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Graded:
-    """A grade, and what it rests on.
+    """A grade, with its analysis and verdicts.
 
     Attributes
     ----------
-    analysis : of the student's recordings, None where it failed.
-    verdicts : by criterion, also where what it requires was not passed; none where it failed.
+    analysis : of the student's recordings; None if the grading failed.
+    verdicts : by criterion, even if a required one was not passed; empty if the grading failed.
     """
 
     grade: Grade
@@ -58,8 +58,8 @@ def grade_submission(
 ) -> Graded:
     """Analyse a submission's recordings under the rubric's system and grade what it reports.
 
-    Recordings that cannot be read are flagged. Where none can be, or the carts are
-    not as many as the rubric's, the grade is `failed` with its reason.
+    Recordings that cannot be read are flagged. If none can be read, or the number of carts differs
+    from the rubric's, the grade is `failed` with the reason.
     """
 
     def failed(reason: str) -> Graded:
@@ -75,7 +75,7 @@ def grade_submission(
         return failed(str(error))
     springs, notes, analysis = judged.springs, judged.notes, judged.analysis
     if springs:
-        asked = f"these recordings ask for springs that the rubric has not: {', '.join(springs)}"
+        asked = f"these recordings need springs that the rubric lacks: {', '.join(springs)}"
         notes = (*notes, f"{asked}; judged with them")
     graded = grade_analysis(
         judged.submission, analysis, rubric=rubric, name=name, days_late=days_late
@@ -86,9 +86,9 @@ def grade_submission(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysed:
-    """A submission under a rubric's system, analysed; `notes` say what of its own gave way.
+    """An analysed submission under a rubric's system; `notes` list its replaced settings.
 
-    `springs` : that the recordings ask for and the rubric has not.
+    `springs` : those that the recordings need and the rubric lacks.
     """
 
     submission: Submission
@@ -104,7 +104,7 @@ def analyse_under(
 
     Raises
     ------
-    SubmissionError : none can be read, or the carts are not as many as the rubric's.
+    SubmissionError : no recording can be read, or the number of carts is not the rubric's.
     """
     count = submission.system.carts
     if count != rubric.system.carts:
@@ -156,7 +156,7 @@ def grade_analysis(
 def prepare_work(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
-    """Return what the checks work on, all flags in the order of their codes, and what to note."""
+    """Return the input of the checks, all flags in the order of their codes, and notes."""
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
     work, told = _prepare(submission, analysis, rubric=rubric)
@@ -167,7 +167,7 @@ def prepare_work(
 def _prepare(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...]]:
-    """Return what the checks work on, and the flags of the tables of parameters."""
+    """Return the input of the checks, and the flags of the parameter tables."""
     reported, n = submission.reported or Reported(), rubric.system.carts
     measured, chain = in_scale(
         recompute(analysis),
@@ -187,7 +187,7 @@ def _prepare(
     if diagnosis.corrected != tables[0]:
         tables.append(diagnosis.corrected)
     if chain is None and not diagnosis.possible:
-        tables = []  # a model may well be right where its table was copied wrongly
+        tables = []  # a model can be right although its table was copied wrongly
     digits = {n: float(rounding(typed) / abs(Fraction(typed))) for n, typed in positive.items()}
     work = Work(
         submission=submission,
@@ -205,11 +205,10 @@ def _prepare(
 
 
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
-    """Return the submission with the rubric's system in the place of its own, and what to note.
+    """Replace a submission's system by the rubric's; return it with notes.
 
-    Where the rubric leaves a sign or a calibration open the submission's own stands. A length
-    unit other than the rubric's is kept, as the students' numbers are in it; the calibration is
-    converted.
+    A sign or calibration that the rubric leaves open stays the submission's. A different unit of
+    length is kept, because the students' numbers use it, and the calibration is converted.
     """
     own, set_ = submission.system, rubric.system
     notes = []
@@ -218,7 +217,7 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
     if factor is not None and own.position.unit != unit:
         unit = own.position.unit
         per_count = None if per_count is None else per_count * factor
-        notes.append(f"lengths are in {unit}, as handed in; the rubric has {set_.position.unit}")
+        notes.append(f"lengths are in {unit}, as submitted; the rubric has {set_.position.unit}")
     if own.springs != set_.springs and set_.carts > 1:  # one cart has one stiffness
         notes.append("the springs are the rubric's, not those of the submission")
     system = System(
@@ -236,7 +235,7 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
     )
     experiments = tuple(_under_calibration(e, set_) for e in submission.experiments)
     if experiments != submission.experiments:
-        notes.append("the input's scale is the rubric's, also where a record states its own")
+        notes.append("the scale of the input is the rubric's, even if a recording states its own")
     update = {
         "system": system,
         "design": rubric.design or submission.design,
@@ -246,10 +245,10 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
 
 
 def _under_calibration(experiment: Experiment, system: System) -> Experiment:
-    """Return the experiment without an input scale of its own where the rubric states one.
+    """Return the experiment without its own input scale if the rubric states one.
 
-    Under feedback a bench may log another signal as its input, so there the record's own stands.
-    Between its own sign and the rubric's the data decide, as everywhere.
+    Under feedback a bench may log another signal as its input, so such a run keeps its scale.
+    The data decide between its own sign and the rubric's, as everywhere.
     """
     own = experiment.input
     if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
@@ -261,10 +260,10 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 
 
 def _flags(work: Work) -> list[Flag]:
-    """Return the flags beside those of the parameter tables.
+    """Return the flags that do not concern the parameter tables.
 
-    A table of a bench that is not linear is of no one chain: what is made of it one way is not
-    what is made of it another, and only what no chain can have is wrong.
+    On a nonlinear bench no single chain fits the table, and results depend on the method. Then only
+    numbers that no chain can have are wrong.
     """
     flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
     if space is not None and space.A:

@@ -1,4 +1,4 @@
-"""What the checks work on, and what each of them says."""
+"""The input of the checks, and their verdicts."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -20,12 +20,12 @@ from pipeline.words.numbers import first_few
 
 @dataclass(frozen=True, kw_only=True)
 class Work:
-    """All that a check may look at.
+    """Everything that a check may use.
 
     Attributes
     ----------
-    state_models : what [A B] may rightly be.
-    bad : runs that do not hold what they should, each with what is wrong.
+    state_models : acceptable values of [A B].
+    bad : runs with something wrong in them, each with its problem.
     named : by table, the numbers that a known mistake explains.
     """
 
@@ -40,33 +40,33 @@ class Work:
 
     @property
     def missing(self) -> list[str]:
-        """What must be handed in and is not; a file that cannot be read is not."""
+        """The required items that are missing; an unreadable file counts as missing."""
         return missing_pieces(self.submission, self.rubric, unreadable=self.analysis.unreadable)
 
     @cached_property
     def entries(self) -> list[MatrixEntry]:
-        """The entries of A and B beside what they may rightly be; none where they are not there."""
+        """The entries of A and B with their acceptable values; empty without A and B."""
         space = self.reported.state_space
         n = self.rubric.system.carts
         return compare_entries(space, models=self.state_models, n=n) if space and space.A else []
 
     @property
     def reported(self) -> Reported:
-        """What the students claim; empty where they claim nothing."""
+        """The reported numbers; empty if nothing is reported."""
         return self.submission.reported or Reported()
 
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The share of the points; None where nothing could be judged, and `message` says why.
+    """The share of the points; None if nothing could be judged (`message` says why).
 
     Attributes
     ----------
-    explained : a known mistake is behind all that is lost, and its flag says more than advice.
-    models : how far the numbers are off on each model that they may rest on, of which the best
-        counts; none where no tolerance decides.
-    most : the share that is kept at most, whatever the tolerances.
-    agrees : of each number that is judged on its own, whether nothing is lost by it.
+    explained : a known mistake explains all lost points, and its flag replaces advice.
+    models : errors of the numbers on each acceptable model, of which the best counts; empty if no
+        tolerance decides.
+    most : the largest share that can be kept, whatever the tolerances.
+    agrees : for each number judged on its own, whether it loses no points.
     """
 
     share: Fraction | None
@@ -79,21 +79,21 @@ class Verdict:
     agrees: Mapping[str, bool] = field(default_factory=dict)
 
 
-# ------------------------------------------------------------- what must be handed in
+# --------------------------------------------------------------------- required items
 
-# Runs that serve as well: a ring-down after a step is a decay, a reduced table holds all dwells.
+# Acceptable substitutes: a step's ring-down for a decay, a reduced table for all dwells.
 _SERVES = {"decay": ("decay", "step"), "sine": ("sine",), "step": ("step",)}
 
 
 def asked_pieces(rubric: Rubric) -> list[str]:
-    """Return the names of all pieces that a rubric asks for."""
+    """Return the names of all items that a rubric requires."""
     return list(_pieces(None, rubric))
 
 
 def missing_pieces(
     submission: Submission, rubric: Rubric, *, unreadable: Collection[str]
 ) -> list[str]:
-    """Return the names of the pieces that are not there; an unreadable experiment is none."""
+    """Return the names of the missing items; an unreadable experiment counts as missing."""
     left = tuple(e for e in submission.experiments if e.id not in unreadable)
     submission = submission.model_copy(update={"experiments": left})
     return [name for name, there in _pieces(submission, rubric).items() if not there]
@@ -104,13 +104,13 @@ def missing_flag(missing: list[str]) -> Flag:
     return Flag(
         code="missing",
         parameters=tuple(missing),
-        message=f"not handed in: {first_few(missing, 6)}.",
+        message=f"missing: {first_few(missing, 6)}.",
         evidence={"missing": missing},
     )
 
 
 def data_flag(bad: Mapping[str, str]) -> Flag:
-    """Return the flag for the runs that do not hold what they should."""
+    """Return the flag for the runs with something wrong in them."""
     first, problem = next(iter(bad.items()))
     others = len(bad) - 1
     have = "run has" if others == 1 else "runs have"
@@ -145,7 +145,7 @@ def _pieces(submission: Submission | None, rubric: Rubric) -> dict[str, bool]:
 
 
 def run_name(runs: RequiredRuns) -> str:
-    """Return how a required run is called: "decay of cart 2", "12 sine"."""
+    """Return the name of a required run: "decay of cart 2", "12 sine"."""
     carts = f" of cart {', '.join(map(str, runs.carts))}" if runs.carts else ""
     return f"{runs.at_least} {runs.kind}{carts}" if runs.at_least > 1 else f"{runs.kind}{carts}"
 

@@ -1,1 +1,1 @@
-"""Which mistake makes this number: of the tables, the model, the controller, the recordings."""
+"""Find the mistakes behind wrong numbers in tables, model, controller and recordings."""

@@ -1,4 +1,4 @@
-"""The known mistakes, tried on the student's own data: what each would make of every number."""
+"""The known mistakes, applied to the student's own data to predict every number."""
 
 import itertools
 import math
@@ -19,7 +19,7 @@ from pipeline.names import read_name
 from pipeline.results import Analysis
 from pipeline.submission import Reported
 
-# (periods counted, periods there): one too many, or one too few.
+# (periods counted, true periods): one too many, or one too few.
 _COUNTS = [pair for k in range(1, 11) for pair in ((k + 1, k), (k, k + 1))]
 
 Numbers = Mapping[str, Reference]
@@ -27,21 +27,21 @@ Numbers = Mapping[str, Reference]
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """One or two mistakes, and what they make of the numbers of a table.
+    """One or two mistakes, and the numbers of a table that they produce.
 
     Attributes
     ----------
-    said : the sentences that help, by their keys in `words`.
-    predicted : by parameter name; the bounds within which the mistaken number lies.
+    said : the sentences of advice, by their keys in `words`.
+    predicted : by parameter name; the bounds of the mistaken number.
     tolerance : relative, around those bounds.
-    periods : counted, and there.
-    whole : all of the predicted that were reported must be met for it to be believed.
-    least : so many numbers must be explained for it to be believed.
-    table_wide : believed, it explains every other wrong number of the table too.
-    tries : so many of its kind are tried, of which one meets the numbers the easier.
-    beside : numbers that are right where it is this mistake.
-    from_time_records : it comes of reading a decay or a step; so in a final table only where that
-        was taken over from the initial one.
+    periods : counted, and true.
+    whole : it is believed only if all reported numbers match its predictions.
+    least : it is believed only if it explains so many numbers.
+    table_wide : if believed, it also explains every other wrong number of the table.
+    tries : number of variants tried; more variants match more easily by chance.
+    beside : numbers that must be right for this mistake.
+    from_time_records : it comes from reading a decay or a step, so a final table can have it only
+        if it was copied from the initial one.
     """
 
     codes: tuple[Code, ...]
@@ -57,7 +57,7 @@ class Mistake:
     from_time_records: bool = False
 
     def help(self, typed: Decimal, reference: Reference) -> str:
-        """Return what helps with one number."""
+        """Return the advice for one number."""
         counted, there = self.periods
         recomputed = f"{reference.value:.4g}"
         values = {"reported": as_typed(typed), "recomputed": recomputed}
@@ -70,10 +70,10 @@ class Mistake:
 
 
 def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
-    """Tell whether a damping can show it: a blurred one only against the team's own final value.
+    """Return whether a damping can show a log10 mistake; with friction only by the final value.
 
-    A decay with friction has any ratio to a reference so wide; a final value that agrees with the
-    initial one was not made by taking the wrong logarithm of the decay.
+    With friction the reference is so wide that any ratio occurs. A final value that agrees with the
+    initial one excludes a wrong logarithm of the decay.
     """
     if reference.high <= limits.BLURRED_DAMPING * reference.low:
         return True
@@ -130,7 +130,7 @@ def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Refe
         "sharp gains": {n: r for n, r in gains.items() if r.within(limits.SHARP)},
         "all dampings": dampings,
         "own dampings": own,
-        "dampings": dampings if shows_log10 else {},  # vague ones as well
+        "dampings": dampings if shows_log10 else {},  # including vague ones
         "sharp dampings": {n: r for n, r in own.items() if r.within(limits.SHARP)},
     }
 
@@ -140,7 +140,7 @@ def _by_factor(of: Mapping[str, Numbers], *groups: Of) -> list[Mistake]:
     found = []
     for row in [row for row in FACTORS if row.of in groups]:
         numbers = of[row.of]
-        # A decrement is taken of one decay, and wrong beside a frequency that is right.
+        # A decrement belongs to one decay and can be wrong while its frequency is right.
         alone = row.of == "sharp dampings"
         for some in [{n: r} for n, r in numbers.items()] if alone else [numbers]:
             beside = [n for n in of["own frequencies"] if alone and _damping(n) in some]
@@ -170,7 +170,7 @@ def _times(references: Numbers, factor: float) -> dict[str, Reference]:
 
 
 def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator[Mistake]:
-    """One period too many or too few: ω is off by their ratio, and a decrement by its inverse."""
+    """One period too many or too few: ω is wrong by their ratio, a decrement by its inverse."""
     for counted, there in _COUNTS:
         fast = _times(omegas, counted / there)
         damped = {n: _miscounted_damping(r, there / counted) for n, r in every_zeta.items()}
@@ -199,12 +199,12 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
 
 
 def _with_slack(zeta: Reference) -> Reference:
-    """Return a damping with what it may be off in its bounds, to stand beside sharper numbers."""
+    """Return a damping with its tolerance added to its bounds, for use with sharper numbers."""
     return zeta.widened(1 + limits.DAMPING)
 
 
 def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
-    """Return the bounds of a damping so miscounted, up to where it is as near to the right one."""
+    """Return the bounds of a miscounted damping, up to the midpoint to the right one."""
     mistaken, middle = _with_slack(zeta.times(factor)), zeta.times(math.sqrt(factor))
     if factor < 1:
         return replace(mistaken, high=middle.high)
@@ -243,7 +243,7 @@ def _gain_mistakes(gains: Numbers, analysis: Analysis) -> Iterator[Mistake]:
 
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
-    """Yield the peaks of one edge, or of all: of every cart, as one step moves them all."""
+    """Yield the peaks of one edge or of all, for every cart, because a step moves all carts."""
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     peaks = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
     peaks.append({n: peak for n, t in turns.items() if (peak := t.mean_peak()) is not None})
@@ -260,7 +260,7 @@ def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
 
 
 def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistake]:
-    """Yield where the carts turn after the peak of one edge: next, and after that."""
+    """Yield the next turning points of the carts after the peak of one edge."""
     edges = {edge for one in turns.values() for edge in one.by_edge}
     for edge, turn in itertools.product(sorted(edges), (1, 2)):
         later = {n: e for n, t in turns.items() if (e := t.turn(edge, turn)) is not None}
@@ -277,7 +277,7 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistak
 
 
 def _count(name: str, analysis: Analysis) -> float:
-    """Return the encoder step of the gain's cart in position units; 0 where it says nothing."""
+    """Return the encoder step of the gain's cart in position units; 0 if it is not known."""
     cart = read_name(name).cart or 1
     steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
     step = float(np.median(steps)) if steps else 0.0
@@ -312,7 +312,7 @@ def _permutations(names: Sequence[str]) -> Iterator[dict[str, str]]:
 
 
 def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mistake]:
-    """Yield every order of the carts but the right one; frequencies may take dampings along."""
+    """Yield every wrong order of the carts; frequencies may be swapped with their dampings."""
     for source in _permutations(list(references)):
         moved = {name: other for name, other in source.items() if name != other}
         predicted = {name: references[other] for name, other in moved.items()}

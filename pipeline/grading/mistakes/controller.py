@@ -1,4 +1,4 @@
-"""The reported controller: do its gains reach the goal, are the claims theirs, is N 1/DC gain?"""
+"""Judge the reported controller: gains, claims and prefilter (1 / DC gain)."""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,18 +27,18 @@ from pipeline.workflow import reference_design
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Controller:
-    """The reported controller with all there is to judge it by.
+    """The reported controller and the data for judging it.
 
     Attributes
     ----------
-    gains : (2n,) as reported; None if they were not.
+    gains : (2n,) as reported; None if not reported.
     ran : (2n,) gains stated for a closed-loop run, if any.
     models : the reference chain and the student's own.
-    goal : what must be met; what a reference design reaches where neither it nor these gains do.
-    blurred : the reference's gains are as uncertain as friction makes them.
-    doubt : relative error of the prefilter that the models' own errors leave.
-    reference : the chain that the recordings give, the first of the models; None without one.
-    own : the student's table is complete, so that what they designed for is known.
+    goal : to be met; if neither a reference design nor these gains do, what that design reaches.
+    blurred : friction makes the reference's gains uncertain.
+    doubt : relative error of the prefilter due to errors of the models.
+    reference : the chain from the recordings, the first of the models; None without one.
+    own : the student's table is complete, so that their own model is known.
     """
 
     gains: Array | None
@@ -54,14 +54,14 @@ class Controller:
     doubt: float = 0.0
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
-        """Return what gains do on each of the models."""
+        """Return the loop that gains give on each of the models."""
         found = [self._on(chain, gains) for chain in self.models]
         return [numbers for numbers in found if numbers is not None]
 
     def runaway(self, gains: Array) -> LoopNumbers | None:
-        """Return what gains do on the recorded carts where that grows, and so fast that it counts.
+        """Return the loop on the recorded carts if it is clearly unstable.
 
-        What grows less than e-fold in the settling time asked for may be the model's own error.
+        Growth by less than a factor e within the required settling time may be a model error.
         """
         numbers = self._on(self.reference, gains) if self.reference is not None else None
         if numbers is None or numbers.stable:
@@ -79,7 +79,7 @@ class Controller:
         )
 
     def reaches_goal(self, gains: Array) -> bool:
-        """Whether gains do what is asked for on one of the models."""
+        """Return whether gains reach the goal on one of the models."""
         return any(
             self.meets(numbers, overshoot=0.0, settling=1.0) for numbers in self.numbers(gains)
         )
@@ -91,7 +91,7 @@ class Controller:
         overshoot: float = limits.OVERSHOOT,
         settling: float = limits.SETTLING,
     ) -> bool:
-        """Whether a loop comes near enough to the goal, by default not to be called wrong."""
+        """Return whether a loop is near enough to the goal, by default not to be called wrong."""
         return (
             numbers.stable
             and numbers.overshoot <= self.goal.overshoot_percent + overshoot
@@ -100,7 +100,7 @@ class Controller:
         )
 
     def is_claimed(self, numbers: LoopNumbers) -> bool:
-        """Whether a loop does about what was reported of it."""
+        """Return whether a loop behaves about as reported."""
         if self.overshoot is not None and not (
             abs(numbers.overshoot - float(self.overshoot)) <= limits.CLAIM_OVERSHOOT
         ):
@@ -112,16 +112,16 @@ class Controller:
         return ratio is not None and 1 / limits.CLAIM_SETTLING <= ratio <= limits.CLAIM_SETTLING
 
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
-        """Whether a loop settles so much sooner or later than reported that it is not meant."""
+        """Return whether the settling time differs so much that other gains are meant."""
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False
         ratio = numbers.settling_time / float(self.settling)
         return max(ratio, 1 / ratio) > 2.5  # whatever the prefilter
 
     def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
-        """Whether the reported prefilter is one over the static gain of this loop.
+        """Return whether the reported prefilter is the reciprocal of this loop's static gain.
 
-        A student's own numbers leave less room than recordings that friction blurs: `sharp`.
+        `sharp`: the student's own numbers are more precise than recordings with friction.
         """
         if self.prefilter is None:
             return True
@@ -137,12 +137,12 @@ def reported_controller(
     chain: Chain | None,
     tables: Sequence[Mapping[str, float]],
 ) -> Controller | None:
-    """Return the controller of a submission; None without one, or nothing to judge it by.
+    """Return the controller of a submission; None if it is missing or cannot be judged.
 
     Parameters
     ----------
     chain : the reference, if there is one.
-    tables : the student's final table, as typed and with the mistakes found in it undone.
+    tables : the student's final table, as typed and with its known mistakes corrected.
     """
     feedback = submission.reported.feedback if submission.reported else None
     n = submission.system.carts
@@ -174,9 +174,9 @@ def reported_controller(
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
-    """Return the relative error that those of the models, fitted or typed, leave in a prefilter.
+    """Return the relative error of a prefilter due to errors of the fitted or typed models.
 
-    Gains that cancel much of the plant's stiffness make more of them than there was.
+    Gains that cancel much of the plant's stiffness amplify these errors.
     """
     chain, gains, cart = controller.models[0], controller.gains, controller.goal.cart
     if gains is None or gains.size != 2 * chain.n:
@@ -199,7 +199,7 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
         chain = own_chain(table, n=gains.size // 2)
         try:
             return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
-        except np.linalg.LinAlgError:  # the gains cancel all stiffness: nothing holds a level
+        except np.linalg.LinAlgError:  # the gains cancel all stiffness: there is no static level
             return np.nan
 
     half = {name: float(rounding(value)) for name, value in typed.items()}
@@ -209,7 +209,7 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
-    """Return the goal or, where the reference design comes short of it, what that reaches."""
+    """Return the goal or, if the reference design misses it, what that design reaches."""
     try:
         design = reference_design(submission, analysis.fit)
     except DataError:
@@ -238,11 +238,11 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     fits = any(controller.prefilter_fits(one) for one in numbers)
     meets = any(controller.meets(one) for one in numbers)
     claimed = any(controller.is_claimed(one) for one in numbers)
-    # Gains that reach the goal, and do what is claimed of them, are the ones meant.
+    # Gains that reach the goal and match the claims are the intended ones.
     told = controller.overshoot is not None or controller.settling is not None
     slip, intended = ("", None) if meets and told and claimed else _slip(controller)
     ran = controller.ran
-    # The gains that ran tell which of the reported numbers does not belong to the others.
+    # The gains of the run show which reported number does not fit the others.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
     sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)
@@ -260,14 +260,14 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
         fits = fits or not known or any(controller.prefilter_fits(one) for one in known)
     if not fits and controller.prefilter is not None:
         slip = _prefilter_slip(controller, numbers[0].prefilter)
-        # What is right on the student's own carts may be off on those of the reference.
+        # Gains that are right on the student's own carts may be wrong on the reference's.
         if controller.own or slip:
             flags.append(_prefilter_flag(controller, numbers[0], slip=slip))
     return flags
 
 
 def same_gains(a: Array, b: Array) -> bool:
-    """Whether two sets of gains are one, typed with different numbers of digits."""
+    """Return whether two sets of gains are equal, apart from the number of typed digits."""
     if a.shape != b.shape:
         return False
     scale = np.empty_like(a)
@@ -277,7 +277,7 @@ def same_gains(a: Array, b: Array) -> bool:
 
 
 def _slip(controller: Controller) -> tuple[str, Array | None]:
-    """Return the known slip that, undone, makes the gains right, and the gains meant; or ""."""
+    """Return the known mistake whose correction makes the gains right, and those gains; or ""."""
     gains = controller.gains
     assert gains is not None
     for text, meant in _undone(gains):
@@ -298,7 +298,7 @@ def _slip(controller: Controller) -> tuple[str, Array | None]:
 
 
 def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
-    """Yield (the slip in words, the gains without it); none that changes nothing."""
+    """Yield (mistake in words, corrected gains), only if that changes the gains."""
     n = gains.size // 2
     pairs = gains.reshape(n, 2)
     found = [(WORDS.text("all_signs"), -gains)]
@@ -317,7 +317,7 @@ def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
 
 
 def does(numbers: LoopNumbers) -> str:
-    """Return what a loop does, in words."""
+    """Return the response of a loop, in words."""
     if not numbers.stable:
         return WORDS.text("unstable")
     seconds = numbers.settling_time
@@ -360,7 +360,7 @@ def _gains_flag(
 
 
 def _prefilter_slip(controller: Controller, right: float) -> str:
-    """Return the known slip that gives the reported prefilter, or ""."""
+    """Return the known mistake that gives the reported prefilter, or ""."""
     typed = controller.prefilter
     assert typed is not None
     for text, value in _prefilter_slips(controller, right):

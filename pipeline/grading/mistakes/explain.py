@@ -1,4 +1,4 @@
-"""Find the mistakes that make the numbers of a table likeliest, where they are likely enough."""
+"""Find the most likely mistakes behind the numbers of a table, if they are likely enough."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -14,8 +14,8 @@ from pipeline.grading.references.tolerance import Typed
 from pipeline.names import read_name
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
-# With little damping a step peaks at twice its level, which is also what peak to peak gives: of a
-# first estimate it is then true that the step peaks there, whatever was done.
+# With little damping a step peaks at twice its level, the same as a peak-to-peak mistake. For a
+# first estimate the statement that the step peaks there is then true in any case.
 _TRUE_ANYWAY: Code = "peak_for_steady_state"
 
 Table = Mapping[str, Decimal]
@@ -24,7 +24,7 @@ Label = Literal["initial", "final"]
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedNumbers:
-    """Numbers of one table that a mistake explains; `rival` explains them as well."""
+    """Numbers of one table that a mistake explains; `rival` explains them equally well."""
 
     mistake: Mistake
     table: Label
@@ -34,7 +34,7 @@ class ExplainedNumbers:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """The mistakes found, and the numbers that none explains or several do."""
+    """The mistakes found, and the numbers that no single mistake explains."""
 
     explained: tuple[ExplainedNumbers, ...]
     left: tuple[str, ...]
@@ -54,9 +54,9 @@ def explain(
     label: Label,
     believed: frozenset[Code] = frozenset(),
 ) -> Explanation:
-    """Find the mistakes that make the whole table likeliest; those `believed` count as no more.
+    """Find the mistakes that make the whole table most likely; `believed` ones cost nothing.
 
-    Where others make it about as likely, none is named.
+    If other mistakes make it about as likely, no mistake is named.
     """
     typed = {name: Typed.of(number) for name, number in table.items()}
     ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
@@ -84,7 +84,7 @@ def explain(
         less = [c for c in rivals if c.codes <= shared]
         if rivals and len(supported) == 1:
             best, rivals = supported[0], []
-        elif less:  # sure of one mistake, not of the other
+        elif less:  # certain of one mistake, but not of the other
             best, rivals = less[0], []
         if rivals and label == "initial":
             true = [c for c in (best, *rivals) if _TRUE_ANYWAY in c.codes]
@@ -108,7 +108,7 @@ def explain(
 
 @dataclass(frozen=True, kw_only=True)
 class _Cover:
-    """What some codes explain, each number by one mistake."""
+    """The numbers that some codes explain, each by one mistake."""
 
     codes: frozenset[Code]
     fits: tuple[tuple[Mistake, list[str]], ...]
@@ -121,7 +121,7 @@ class _Cover:
 
 @dataclass(frozen=True, kw_only=True)
 class _Tried:
-    """A mistake held against a table: how far off what it predicts each number is, in percent."""
+    """A mistake compared with a table: the error of each number against its prediction, percent."""
 
     mistake: Mistake
     label: Label
@@ -137,9 +137,9 @@ class _Tried:
         return cls(mistake=mistake, label=label, errors=errors)
 
     def explains(self, remaining: Sequence[str]) -> list[str]:
-        """Return which of the remaining numbers it reproduces, if it may be believed.
+        """Return the remaining numbers that it reproduces, if it can be believed.
 
-        Half of them must be met; the others may be as far off as honest numbers are.
+        Half of them must match; the others may differ as much as honest numbers do.
         """
         mistake = self.mistake
         met = [name for name in self.errors if self.off_by(name) <= 1]
@@ -149,22 +149,22 @@ class _Tried:
         if mistake.whole and len(near) < len(self.errors):
             return []
         wrong = [name for name in remaining if name in near]
-        # Of two carts swapped both numbers are wrong, not only near the other's.
+        # If carts are swapped, both numbers are wrong, not only close to the other's.
         return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
 
     def off_by(self, name: str) -> float:
-        """Return how far a number is off, as share of what it may be."""
+        """Return the error of a number relative to its tolerance."""
         return self.errors[name] / (100 * self.mistake.tolerance)
 
     def _is_near(self, name: str) -> bool:
-        """Whether a number beside others that it makes is off as honest numbers are off."""
+        """Return whether the error of a number is within that of honest numbers."""
         by_eye = self.label == "initial" and read_name(name).is_by_eye
         limit = limits.NEAR_BY_EYE if by_eye else limits.NEAR
         return not read_name(name).is_damping and self.errors[name] <= 100 * limit
 
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
-    """Return the mistakes that are one and the same way to be wrong, of whatever numbers."""
+    """Group mistakes of the same kind that concern different numbers."""
     ways: dict[tuple, list[_Tried]] = {}
     for one in tried:
         ways.setdefault((one.mistake.said, one.mistake.periods), []).append(one)
@@ -172,7 +172,7 @@ def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
 
 
 def _cover(way: Sequence[_Tried], remaining: Sequence[str]) -> _Cover:
-    """Explain what one way to be wrong can, with mistakes that explain more numbers first."""
+    """Explain numbers by one kind of mistake, trying those first that explain the most."""
     fits: list[tuple[Mistake, list[str]]] = []
     open_ = list(remaining)
     while tried := [(one, names) for one in way if (names := one.explains(open_))]:
@@ -194,12 +194,12 @@ def _score(
     off: Collection[str],
     free: Collection[Code],
 ) -> float:
-    """Return the logarithm of how likely some mistakes are, and the table with them in it."""
+    """Return the log likelihood of some mistakes together with the table that they give."""
     predicted: dict[str, Reference] = dict(known)
     for mistake, names in reversed(cover.fits):
         touched = [n for n in mistake.predicted if n in table] if mistake.whole else names
         predicted |= {n: mistake.predicted[n] for n in touched}
-    # What is off is no honest number; a mistake of the whole table may make any of it.
+    # A wrong number is not an honest one; a mistake of the whole table can produce any number.
     wide = any(m.table_wide for m, _ in cover.fits)
     unexplained = -math.log(limits.ANYWHERE) - (0.0 if wide else _SLIP)
     told = sum(
@@ -214,10 +214,10 @@ def _score(
 
 
 def _log_density(typed: Typed, reference: Reference, name: str) -> float:
-    """Return the logarithm of the density of ln(number), that of one anywhere at the least.
+    """Return the log density of ln(number), at least that of a number anywhere.
 
-    Even between the bounds that rounding leaves, with Cauchy's tails outside them: some numbers
-    are read far worse than most.
+    The density is uniform between the bounds, widened by rounding, with Cauchy tails outside,
+    because some numbers are read far worse than most.
     """
     half, value = typed.hidden, typed.value
     low, high = reference.low, reference.high
@@ -231,7 +231,7 @@ def _log_density(typed: Typed, reference: Reference, name: str) -> float:
         usual = limits.USUAL_DAMPING
     elif read.is_by_eye:
         usual = limits.USUAL_BY_EYE
-    # What a mistake is made with was typed to as many digits before.
+    # The number in the mistake had as many digits.
     digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)
     outside = max(math.log(low / value), math.log(value / high)) - half

@@ -1,6 +1,6 @@
-"""Mistakes that multiply a number by one factor, as a table: a new one is a row here.
+"""A table of mistakes that multiply a number by one factor; a new mistake is a row here.
 
-Its code stands in `pipeline/grading/grade.py`, its sentences in `templates/words/grading.toml`.
+Its code is in `pipeline/grading/grade.py`, its sentences are in `templates/words/grading.toml`.
 """
 
 import math
@@ -12,30 +12,30 @@ from pipeline.grading.grade import Code
 
 TURN = 2 * math.pi
 LOG10 = math.log10(math.e)
-MISREAD_RATIO = 0.06  # a ratio of a reduced table that is read off by one slip
+MISREAD_RATIO = 0.06  # tolerance for a ratio of a reduced table with one mistake
 Of = Literal[
-    "frequencies",  # … that the recordings tell well
-    "all frequencies",  # … where some are told vaguely
+    "frequencies",  # … known well from the recordings
+    "all frequencies",  # … including vaguely known ones
     "gains",
-    "sharp gains",  # … that friction does not blur
+    "sharp gains",  # … without the uncertainty of friction
     "dampings",  # of decays
-    "sharp dampings",  # … each on its own
-    "frequencies of rows",  # of a table that the students reduced themselves, beside dwells
+    "sharp dampings",  # … each separately
+    "frequencies of rows",  # of a reduced table, with dwells to compare
     "ratios of rows",
-    "fitted gains",  # … fitted, beside steps and decays
+    "fitted gains",  # … fitted, with steps and decays to compare
     "fitted frequencies",
 ]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Factor:
-    """A row: reported is what is asked for times a factor.
+    """A row: the reported number is the right one times a factor.
 
     Attributes
     ----------
-    code : of the flag; `said` is the sentence that helps, by its key in the words of grading.
-    of : the numbers in which it is made.
-    tolerance : relative, around what it makes of the recordings' own number.
+    code : of the flag; `said` is the key of its advice in the words of grading.
+    of : the numbers that can have it.
+    tolerance : relative, around the recordings' own number times the factor.
     whole, least, tries, from_time_records : see `Mistake`.
     """
 
@@ -81,9 +81,9 @@ def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
 
 FACTORS = (
     _frequency("hertz", 1 / TURN),
-    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),  # beside a sharper one
+    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),  # together with a sharper one
     _frequency("hertz_twice", TURN),
-    # Who reads from peak to peak does so for every cart; of one alone a sharp reference tells.
+    # A team reads peak to peak for every cart; for a single cart only a sharp reference proves it.
     _peaks("peak_to_peak", 2.0, of="gains", whole=True),
     _peaks("input_peak_to_peak", 0.5, of="gains", whole=True),
     _peaks("peak_to_peak", 2.0, of="sharp gains"),
@@ -97,10 +97,10 @@ FACTORS = (
         whole=True,
         from_time_records=True,
     ),
-    # The decrement alone, not blurred by friction: over half a period, or over two.
+    # The decrement alone, without friction: over half a period, or over two.
     _decrement("half_decrement", 0.5),
     _decrement("twice_decrement", 2.0),
-    # A column headed in Hz that holds rad/s, and the other way round.
+    # A column headed Hz that holds rad/s, or vice versa.
     _reduced("hz_for_rad_s", "reduced_radians", 1 / TURN, of="frequencies of rows"),
     _reduced("hz_for_rad_s", "reduced_hertz", TURN, of="frequencies of rows"),
     _reduced("peak_to_peak", "reduced_twice", 2.0, of="ratios of rows"),

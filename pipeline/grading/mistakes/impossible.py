@@ -1,4 +1,4 @@
-"""What no real chain of carts can do, whatever the data: signs and orders of reported numbers."""
+"""Find numbers that no real chain of carts can have, by their signs and order."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ class BrokenOrder:
 
     @property
     def is_of_gains(self) -> bool:
-        """Whether it is about how far carts are moved by a constant input."""
+        """Return whether it concerns static gains."""
         return read_name(self.lesser).is_gain
 
     @property
     def is_plain(self) -> bool:
-        """Whether everybody sees it: of gains or resonances; nulls and single carts need thought.
+        """Return whether it is obvious, as for gains or resonances, not nulls or single carts.
 
-        There the recordings' own value of the one number that is off is the better help.
+        For those, the recordings' own value of the wrong number helps more.
         """
         return self.is_of_gains or all(read_name(name).is_mode for name in self.names)
 
@@ -68,7 +68,7 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
     """Return the orders that a table breaks by more than rounding and honest error."""
-    # Fitted numbers are good to some percent; first estimates are read off a plot.
+    # Fitted numbers are good to a few percent; first estimates are read off a plot.
     slack = 1.2 if initial else 1.1
     heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []

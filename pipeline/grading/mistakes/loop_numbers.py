@@ -1,4 +1,4 @@
-"""What reported gains and prefilter do on a chain: stable, overshoot, settling, static gain."""
+"""Simulate reported gains on a chain: stability, overshoot, settling time, static gain."""
 
 import math
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
 
-_SAMPLE_TIME = 0.00884  # s, of the ECP controller, where none is stated
-_HORIZON = 6.0  # times the settling time asked for
+_SAMPLE_TIME = 0.00884  # s, of the ECP controller, the default
+_HORIZON = 6.0  # times the required settling time
 _MOST_SAMPLES = 60_000
 _BLOWN_UP = 1e6  # times the reference
 
@@ -24,7 +24,7 @@ class LoopNumbers:
     ----------
     poles : continuous equivalents, rad/s.
     overshoot : percent; settling_time : s, None if it does not settle in view.
-    prefilter : one over the loop's static gain: what makes the steady state right.
+    prefilter : reciprocal of the loop's static gain, which makes the steady state right.
     """
 
     stable: bool
@@ -37,7 +37,7 @@ class LoopNumbers:
 def loop_numbers(
     chain: Chain, gains: Array, *, cart: int, settling: float, sample_time: float | None
 ) -> LoopNumbers | None:
-    """Return what gains (2n,) do on a chain; None where the numbers run over."""
+    """Return the loop that gains (2n,) give on a chain; None on numerical overflow."""
     T = sample_time or _SAMPLE_TIME
     row, size = 2 * (cart - 1), 2 * chain.n
     with np.errstate(all="ignore"):
@@ -56,7 +56,7 @@ def loop_numbers(
         poles = np.asarray(np.log(z) / T, dtype=np.complex128)
         stable = bool(np.abs(z).max() < 1)
         samples = int(_HORIZON * settling / T) + 2
-        stride = math.ceil(samples / _MOST_SAMPLES)  # a fast controller is looked at now and then
+        stride = math.ceil(samples / _MOST_SAMPLES)  # for fast controllers
         count = math.ceil(samples / stride)
         y = _step(*_together(loop, gamma / static[row], stride), row=row, count=count)
     overshoot, settles = np.inf, np.nan

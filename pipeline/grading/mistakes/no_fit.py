@@ -1,4 +1,4 @@
-"""Final estimates copied from the initial ones: too many coincidences for a fit."""
+"""Find final estimates that were copied from the initial ones."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -12,10 +12,10 @@ from pipeline.submission import Reported
 
 
 def copied_final(reported: Reported, *, references: References) -> list[str]:
-    """Return the final estimates that stand in the initial table too, if that is no coincidence.
+    """Return the final estimates equal to the initial ones, if this is not a coincidence.
 
-    The numbers of a cart alone may honestly be taken over, so those that only a fit can give
-    must be among the copied. An initial damping that is the usual guess tells most. Tables of
+    Numbers of a single cart may honestly be kept, so the copied ones must include numbers that only
+    a fit can give. A copy of the usual guess of a damping is the strongest evidence. Tables with
     single digits agree anyway.
     """
     both = [name for name in reported.final if name in reported.initial]
@@ -31,23 +31,22 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < 3e-3 else []  # rarely does a fit agree so
+    return same if chance < 3e-3 else []  # a fit rarely agrees by chance
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
-    """Return how likely a fit gives a number again, digit for digit.
+    """Return the probability that a fit reproduces a number digit for digit.
 
-    Where the first estimate was right to its last digit already that is no wonder, and the less of
-    one the fewer digits are typed.
+    It is high if the first estimate was right to its last digit, and if few digits were typed.
     """
     if not typed:
         return 1.0
     damping = read_name(name).is_damping
     half = half_digit(typed) / abs(Fraction(typed))
-    # How far the two estimates of a number usually lie apart: less where there is no doubt of it.
+    # Usual difference between the two estimates of a number, smaller for certain ones.
     apart, surprise = 0.15 if damping else 0.01, 0.0
     if reference is not None and reference.low > 0:
-        # A single digit stands for more than what grading excuses of it.
+        # Rounding to a single digit is more than grading excuses.
         hidden = half - rounding(typed) / abs(Fraction(typed))
         off = max(float(percent_off(typed, reference, sigmas=limits.SIGMAS) / 100 - hidden), 0.0)
         if reference.within(1.05 if damping else 1.01):
@@ -55,7 +54,7 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
             if off == 0:
                 return 1.0
         measured = not damping and not read_name(name).is_by_eye
-        # One measured further off is wrong by a slip, maybe in both tables; some fit badly.
+        # A larger error is a mistake, perhaps in both tables; some students fit badly.
         if not measured or off <= 0.2:
             surprise = min(0.5 * (off / apart) ** 2, 3.0)
     # A normal difference has the density 1/√(4π) at zero.

@@ -1,7 +1,7 @@
-"""Amplitude ratios that students reduced themselves, against what their own dwells say.
+"""Compare amplitude ratios that students reduced themselves with their own dwells.
 
-A table stands in for dwells, so a slip in it goes unseen into every number that is fitted to it.
-Where the dwells are handed in too they tell; else the steps and decays do, by the fit's numbers.
+A table replaces dwells, so a mistake in it enters every number fitted to it. The dwells reveal it
+if they are submitted too; otherwise steps and decays do, by comparison with the fit.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from pipeline.results import Analysis, SinePoint
 
 @dataclass(frozen=True, kw_only=True)
 class _Rows:
-    """The rows of the table that a dwell stands for, and what that gives; each (n,)."""
+    """Rows of the table with a matching dwell, and the dwell's values; each (n,)."""
 
     cart: Array
     reported: Array
@@ -29,7 +29,7 @@ class _Rows:
 
 
 def diagnose_reduced(analysis: Analysis) -> list[Flag]:
-    """Return a flag where the reduced table is not what the dwells, or steps and decays, say."""
+    """Return a flag if the reduced table contradicts the dwells, or the steps and decays."""
     if not analysis.tables:
         return []
     if not analysis.sine_points:
@@ -44,12 +44,12 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
-    off = ratio > np.log(1.3)  # wrong by an unknown slip
+    off = ratio > np.log(1.3)  # wrong by an unknown mistake
     return [_flag("data_problem", "reduced_off", rows)] if off else []
 
 
 def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
-    """Match rows with dwells, the table's frequencies multiplied; None where few match."""
+    """Match rows with dwells after scaling the frequencies; None if few match."""
     matched: list[tuple[int, float, SinePoint]] = []
     for table in analysis.tables:
         points = [
@@ -60,7 +60,7 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
             if near:
                 best = min(near, key=lambda p: abs(p.omega - omega))
                 matched.append((table.cart, float(ratio), best))
-    if len(matched) < 4:  # fewer single nothing out
+    if len(matched) < 4:  # fewer rows cannot identify a mistake
         return None
     return _Rows(
         cart=np.array([cart for cart, _, _ in matched]),
@@ -75,14 +75,14 @@ def _is_clear(point: SinePoint, analysis: Analysis) -> bool:
 
 
 def _share(reported: Array, predicted: Array) -> float:
-    """Return the share of the rows that are what is predicted."""
+    """Return the share of the rows that match the prediction."""
     with np.errstate(all="ignore"):
         return float(np.mean(np.abs(np.log(reported / predicted)) <= MISREAD_RATIO))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Slip:
-    """A slip, the sentence that says it, and what it makes of the rows."""
+    """A mistake, its sentence, and the rows that it predicts."""
 
     code: Code
     said: str
@@ -91,7 +91,7 @@ class _Slip:
 
 
 def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
-    """Yield all that may have gone wrong with the whole table."""
+    """Yield all known mistakes that affect the whole table."""
     for row in [row for row in FACTORS if row.of == "frequencies of rows"]:
         moved = _rows(analysis, stretch=row.factor)
         if moved is not None:
@@ -131,7 +131,7 @@ def _flag(code: Code, said: str, rows: _Rows) -> Flag:
 
 
 def _against_time_records(analysis: Analysis) -> list[Flag]:
-    """Return the flags that the fit to the table, against steps and decays, gives rise to."""
+    """Return flags from comparing the fit to the table with steps and decays."""
     if not is_explained(analysis):
         return []
     ratios: dict[str, list[float]] = {"fitted gains": [], "fitted frequencies": []}

@@ -22,14 +22,14 @@ from pipeline.submission import ReportedStateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]
 
-_NAMED = 3  # carts whose chain the named parameters give back
+_NAMED = 3  # up to this many carts the named parameters determine the chain
 _MODES = ("omega_a", "omega_b", "omega_c")
 _NULLS = ("omega_x", "omega_y")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateMatrices:
-    """What [A B] may rightly be, (2n, 2n + 1), NaN where unknown, and how vaguely that is known."""
+    """Acceptable [A B], (2n, 2n + 1), NaN for unknown entries, with their uncertainty."""
 
     right: Array
     slack: Array
@@ -37,9 +37,9 @@ class StateMatrices:
 
 @dataclass(frozen=True, kw_only=True)
 class MatrixEntry:
-    """One entry of A or B: as typed, what it may be, and how far it is off (percent).
+    """One entry of A or B: as typed, acceptable values, and error (percent).
 
-    `error` is what is left beyond the slack of the models, `bare` what it is without.
+    `error` is the error beyond the uncertainty of the models, `bare` the error without it.
     """
 
     name: str
@@ -63,9 +63,9 @@ class MatrixEntry:
 def compare_entries(
     space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int
 ) -> list[MatrixEntry]:
-    """Compare every entry with what the right A and B may be.
+    """Compare every entry with the acceptable A and B.
 
-    An entry is as good as its best match: an A that follows from a wrong table is right.
+    An entry counts by its best match: an A that follows from a wrong table is right.
     """
     kinds, entries = _kinds(n), []
     for (i, j), number in _matrix(space, n).items():
@@ -100,14 +100,14 @@ def state_models(
 ) -> list[StateMatrices]:
     """Return [A B] of the reference and of the student's tables.
 
-    A table gives a cart's own terms directly; its couplings only as differences of large numbers,
-    so that the errors of a table, of which there are always some, are carried through. Those of
-    the reference are as vague: a student's come from a table like it.
+    A table gives a cart's own terms directly, but its couplings only as differences of large
+    numbers, so the errors of the table are propagated. The reference gets the same uncertainty,
+    because a student's entries come from a similar table.
 
     Parameters
     ----------
-    rounding : by parameter, how far it may have moved a number of the table, relative.
-    known : the references of the final table: of dampings they tell more than the chain.
+    rounding : by parameter, the relative error that rounding may have caused.
+    known : the references of the final table, which know more about dampings than the chain.
     """
     models = []
     reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
@@ -129,7 +129,7 @@ def state_models(
 def _put_dampings(
     right: Array, slack: Array, values: Mapping[str, float], *, known: Mapping[str, Reference]
 ) -> None:
-    """Put in each cart's own damping, anywhere between what was measured of it; NaN if nothing."""
+    """Insert the measured range of each cart's own damping; NaN without a measurement."""
     n = right.shape[0] // 2
     for i in range(n):
         omega, zeta = _own_names(i, n)
@@ -149,7 +149,7 @@ def _own_names(i: int, n: int) -> tuple[str, str]:
 
 
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
-    """Return the [A B] that a table's transfer functions imply; None where they imply no chain."""
+    """Return the [A B] implied by a table's transfer functions; None if they imply no chain."""
     chain = own_chain(values, n=n)
     return None if chain is None else _matrices(chain)
 
@@ -172,9 +172,9 @@ def _direct(values: Mapping[str, float], n: int) -> Array:
 
 
 def _by_own_frequencies(values: Mapping[str, float], n: int) -> Array | None:
-    """Return the [A B] of two or three carts from each cart's own frequency as it was found.
+    """Return the [A B] of two or three carts from each cart's own reported frequency.
 
-    The transfer functions alone give those once more; the couplings are then other differences.
+    The transfer functions alone also give these frequencies, but different couplings.
     With T_i the square of all frequencies of carts i to n alone, T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
     """
     if n not in (2, 3) or not {*parameter_names(n)} <= values.keys():
@@ -200,7 +200,7 @@ def _spread(
     rounding: Mapping[str, float],
     n: int,
 ) -> Array:
-    """Return how far the errors of a table's numbers move the [A B] made of them."""
+    """Return the uncertainty of [A B] due to errors of a table's numbers."""
     variance = np.zeros_like(right)
     for name, value in values.items():
         error = np.hypot(
@@ -214,9 +214,9 @@ def _spread(
 
 
 def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
-    """Return the chain of n carts that a student's final table implies; None where it has none.
+    """Return the chain of n carts implied by a student's final table, or None.
 
-    Without one gain a table of three carts reads as one of two.
+    Without one of its gains, a table of three carts looks like one of two.
     """
     try:
         with np.errstate(all="ignore"):
@@ -261,7 +261,7 @@ def _entry_error(typed: Decimal, right: float, kind: Kind, *, slack: float = 0.0
     return percent_off(typed if right > 0 else -typed, reference, sigmas=0.0)
 
 
-# -------------------------------------------------------------------- what it comes to
+# ------------------------------------------------------------------ harmful models
 
 Harm = Literal["unstable", "wrong_way"]
 
@@ -274,11 +274,11 @@ def model_harm(
     n: int,
     tied: bool,
 ) -> Harm | None:
-    """Return what the wrong entries of a model predict that carts on springs never do, if anything.
+    """Return the impossible behaviour that wrong entries of a model predict, if any.
 
-    It grows without end, or a positive input drives a cart to the negative side. Imprecise entries
-    are taken as right: in a stiff chain honest errors could do the same. Another order of the
-    states is no harm.
+    The motion grows without limit, or a positive input drives a cart to the negative side.
+    Imprecise entries count as right, because in a stiff chain honest errors could have the same
+    effect. A different order of the states is harmless.
 
     Parameters
     ----------
@@ -302,15 +302,15 @@ def model_harm(
 
 def _grows(A: Array) -> bool:
     found = np.linalg.eigvals(A)
-    # Less is what a computer leaves of a free body.
+    # Smaller eigenvalues of a free body are rounding.
     return bool(found.real.max() > 1e-6 * float(np.abs(found).max()))
 
 
 def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
-    """Return whether a positive input drives cart 1 off, or holds a cart, on the negative side."""
+    """Return whether a positive input drives or holds a cart on the negative side."""
     orders = [np.arange(2 * n), *(np.argsort(order) for _, order in _reordered(n))]
     meant = [A[np.ix_(o, o)] for o in orders]
-    # In the order that is meant each position is followed by its velocity.
+    # In the required order each position is followed by its velocity.
     kinematic = np.eye(2 * n)[1::2]
     known = [i for i, one in enumerate(meant) if np.allclose(one[0::2], kinematic)] or [0]
     ways = [_drives_back(meant[i], b, tied=tied) for i in known for b in (B[orders[i]], B)]
@@ -336,10 +336,10 @@ def diagnose_state_space(
     models: Sequence[StateMatrices],
     n: int,
 ) -> list[Flag]:
-    """Return a flag where entries are wrong, with the slip that explains them all, if any.
+    """Return a flag if entries are wrong, with the mistake that explains all of them, if any.
 
-    A known slip that makes all of A and B is evidence even where a table is too vague for one
-    entry alone to be.
+    A known mistake that explains all of A and B is evidence even if the table is too vague to judge
+    single entries.
     """
     suspects = [entry for entry in entries if entry.suspect]
     slip = _slip(space, models=models, n=n) if suspects else ""
@@ -366,7 +366,7 @@ def diagnose_state_space(
 
 
 def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
-    """Return the first known slip that turns the right [A B] into the one reported, or ""."""
+    """Return the first known mistake that turns the right [A B] into the reported one, or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
     A = {at: number for at, number in typed.items() if at[1] < 2 * n}
     B = {at: number for at, number in typed.items() if at[1] == 2 * n}
@@ -375,7 +375,7 @@ def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int)
             columns = [*order, 2 * n]
             slipped = model[np.ix_(order, columns)]
             of_states: list[list[Kind]] = [[kinds[i][j] for j in columns] for i in order]
-            # Who orders the states anew in A may have left B as it was.
+            # A student may have reordered the states in A but not in B.
             if _met(typed, slipped, of_states) or (
                 _met(A, slipped, of_states) and _met(B, model, kinds)
             ):
@@ -389,7 +389,7 @@ def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int)
 def _met(
     typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
 ) -> bool:
-    """Whether all typed entries are those of a slipped [A B]."""
+    """Return whether all typed entries match an [A B] with a mistake."""
     return all(
         _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= limits.EXPLAINED[kinds[i][j]]
         for (i, j), number in typed.items()
@@ -397,7 +397,7 @@ def _met(
 
 
 def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
-    """Yield (in words, which state stands where)."""
+    """Yield (words, order of the states)."""
     if n > 1:
         yield WORDS.text("positions_first"), [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
         back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
@@ -405,7 +405,7 @@ def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
 
 
 def _changed(model: Array, n: int) -> Iterator[tuple[str, Array]]:
-    """Yield (in words, the [A B] it gives)."""
+    """Yield (words, the resulting [A B])."""
     own = [(2 * i + 1, 2 * i) for i in range(n)]
     dampings = [(2 * i + 1, 2 * i + 1) for i in range(n)]
     pairs = [((2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)) for i in range(n - 1)]

@@ -1,4 +1,4 @@
-"""Where a cart turns after an edge of a step: what may be read for the level it settles at."""
+"""Turning points of a cart after a step, which may be mistaken for its settled level."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from pipeline.names import read_name
 from pipeline.results import Analysis, Record, StepGain
 
 _TURNS = 3  # the peak, the trough after it, the second peak
-_DIGITS = 2  # to which two edges of one size agree
+_DIGITS = 2  # digits to which edges of the same size agree
 
-Edge = tuple[int, float]  # which of the record, and how large
+Edge = tuple[int, float]  # number in the recording, and size
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -22,32 +22,32 @@ class StepTurns:
 
     Attributes
     ----------
-    by_edge : for every kind of edge, of each repeat where the cart turns first, next, after that.
-    furthest : … how far it ever goes: where two motions beat, that is not where it turns first.
+    by_edge : for every kind of edge and repeat, the first three turning points.
+    furthest : the largest displacement; if two motions beat, it is not the first turning point.
     """
 
     by_edge: dict[Edge, list[list[float]]]
     furthest: dict[Edge, list[float]]
 
     def mean_peak(self) -> Reference | None:
-        """Return the mean over all edges of where the cart turns first; None without any."""
+        """Return the mean first turning point over all edges; None without edges."""
         peaks = [one[0] for repeats in self.by_edge.values() for one in repeats]
         return _spread([float(np.mean(peaks))]) if peaks else None
 
     def turn(self, edge: Edge, number: int) -> Reference | None:
-        """Return a turning point after one kind of edge; None where one up to it is not real."""
+        """Return a turning point after one kind of edge; None if any up to it is not real."""
         repeats = [one for one in self.by_edge.get(edge, ()) if len(one) > number]
         if not repeats or min(min(one[: number + 1]) for one in repeats) <= 0:
             return None
         return _spread([one[number] for one in repeats])
 
     def peak(self, edge: Edge) -> Reference:
-        """Return where the cart peaks after one kind of edge, at first or furthest."""
+        """Return the first or the largest peak after one kind of edge."""
         return _spread([*(repeat[0] for repeat in self.by_edge[edge]), *self.furthest[edge]])
 
 
 def step_turns(name: str, analysis: Analysis) -> StepTurns:
-    """Return where the cart of a gain (`K` or `K_i`) turns in the steps."""
+    """Return the turning points in the steps of the cart of a gain (`K` or `K_i`)."""
     cart = read_name(name).cart or 1
     records = {record.id: record for record in analysis.records}
     found: dict[Edge, list[list[float]]] = {}
@@ -68,7 +68,7 @@ def _spread(values: Sequence[float]) -> Reference:
 
 
 def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[float]]]:
-    """Yield every edge, how far the cart is moved after it per unit of input, where it turns."""
+    """Yield every edge with the cart's displacement per unit of input and its turning points."""
     y = record.position(step.cart)
     for number, edge in enumerate(step.edges):
         change = edge.u_after - edge.u_before
@@ -77,7 +77,7 @@ def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[f
         level = (edge.level_after - edge.level_before) / change
         turns, side, rest = [], 1.0, moved
         while rest.size and len(turns) < _TURNS:
-            # Up to where it crosses its level again, its furthest point is where it turns.
+            # Until it crosses its level again, its furthest point is the turning point.
             beyond = side * (rest - level) > 0
             first = int(np.argmax(beyond)) if beyond.any() else rest.size
             back = np.flatnonzero(~beyond[first:])

@@ -1,4 +1,4 @@
-"""The remarks on the tables of parameters, each with the number that tells most."""
+"""The remarks on the parameter tables, each with its most telling number."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -19,7 +19,7 @@ OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 def specific_flags(
     explained: Sequence[ExplainedNumbers], tables: Mapping[Label, Table], references: References
 ) -> list[Flag]:
-    """Return one flag a code, over both tables; the first number stands for all in the text."""
+    """Return one flag per code for both tables; the text shows the first number."""
     flags = []
     for code in CODES:
         mine = [one for one in explained if code in one.mistake.codes]
@@ -45,7 +45,7 @@ def specific_flags(
             evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
             message += WORDS.text("or_else", help=first.rival.help(typed, reference))
         other = OTHER[first.table]
-        if any(one.table == other for one in mine):  # who mends one table leaves the other else
+        if any(one.table == other for one in mine):  # else a student might fix only one table
             evidence["also_in"] = other
             message += WORDS.text(f"also_{other}")
         flags.append(Flag(code=code, parameters=tuple(names), message=message, evidence=evidence))
@@ -55,7 +55,7 @@ def specific_flags(
 def off_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
 ) -> Flag:
-    """Return the flag of numbers that no known mistake explains, by the one furthest off."""
+    """Return the flag of unexplained wrong numbers, showing the largest error."""
 
     def error(name: str) -> float:
         return float(percent_off(table[name], known[name], sigmas=limits.SIGMAS)) / limit(
@@ -104,7 +104,7 @@ def impossible_flag(
 
 
 def copied_flag(reported: Reported, copied: Sequence[str], references: References) -> Flag:
-    """Return the flag of final numbers that are the initial ones, by the one furthest off."""
+    """Return the flag of copied final numbers, showing the largest error."""
 
     def error(name: str) -> float:
         known = references.final.get(name)
@@ -120,7 +120,7 @@ def copied_flag(reported: Reported, copied: Sequence[str], references: Reference
 
 
 def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -> Flag:
-    """Return the flag of numbers (how much, name) that the two tables contradict each other in."""
+    """Return the flag of numbers (difference, name) that differ between the two tables."""
     _, worst = apart[0]
     initial, final = reported.initial[worst], reported.final[worst]
     return Flag(
@@ -139,7 +139,7 @@ def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) ->
 
 
 def limit(name: str, table: str) -> float:
-    """Return from how many percent on a reported number is worth a remark."""
+    """Return the error, in percent, above which a reported number gets a remark."""
     if read_name(name).is_damping:
         return limits.OFF_DAMPING
     if table == "final":

@@ -1,4 +1,4 @@
-"""Name the mistake behind a wrong number, where one reproduces it and the others do not."""
+"""Name the mistake behind a wrong number, if only one reproduces it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,10 +28,10 @@ from pipeline.submission import Reported
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """The flags of the tables, and the final table with what is off in it put right.
+    """The flags of the tables, and the final table with known mistakes corrected.
 
-    `named`: by table, the numbers that a known mistake explains. `possible`: what is left of the
-    final table once it is put right may be that of real carts.
+    `named`: by table, the numbers that a known mistake explains. `possible`: the corrected final
+    table may belong to real carts.
     """
 
     flags: tuple[Flag, ...]
@@ -47,7 +47,7 @@ def diagnose_tables(
 
     Parameters
     ----------
-    copied : the final estimates that are the initial ones, as `copied_final` finds them.
+    copied : final estimates equal to the initial ones, from `copied_final`.
     """
     tables: dict[Label, Table] = {"initial": reported.initial, "final": reported.final}
     judged: dict[Label, _Judged] = {
@@ -78,9 +78,9 @@ def diagnose_tables(
         if names
     ]
     named = {name for flag in flags for name in flag.parameters}
-    # A mistake in one of the tables parts them; also where the recordings give no number.
+    # A mistake in one table makes them differ, also for numbers that the recordings do not give.
     symbols = {read_name(name).symbol for one in explained for name in one.names}
-    # On a bench that is not linear an estimate from large motions and one from small ones differ.
+    # On a nonlinear bench, estimates from large and small motions differ.
     apart = [
         (size, name)
         for size, name in _disagreements(reported, references, blurred=True)
@@ -99,7 +99,7 @@ def diagnose_tables(
 
 
 def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]:
-    """Return the mistakes of each table: what one leaves open those of the other may decide."""
+    """Return the mistakes of each table; one table may decide doubts of the other."""
     alone = {label: one.explain() for label, one in judged.items()}
     return {
         label: one.explain(believed=alone[OTHER[label]].codes)
@@ -115,10 +115,10 @@ class _Judged:
 
     Attributes
     ----------
-    errors : of every number that has a reference and is not flagged already, percent.
-    suspect : enough off, or in enough doubt, to look for a known mistake.
-    unordered : gains that may be right one by one, and are not in their order.
-    flags : what is wrong whatever the recordings say.
+    errors : percent, of every number with a reference and without a flag.
+    suspect : wrong or doubtful enough to look for a known mistake.
+    unordered : gains that may each be right, but are out of order.
+    flags : problems that do not depend on the recordings.
     """
 
     label: Label
@@ -132,7 +132,7 @@ class _Judged:
     flags: list[Flag]
 
     def broken_laws(self, off: set[str]) -> list[BrokenOrder]:
-        """Return the laws it breaks by numbers that are off and that nothing explains."""
+        """Return the laws that it breaks by unexplained wrong numbers."""
         return [
             law
             for law in self.laws
@@ -140,7 +140,7 @@ class _Judged:
         ]
 
     def explain(self, *, believed: frozenset[Code] = frozenset()) -> Explanation:
-        """Return the mistakes that explain what is off."""
+        """Return the mistakes that explain the wrong numbers."""
         off = [n for n in self.errors if n in self.suspect or n in self.unordered]
         return explain(
             self.table,
@@ -160,7 +160,7 @@ def _judge(
     analysis: Analysis,
     copied: Sequence[str],
 ) -> _Judged:
-    """Hold one table against the recordings."""
+    """Compare one table with the recordings."""
     table: Table = getattr(reported, label)
     known: dict[str, Reference] = getattr(references, label)
     impossible = not_positive(table)
@@ -180,14 +180,14 @@ def _judge(
     laws = broken_orders(table, initial=label == "initial")
     unordered = _unordered(laws, label, reported, suspect=suspect) & errors.keys()
     mistakes = []
-    if suspect or unordered:  # else there is nothing to explain
+    if suspect or unordered:  # otherwise there is nothing to explain
         there = {name: reference for name, reference in known.items() if name in table}
         mistakes = known_mistakes(there, analysis, reported)
     if label == "final":
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
-    if any(law.is_of_gains for law in laws):  # a plain fact goes before a guess at one of them
+    if any(law.is_of_gains for law in laws):  # an obvious fact comes before a guess
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
         label=label,
@@ -205,7 +205,7 @@ def _judge(
 def _unordered(
     laws: Sequence[BrokenOrder], label: Label, reported: Reported, *, suspect: Sequence[str]
 ) -> frozenset[str]:
-    """Return the gains that are not in their order and not as in the other table."""
+    """Return the gains that are out of order and differ from the other table."""
     other: Table = getattr(reported, OTHER[label])
     table: Table = getattr(reported, label)
     gains = [law for law in laws if law.is_of_gains and not set(law.names).isdisjoint(suspect)]
@@ -218,7 +218,7 @@ def _unordered(
 
 
 def _agrees(final: Decimal, references: References, name: str) -> bool:
-    """Whether a final number is what the recordings say."""
+    """Return whether a final number agrees with the recordings."""
     known = references.final.get(name)
     return known is not None and percent_off(final, known, sigmas=limits.SIGMAS) == 0
 
@@ -232,7 +232,7 @@ def _near(a: Decimal, b: Decimal) -> bool:
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
-    """Whether a mistake can be in a final table: one of a decay or a step only if taken over."""
+    """Return whether a final table can have a mistake; for decays and steps only if copied."""
     if not mistake.from_time_records:
         return True
     both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
@@ -242,7 +242,7 @@ def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
 def _corrected(
     final: Table, explained: Sequence[ExplainedNumbers], known: Mapping[str, Reference]
 ) -> dict[str, float]:
-    """Return the final table as it would be without the mistakes found in it."""
+    """Return the final table without the mistakes found in it."""
     corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
     for one in explained:
         inside = [n for n in one.names if n in one.mistake.predicted]
@@ -254,9 +254,9 @@ def _corrected(
 def _disagreements(
     reported: Reported, references: References, *, blurred: bool
 ) -> list[tuple[float, str]]:
-    """Return (how much, name) of what the tables contradict each other in, the worst first.
+    """Return (difference, name) of contradictions between the tables, the worst first.
 
-    With `blurred`, two numbers may be as far apart as the readings of the recordings are.
+    With `blurred`, two numbers may differ as much as the readings of the recordings.
     """
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():
@@ -268,7 +268,7 @@ def _disagreements(
         if name in references.initial and name in references.final:
             if references.final[name].low <= 0:
                 continue
-            # The data's own two estimates may differ as much.
+            # The two estimates from the data may differ as much.
             ratio = references.initial[name].value / references.final[name].value
             bounds.append(float(final) * ratio)
             if blurred:

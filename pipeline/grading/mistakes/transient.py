@@ -1,4 +1,4 @@
-"""Amplitudes read before the steady state, and the table a fit to them gives."""
+"""Amplitudes read before the steady state, and the table fitted to them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal
@@ -20,7 +20,7 @@ Reading = Callable[[Record, Array], float]
 def transient_fits(
     analysis: Analysis, table: Mapping[str, Decimal], known: Mapping[str, Reference]
 ) -> list[Mistake]:
-    """Return what fits to the amplitudes of the transient give, one for each way to read them."""
+    """Return fits to amplitudes of the transient, one for each way to read them."""
     runs = {r.id: r for r in analysis.records if r.kind == "sine" and r.u is not None}
     if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.bench.n:
         return []
@@ -38,9 +38,9 @@ def transient_fits(
                 Mistake(
                     codes=("transient_used",),
                     predicted=moved,
-                    tolerance=0.06,  # a student's fit weighs the points its own way
+                    tolerance=0.06,  # a student's fit may weigh the points differently
                     said=("early",),
-                    # A wrong response has no exact fit, so not every number is met.
+                    # A wrong response has no exact fit, so not every number matches.
                     least=max(2, round(0.65 * len(asked))),
                     table_wide=True,
                     from_time_records=True,
@@ -50,7 +50,7 @@ def transient_fits(
 
 
 def _is_new(name: str, ratio: float) -> bool:
-    # Moved by less, the right number would be met as well.
+    # A smaller change would also match the right number.
     return abs(np.log(ratio)) > np.log1p(0.5 if read_name(name).is_damping else 0.12)
 
 
@@ -71,7 +71,7 @@ def _half_swing(record: Record, y: Array, *, cycles: float) -> float:
 def _refit(
     analysis: Analysis, runs: Mapping[str, Record], reading: Reading
 ) -> dict[str, Reference]:
-    """Return the parameters fitted to amplitudes so read; none where the fit fails."""
+    """Return the parameters fitted to such amplitudes; empty if the fit fails."""
     responses = []
     for response in analysis.frequency_responses:
         points = [

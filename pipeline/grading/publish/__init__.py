@@ -1,1 +1,1 @@
-"""What a class is shown: feedback, the class page, exports, surveys."""
+"""Output for a class: feedback, class page, exports, surveys."""

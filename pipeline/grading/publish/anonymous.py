@@ -1,4 +1,4 @@
-"""Results without names, the key that reveals them, and commands that name a team as they do."""
+"""Results without names, the key that reveals them, and commands that accept pseudonyms."""
 
 import hashlib
 import re
@@ -16,18 +16,18 @@ from pipeline.output import csv_text
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
-_SHORTEST = 6  # letters: a thousand submissions rarely need one more
+_SHORTEST = 6  # letters: a thousand submissions rarely need more
 STRANGER = "another submission"
 _ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
 
 
 def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
-    """Return a name for each submission that says nothing about it.
+    """Return a pseudonym for each submission.
 
     Parameters
     ----------
-    first_keys : by submission, the hash of what was first handed in: whoever has not seen that
-        cannot work the name out, and a later hand-in does not change it.
+    first_keys : by submission, the hash of the first version. A stranger cannot compute the
+        pseudonym from it, and later versions do not change it.
     """
     hashes = {
         name: b32encode(hashlib.sha256(f"anonymous {key}".encode()).digest()).decode().lower()
@@ -40,21 +40,21 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
 
 
 def pseudonyms_in(book: Gradebook) -> dict[str, str]:
-    """Return the name that stands in for each submission of a class list."""
+    """Return the pseudonym of each submission of a class list."""
     return pseudonyms({entry.submission: entry.first_key for entry in book.entries()})
 
 
 def is_pseudonym(name: str) -> bool:
-    """Whether a name looks like one that stands in for another."""
+    """Return whether a name looks like a pseudonym."""
     return name.startswith(_PREFIX)
 
 
 def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
-    """Return the grade without authors, and without the names of submissions.
+    """Return the grade without authors and names of submissions.
 
-    Those stand in the flag for shared data, and before the files of a submission in the reason why
-    it could not be graded; platforms put the student's name into that of an archive. What students
-    call their runs and files stays.
+    Names occur in the flag for shared data, and before file names in the reason why a submission
+    could not be graded; platforms put the student's name into the name of an archive. The students'
+    own names of runs and files stay.
     """
     hidden = _hidden_names(grade, names) | {
         "flags": tuple(
@@ -76,7 +76,7 @@ def _hidden_names(grade: Grade | Line, names: Mapping[str, str]) -> dict[str, ob
 
 
 def hidden_reason(reason: str, submission: str, own: str) -> str:
-    """Return why a submission could not be graded, with `own` for its name."""
+    """Return the reason why a submission could not be graded, with `own` as its name."""
     if not reason:
         return ""
     name = re.escape(submission)
@@ -85,7 +85,7 @@ def hidden_reason(reason: str, submission: str, own: str) -> str:
 
 
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
-    """Return a flag for shared data that calls submissions by other names."""
+    """Return a flag for shared data with pseudonyms."""
     others = list(dict.fromkeys(names.get(o, STRANGER) for o in flag.evidence["submissions"]))
     recordings = [
         {**recording, "submission": names.get(recording["submission"], STRANGER)}
@@ -100,20 +100,20 @@ def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
 
 
 def key_text(names: Mapping[str, str], authors: Mapping[str, tuple[str, ...]]) -> str:
-    """Return the key as CSV: for each name that stands in for one, whose it is."""
+    """Return the key as CSV: the owner of each pseudonym."""
     rows = sorted((names[name], name, " ".join(authors[name])) for name in names)
     return csv_text(("anonymous", "submission", "authors"), rows)
 
 
 def meant(book: Gradebook, team: str) -> str:
-    """Return the submission that a name stands in for; any other name as it is."""
+    """Return the submission of a pseudonym; any other name is returned unchanged."""
     if not is_pseudonym(team):
         return team
     return {shown: name for name, shown in pseudonyms_in(book).items()}.get(team, team)
 
 
 def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
-    """Return what to call a team, and its history without the name it was not asked by.
+    """Return a team's name as it was asked for, and its history under that name.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
 
 
 def renamed_events(events: Sequence[Event], name: str, shown: str) -> list[Event]:
-    """Return a history in which a submission is called otherwise."""
+    """Return a history with another name for the submission."""
     return [replace(event, text=_renamed(event.text, name, shown)) for event in events]
 
 

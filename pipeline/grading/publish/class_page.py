@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _OUTCOMES = ("pass", "partial", "fail", "skip")
-_NAMED = 8  # submissions named beside a mistake
+_NAMED = 8  # submissions named per mistake
 
 
 def class_page(
@@ -101,7 +101,7 @@ def _board(lines: Sequence[Line], points: "pd.Series", rubric: Rubric) -> list[B
 
 
 def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]:
-    """Return what somebody should decide: wrong springs, failures, authors in several teams."""
+    """Return the questions for the instructor: springs, failures, authors in several teams."""
     failed = [line for line in lines if line.status == "failed"]
     blocks: list[Block] = []
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
@@ -195,7 +195,7 @@ def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
 
 
 def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster]) -> list[Block]:
-    """Return who shares recordings with whom, a cluster after the other."""
+    """Return the shared recordings, cluster by cluster."""
     if not clusters:
         return []
     here = {line.submission for line in lines}
@@ -209,7 +209,7 @@ def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster
 
 
 def _listed(links: Sequence[Span]) -> list[str | Span]:
-    """Return links with commas between them, those beyond the first few as a number."""
+    """Return links separated by commas; beyond the first few, only their number."""
     text: list[str | Span] = [part for link in links[:_NAMED] for part in (link, ", ")][:-1]
     more = len(links) - _NAMED
     return [*text, f" and {more} more"] if more > 0 else text

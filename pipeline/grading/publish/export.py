@@ -1,7 +1,7 @@
-"""Class grades in the forms that Canvas, Moodle and Gradescope import.
+"""Export class grades in the formats of Canvas, Moodle and Gradescope.
 
-Each form is a table with a row for every student. Given the table that the platform itself exports
-(a roster), its rows and columns stay as they are and the grades are filled in.
+Each format is a table with a row for every student. If the platform's own exported table (a roster)
+is given, its rows and columns stay as they are and the grades are filled in.
 
 - Canvas: the gradebook's CSV, read by `lib/gradebook_importer.rb`: the student is found by `ID`,
   `SIS User ID` or `SIS Login ID`, the assignment by its title, or its id in brackets behind it.
@@ -32,7 +32,7 @@ from pipeline.words.text import with_symbols
 
 @dataclass(frozen=True, kw_only=True)
 class Exported:
-    """What was written, and what the person who uploads it should know."""
+    """The files written, and remarks for the person who uploads them."""
 
     files: tuple[Path, ...]
     remarks: tuple[Remark, ...]
@@ -50,14 +50,14 @@ def export(
 
     Parameters
     ----------
-    out : a folder, there or not yet; or a .csv file, which gets the table and nothing beside it.
+    out : a folder, existing or new; or a .csv file, to write only the table.
     title : of the assignment as the platform has it; default: the rubric's.
     roster : the table that the platform exports.
 
     Raises
     ------
-    ConfigError : the roster is no such table, or its grades go up to another maximum; `out` is
-        another file.
+    ConfigError : the roster is not such a table, or has another maximum grade, or `out` is another
+        kind of file.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)
@@ -77,8 +77,8 @@ def export(
         if sent:
             remarks.append(
                 Remark(
-                    text="found by their authors' ids alone; with a roster also by the number in "
-                    f"the file's name: {', '.join(sent)}"
+                    text="matched only by their authors' ids; with a roster also by the number "
+                    "in the file name: {', '.join(sent)}"
                 )
             )
     else:
@@ -94,7 +94,7 @@ def export(
 def _fill_own(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> tuple[str, list[Remark]]:
-    """Return a platform's own table with the grades in it, and what did not fit."""
+    """Return a platform's own table with the grades, and remarks on mismatches."""
     form = WORKSHEET if _has_numbers(platform, "Identifier" in roster.table) else FORMS[platform]
     there = {name: text for name, text in form.if_there.items() if name in roster.table}
     columns = {
@@ -112,7 +112,7 @@ def _fill_own(
 def _make_table(
     platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> str:
-    """Return a table as the platform imports it, made without its own."""
+    """Return a new table that the platform can import, without its own table."""
     numbered = bool(students) and all(student.number for student in students)
     form = WORKSHEET if _has_numbers(platform, numbered) else FORMS[platform]
     head = [name.format(title=title) for name in form.new]
@@ -133,12 +133,12 @@ def _make_table(
 
 
 def _has_numbers(platform: Platform, numbered: bool) -> bool:
-    """Whether it is Moodle's table of participants."""
+    """Return whether it is Moodle's table of participants."""
     return platform == "moodle" and numbered
 
 
 def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
-    """Return all that a column may say of a student, by name."""
+    """Return all values of a student for columns, by name."""
     first, _, last = student.name.partition(" ")
     return {
         "name": student.name,
@@ -159,7 +159,7 @@ def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
 
 
 def _comment(student: Student) -> str:
-    """Return the feedback in short, as the HTML that Moodle takes it for."""
+    """Return short feedback as HTML, which Moodle expects."""
     if student.undecided:
         return ""
     said = _said(student.grade, by_hand=student.by_hand)
@@ -167,7 +167,7 @@ def _comment(student: Student) -> str:
 
 
 def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
-    """Return what was lost or given by hand, and what to look at, a line each."""
+    """Return points lost or given by hand, and remarks, one line each."""
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {on_one_line(grade.reason)}"]
     lost = [

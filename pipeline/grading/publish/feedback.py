@@ -1,4 +1,4 @@
-"""The feedback to one submission: their numbers beside ours, why, and where to look."""
+"""Feedback for one submission: their numbers next to ours, reasons, and where to look."""
 
 import re
 from collections.abc import Sequence
@@ -57,7 +57,7 @@ def feedback_page(
     Parameters
     ----------
     figures : file names and SVG.
-    name : what the submission is called on the page.
+    name : the name of the submission on the page.
     """
     numbers = count(1)
     sections = [Section("summary", "Summary", tuple(_summary(grade)))]
@@ -131,7 +131,7 @@ def counted_criteria(n: int) -> str:
 
 
 def _lost(grade: Grade) -> list[Block]:
-    """Return where points were lost, most first."""
+    """Return the lost points, largest loss first."""
     lost = [c for c in grade.criteria if c.points < c.out_of]
     if not lost:
         return [paragraph(WORDS.text("earned_all_but_look" if grade.flags else "earned_all"))]
@@ -213,7 +213,7 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
 def numbers_table(
     criterion: Criterion, *, check: str, units: Units | None, numbers: count
 ) -> Table | None:
-    """Return the numbers of a criterion side by side, None where it has none."""
+    """Return the numbers of a criterion side by side; None if it has no numbers."""
     names = [
         name
         for name in dict.fromkeys((*criterion.expected, *criterion.found))
@@ -235,7 +235,7 @@ def numbers_table(
 
 
 def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table | None:
-    """Return the numbers and texts that a remark rests on, None where it rests on none."""
+    """Return the numbers and texts behind a remark, or None."""
     of = flag.evidence.get("parameter")
     found = {
         name: value
@@ -264,7 +264,7 @@ def _label(name: str, units: Units | None) -> str | tuple[Span, ...]:
 
 
 def _called(name: str) -> str:
-    """Return what a number is called; one that nobody named as it stands in grade.json."""
+    """Return the name of a number; without a name, its key in grade.json."""
     key = f"quantity_{name}"
     return WORDS.text(key) if key in WORDS.by_key else _capital(clean(name).replace("_", " "))
 
@@ -288,13 +288,13 @@ def _value(name: str, value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, Real):
         number = round(float(value), _FINEST) if name.endswith(_SHARE) else float(value)
-        # A number that was typed with fewer digits is shown as it was.
+        # A number typed with fewer digits is shown as typed.
         return min(significant(number), typeset(f"{number:.6g}"), key=len)
     return clean(value)[:200] if isinstance(value, str) else NOTHING
 
 
 def _off(name: str, found: Any, expected: Any) -> str:
-    """Return how far two numbers are apart: percentages by points, all others as a share."""
+    """Return the difference of two numbers: percentages in points, others as a share."""
     if not (_is_number(found) and _is_number(expected)):
         return NOTHING
     if name.endswith(_SHARE):
@@ -323,6 +323,6 @@ def _picture(number: int, file: str, svg: str) -> Picture:
 
 
 def alternative(svg: str) -> str:
-    """Return what a figure says of itself in words."""
+    """Return the text alternative of a figure."""
     title = _TITLE.search(svg)
     return unescape(title[1]) if title else WORDS.text("some_figure")

@@ -1,4 +1,4 @@
-"""Figures of the feedback: what was measured, and what the reported numbers make of it."""
+"""Figures of the feedback: measurements with the curves of the reported numbers."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -28,7 +28,7 @@ _LARGEST = 1e9  # of gains and frequencies, and its reciprocal the least: no fig
 def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[str, str], ...]:
     """Return file names and SVG: the response of each cart, with the curve of the final table.
 
-    Without the curve where the table is not complete or stands for no response.
+    The curve is left out if the table is incomplete or gives no valid response.
     """
     curve = _response({name: float(v) for name, v in (reported.final if reported else {}).items()})
     if curve and (len(curve[0]) != analysis.bench.n or analysis.bench.n > _MOST_CARTS):
@@ -50,9 +50,9 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
 
 
 def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tuple[str, str], ...]:
-    """Return file names and SVG: the records of what lost points in the initial table.
+    """Return file names and SVG: recordings of the initial numbers that lost points.
 
-    Of repeats the one that says most. A file is named after the numbers in it, see `numbers_in`.
+    Of several repeats the most telling is shown. Files are named after their numbers: `numbers_in`.
 
     Parameters
     ----------
@@ -97,7 +97,7 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
 
 
 def numbers_in(file: str) -> frozenset[str]:
-    """Return the parameters that a figure of a record shows; of other figures none."""
+    """Return the parameters in a figure of a recording; empty for other figures."""
     kind, *names = file.removesuffix(".svg").split("-")
     return frozenset(names if kind == "record" else ())
 
@@ -108,7 +108,7 @@ def is_response(file: str) -> bool:
 
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:
-    """Return the gains and polynomials that a table stands for, None where it stands for none."""
+    """Return the gains and polynomials of a table, None if they are not valid."""
     sizes = [abs(v) for name, v in values.items() if not read_name(name).is_damping]
     if any(not 1 / _LARGEST < size < _LARGEST for size in sizes):
         return None

@@ -1,8 +1,8 @@
 """A grade as the `results.json` of a Gradescope autograder.
 
 Keys and values are those of Gradescope's *Autograder Specifications*. Students who must find the
-numbers themselves (`see = "check"`) read no computed number in it. Partial points tell how far a
-number is off, and anybody may submit again, so these students see points only after the due date.
+numbers themselves (`see = "check"`) see no computed number in it. Partial points reveal the error
+of a number, and resubmission is allowed, so these students see points only after the due date.
 """
 
 import json
@@ -15,7 +15,7 @@ from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.text import with_symbols
 
-_WITHOUT_NUMBERS: tuple[Code, ...] = ("missing", "shared_data")  # remarks that tell none to find
+_WITHOUT_NUMBERS: tuple[Code, ...] = ("missing", "shared_data")  # remarks without numbers
 
 
 def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
@@ -47,12 +47,12 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
 
 
 def told_flags(grade: Grade, *, codes: Collection[Code] = CODES) -> list[str]:
-    """Return what a student reads of each remark with one of these codes."""
+    """Return the student's text for each remark with one of these codes."""
     return [with_symbols(told(flag)) for flag in grade.flags if flag.code in codes]
 
 
 def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
-    """Return what a student reads of the whole, at once."""
+    """Return the student's text for the whole grade."""
     how = " automatically, points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
     said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
@@ -65,7 +65,7 @@ def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
 
 
 def _say_of(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
-    """Return what a student reads of a criterion; hidden: outcome, remarks' titles, reasons."""
+    """Return the student's text for a criterion; if hidden, outcome, titles and reasons only."""
     outcome = WORDS.text(f"outcome_{judged.outcome}")
     if not hidden:
         return f"{outcome}: {with_symbols(judged.message)}"

@@ -1,6 +1,6 @@
-"""All that a grading writes: `grades.csv`, `class.html`, and everybody's feedback.
+"""Write the output of a grading: `grades.csv`, `class.html`, and all feedback.
 
-The files are a function of the gradebook alone: written again at any time, they are the same.
+The files depend only on the gradebook: written again at any time, they are the same.
 """
 
 import hashlib
@@ -26,18 +26,18 @@ from pipeline.words.progress import Progress, silent
 
 FEEDBACK = "feedback"
 _PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
-_WHOLE = ""  # among what each submission's pages were made of, that of the class; none is called so
-# What each page was made of: a page of the same is not made again.
+_WHOLE = ""  # key of the class page among the submissions' pages
+# Hashes of the data behind each page; an unchanged page is not written again.
 _MADE = ".made.json"
 _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "deducted")
 _AFTER = ("remarks", "by_hand", "reason")
 
 
 def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
-    """Write the class list of a gradebook into a folder; return who stands on it several times.
+    """Write the class list of a gradebook into a folder; return authors of several submissions.
 
-    A rubric that is `anonymous` leaves out all names, and `anonymous-key.csv` says whose is what.
-    Feedback that an earlier batch left is removed; what is not ours stays.
+    An `anonymous` rubric leaves out all names, and `anonymous-key.csv` reveals them. Feedback of an
+    earlier batch is removed; other files stay.
     """
     rubric = book.rubric
     names = _names(book, out) if rubric.anonymous else None
@@ -63,7 +63,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         if there and made_of.get(grade.submission) == now_of[grade.submission]:
             continue
         progress(f"feedback: {grade.submission}")
-        (folder / _MADE).unlink(missing_ok=True)  # until all of it is true again
+        (folder / _MADE).unlink(missing_ok=True)  # until all pages are written again
         own.mkdir(exist_ok=True)
         page = feedback_page(
             grade,
@@ -74,7 +74,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         write_file(own / _PAGE, page)
         write_file(own / _JSON, grade_text(grade))
     if names is not None:
-        lines.sort(key=lambda line: line.submission)  # the order of the names would tell
+        lines.sort(key=lambda line: line.submission)  # the order would reveal the names
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
     doubles = doubles_of(book, authors, gradings=gradings, names=names)
@@ -98,7 +98,7 @@ def doubles_of(
     gradings: Mapping[str, int],
     names: Mapping[str, str] | None,
 ) -> list[Double]:
-    """Return who stands in several submissions, nameless where `names` stand in for those."""
+    """Return the authors of several submissions, without names if `names` has pseudonyms."""
     found = find_doubles(authors)
     concerned = dict.fromkeys(name for double in found for name in double.submissions)
     found = with_recordings(found, book.prints([gradings[name] for name in concerned]))
@@ -118,7 +118,7 @@ def doubles_of(
 
 
 def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
-    """Return `grades.csv`: a row a submission, a column a criterion."""
+    """Return `grades.csv`: one row per submission, one column per criterion."""
     taken = {*_BEFORE, *_AFTER}
     ids = [criterion.id for criterion in rubric.criteria]
     heads = [f"criterion {id_}" if id_ in taken else id_ for id_ in ids]
@@ -155,7 +155,7 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
 
 
 def _look(rubric: Rubric) -> str:
-    """Return a hash of all that pages have in common."""
+    """Return a hash of everything that pages have in common."""
     names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js", "explore.js")
     parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]
     return _digest(*parts, rubric.model_dump_json())
@@ -177,9 +177,9 @@ def _read_made(folder: Path) -> dict[str, str]:
 
 
 def _checked(name: str) -> str:
-    """Return a submission's name where it is that of a folder, and nothing else."""
+    """Return a submission's name if it is a plain folder name."""
     if Path(name).name != name or name in ("", ".", ".."):
-        raise ConfigError(f"{name!r}: is no name for a folder of feedback")
+        raise ConfigError(f"{name!r}: cannot be the name of a feedback folder")
     return name
 
 

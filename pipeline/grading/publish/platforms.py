@@ -1,4 +1,4 @@
-"""The tables of learning platforms: which columns they have, and what is written into each.
+"""The tables of learning platforms: their columns and the values written into them.
 
 A column's text names values of a student in braces, see `export.values_of`; `{title}` is the
 assignment's.
@@ -16,10 +16,10 @@ class Form:
 
     Attributes
     ----------
-    own : what its own table has for certain, any of these; no other platform's has it.
-    filled : columns of its own table that grades go into; `if_there` : those it may lack.
-    kept : columns that stay beside them; none: all.
-    new : the columns of a table made without its own.
+    own : columns of which its own table always has one, and other platforms' never.
+    filled : columns of its own table that receive grades; `if_there` : optional ones.
+    kept : other columns to keep; empty: all.
+    new : the columns of a new table.
     """
 
     own: tuple[frozenset[str], ...] = ()

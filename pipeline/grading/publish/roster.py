@@ -1,4 +1,4 @@
-"""The table of students that a learning platform exports, with grades filled in."""
+"""Fill grades into the table of students that a learning platform exports."""
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -41,8 +41,8 @@ class Roster:
 
         Raises
         ------
-        ConfigError : it is no table, has not the columns that say who a row is about there, or has
-            two of one name.
+        ConfigError : it is not a table, lacks the columns that identify a student, or has two
+            columns of the same name.
         """
         table = read_table(path)
         if not any(columns <= set(table.columns) for columns in FORMS[platform].own):
@@ -57,11 +57,11 @@ class Roster:
         return cls(file=path.name, table=table)
 
     def check_maximum(self, out_of: float, *, title: str) -> None:
-        """Refuse a table whose grades go up to another maximum: the platform keeps its own.
+        """Refuse a table with another maximum grade, because the platform keeps its own.
 
         Raises
         ------
-        ConfigError : so say Moodle's column of it, or Canvas' row of the points possible.
+        ConfigError : Moodle's column or Canvas' row of possible points differs.
         """
         column = self._title(title)
         said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
@@ -70,8 +70,8 @@ class Roster:
         for text in said:
             if (most := _number(text)) is not None and most != out_of:
                 raise ConfigError(
-                    f"{self.file}: has the maximum grade {text}, the rubric {out_of:g} points: set "
-                    "the assignment's maximum on the platform and download the table again"
+                    f"{self.file}: has the maximum grade {text}, the rubric {out_of:g}: "
+                    "set the assignment's maximum on the platform and download the table again"
                 )
 
     def fill(
@@ -82,7 +82,7 @@ class Roster:
         keep: Collection[str] | None = None,
         possible: str = "",
     ) -> tuple[str, list[Remark]]:
-        """Return the table with these columns filled in, and what did not fit.
+        """Return the table with these columns filled in, and remarks on mismatches.
 
         Parameters
         ----------
@@ -118,12 +118,12 @@ class Roster:
         found: Mapping[Any, Sequence[Student]],
         settled: Mapping[Any, Student],
     ) -> list[Remark]:
-        """Return what did not fit.
+        """Return remarks on mismatches.
 
         Parameters
         ----------
-        matched : the row of each student, None where there is none.
-        found, settled : by row, who is in it, and the one that counts.
+        matched : the row of each student, or None.
+        found, settled : by row, the matching students and the one that counts.
         """
         index, shared = self._index
         # One of the authors, who are named, handed it in.
@@ -141,7 +141,7 @@ class Roster:
             named = ", ".join(f"{s.called} ({s.grade.submission})" for s in passed_over)
             remarks.append(
                 Remark(
-                    text="has no points, since another's account handed it in and got them: "
+                    text="has no points, because another account submitted it and received them: "
                     f"{named}",
                     left_out=True,
                 )
@@ -157,7 +157,7 @@ class Roster:
             if len(s.grade.authors) > 1 and s.grade.submission not in reached
         )
         if lost:
-            remarks.append(Remark(text=f"nobody of these is in {self.file}: {', '.join(lost)}"))
+            remarks.append(Remark(text=f"none of these is in {self.file}: {', '.join(lost)}"))
         by_number = [
             f"{s.name} ({s.grade.submission})"
             for s in settled.values()
@@ -166,14 +166,14 @@ class Roster:
         if by_number:
             remarks.append(
                 Remark(
-                    text="found by the number in the file's name, so the same person as one of "
-                    f"the authors: {', '.join(by_number)}"
+                    text="matched by the number in the file name, so the same person as one of "
+                    "the authors: {', '.join(by_number)}"
                 )
             )
         return remarks
 
     def _of_all(self) -> "pd.Series":
-        """Return which rows are about the assignments, not about a student."""
+        """Return the rows that concern the assignments, not a student."""
         # Several columns may have no name, the first of them too.
         students = self.table["Student"] if "Student" in self.table else self.table.iloc[:, 0]
         return students.str.contains(POINTS_POSSIBLE, regex=False)
@@ -187,7 +187,7 @@ class Roster:
 
     @cached_property
     def _index(self) -> tuple[dict[tuple[str, str], Any], set[Any]]:
-        """Return the row of everything that says who it is about, and what several rows share."""
+        """Return the row of each identifying text, and the texts that several rows share."""
         import pandas as pd
 
         words = []
@@ -212,7 +212,7 @@ def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
 
 
 def _words(student: Student) -> tuple[tuple[str, str], ...]:
-    """Return by what a student may be found, the surest first."""
+    """Return the texts by which a student can be found, the surest first."""
     return (
         ("number", student.number),
         _id_of(student),

@@ -19,11 +19,11 @@ _BARS = 10  # of a distribution; each is a tenth of all points
 
 @dataclass(frozen=True, kw_only=True)
 class CriterionChange:
-    """A criterion that would give a team other points.
+    """A criterion that would give a team different points.
 
     Attributes
     ----------
-    before, after : None where one of the rubrics does not have it.
+    before, after : None if a rubric does not have the criterion.
     """
 
     id: str
@@ -33,12 +33,12 @@ class CriterionChange:
 
 @dataclass(frozen=True, kw_only=True)
 class TeamChange:
-    """What a team has, and what it would have.
+    """The points of a team, now and under the other rubric.
 
     Attributes
     ----------
     late_before, late_after : points taken off for lateness.
-    by_hand : criteria whose points a person gave; they stay.
+    by_hand : criteria with points by hand, which stay.
     """
 
     submission: str
@@ -51,7 +51,7 @@ class TeamChange:
 
     @property
     def gain(self) -> float:
-        """Points more than before; negative where they are fewer."""
+        """The change in points; negative for a loss."""
         return self.after - self.before
 
 
@@ -63,9 +63,9 @@ class RubricPreview:
     ----------
     assignment : what the class calls the file of its rubric, without `.toml`.
     teams : those whose points are known under both, the largest change first.
-    unknown : submissions of which the gradebook does not keep what the checks found.
-    bars_before, bars_after : how many teams have how many tenths of all points.
-    failed : how many could not be graded, and stay so.
+    unknown : submissions without stored results of the checks.
+    bars_before, bars_after : number of teams in each tenth of all points.
+    failed : number of submissions that could not be graded.
     needs : keys of the rubric that only grading again can apply, see `needs_recordings`.
     """
 
@@ -122,7 +122,7 @@ def _bars(points: list[float], *, out_of: float) -> tuple[int, ...]:
 
 
 def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Verdict]:
-    """Return the findings of criteria that still check the same."""
+    """Return the stored results of criteria that still check the same."""
     was = {criterion.id: criterion.check for criterion in before.criteria}
     same = {c.id for c in now.criteria if was.get(c.id) == c.check}
     return {id_: found for id_, found in read_findings(text or "{}").items() if id_ in same}

@@ -10,7 +10,7 @@ from pipeline.grading.intake.lms_names import Platform, read_owner
 from pipeline.grading.words import points_text
 
 # `results.json` needs a score: "optional, but required if not on each test case".
-_GRADESCOPE_BLANK = "left blank in gradescope.csv but 0 in results.json, which must have a score"
+_GRADESCOPE_BLANK = "left blank in gradescope.csv, but 0 in results.json, where a score is required"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,11 +20,11 @@ class Student:
     Attributes
     ----------
     id : as the submission names the author, or "".
-    name, number : as the learning platform calls who handed it in, or "". The number is the
-        platform's that the grades are for. Of several authors nobody says which that is: it is
-        then a student beside them, known as `uploader`.
+    name, number : of the account that submitted it, on the platform for the grades, or "". If
+        there are several authors, it is not known which one this is; the account is then a
+        separate student, marked as `uploader`.
     by_hand : the criteria whose points were given by hand.
-    undecided : where the student is in several submissions with different points: in which ones.
+    undecided : the submissions of a student who is in several with different points.
     """
 
     id: str
@@ -37,26 +37,26 @@ class Student:
 
     @property
     def points(self) -> str:
-        """The points, "" where nobody has graded it yet: a zero would say that somebody had.
+        """The points; "" if not graded yet, because a zero would look like a grade.
 
-        And where somebody has to say which of several submissions counts.
+        Also "" if a person must decide which of several submissions counts.
         """
         ungraded = self.grade.status == "failed" and not self.by_hand
         return "" if ungraded or self.undecided else points_text(self.grade.points)
 
     @property
     def called(self) -> str:
-        """What to call the student in a message."""
+        """The name of the student in messages."""
         return self.id or self.name or self.grade.submission
 
 
 @dataclass(frozen=True, kw_only=True)
 class Remark:
-    """What the person who uploads a table should know.
+    """A remark for the person who uploads a table.
 
     Attributes
     ----------
-    left_out : somebody who has points has none in the table.
+    left_out : somebody with points is missing from the table.
     """
 
     text: str
@@ -64,9 +64,10 @@ class Remark:
 
 
 def one_of(several: Sequence[Student]) -> Student:
-    """Return what stands for one student in several submissions.
+    """Combine one student's entries from several submissions.
 
-    Any points are better than none; of different points none are, until a person has decided.
+    An entry with points wins over one without. If points differ, there are none until a person has
+    decided.
     """
     if undecided := [student for student in several if student.undecided]:
         return undecided[0]
@@ -76,29 +77,29 @@ def one_of(several: Sequence[Student]) -> Student:
     named = [f"{s.grade.submission} ({s.points})" for s in graded]
     return replace(
         graded[0],
-        undecided=f"{graded[0].called} is in {' and '.join(named)}: left out, "
-        "until cartlab remove takes the wrong one off",
+        undecided=f"{graded[0].called} is in {' and '.join(named)}: left out until the wrong one "
+        f"is removed with cartlab remove",
     )
 
 
 def students_of(
     entries: Sequence[Entry], *, platform: Platform
 ) -> tuple[list[Student], list[Remark]]:
-    """Return every student once, and what to say about it."""
+    """Return every student once, with remarks."""
     found: dict[str, list[Student]] = {}
     for entry in entries:
         for student in _students(entry, platform=platform):
-            # Nobody's id stands for a number, or for who is not named at all.
+            # An empty id is not a number or a name.
             nameless = student.number if student.uploader else entry.submission
             found.setdefault(person(student.id) or f"\0{nameless}", []).append(student)
     students = [one_of(several) for several in found.values()]
     remarks = [Remark(text=s.undecided, left_out=True) for s in students if s.undecided]
     strangers = [s for s in students if not (s.id or s.name or s.number)]
     if nobodys := [s for s in strangers if not s.by_hand]:
-        remarks.append(not_exported("nobody is named in it", nobodys))
+        remarks.append(not_exported("it names no author", nobodys))
     if by_hand := [s.grade.submission for s in strangers if s.by_hand]:
-        folders = f"so exported as who its folder is called: {', '.join(by_hand)}"
-        remarks.append(Remark(text=f"nobody is named in it, {folders}"))
+        folders = f"so exported under the name of its folder: {', '.join(by_hand)}"
+        remarks.append(Remark(text=f"it names no author, {folders}"))
     students = [
         replace(s, name=s.grade.submission) if s in strangers else s
         for s in students
@@ -112,16 +113,16 @@ def students_of(
 
 
 def not_exported(why: str, students: Sequence[Student]) -> Remark:
-    """Return who is in no row of a table, and why."""
+    """Return the students who are missing from a table, with reasons."""
     called = ", ".join(student.called for student in students)
     lost = any(student.points or student.undecided for student in students)
     return Remark(text=f"{why}, so not exported: {called}", left_out=lost)
 
 
 def _students(entry: Entry, *, platform: Platform) -> list[Student]:
-    """Return the authors of a submission, and who handed it in where it may be none of them.
+    """Return the authors of a submission, and its account if that may be somebody else.
 
-    Where nobody can be read in it, those it named before it was given points by hand.
+    If it has no readable authors, use those from before the points by hand.
     """
     name, of, number = read_owner(entry.owner)
     number = number if of in ("", platform) else ""

@@ -1,4 +1,4 @@
-"""What students say of the course: the paper's Tables 4 and 5 from a questionnaire's answers.
+"""Make the paper's Tables 4 and 5 from the answers of a questionnaire.
 
 A row of the CSV is one student, a column one question. A column is an opinion where its answers
 are on the scale of Table 4; it is about a concept (Table 5) where its heading says when and what:
@@ -93,7 +93,8 @@ def read_survey(path: Path) -> Survey:
             left_out.append(title)
     if not opinions and not concepts:
         raise ConfigError(
-            f"{path.name}: no question in it: answers from {SCALE[0]!r} to {SCALE[-1]!r}, or "
+            f"{path.name}: contains no question: expected answers from {SCALE[0]!r} to "
+            f"{SCALE[-1]!r}, or "
             "headings such as 'Pre knowledge: Bode plots' with scores from 1 to 4"
         )
 
@@ -171,7 +172,7 @@ def survey_text(survey: Survey) -> str:
     if len(survey.opinions):
         rows = [[str(q), *(f"{p} %" for p in row)] for q, *row in survey.percents.itertuples()]
         parts.append(_markdown(["Question", *SCALE], rows))
-        parts.append("Table 4: Results of student questionnaires at end of the course.")
+        parts.append("Table 4: Results of student questionnaires at the end of the course.")
     if len(survey.means):
         shown = survey.means.map(lambda mean: NOTHING if isnan(mean) else f"{mean:.2f}")
         rows = [[str(text) for text in row] for row in shown.itertuples()]

@@ -1,1 +1,1 @@
-"""What the recordings say a number is, and how far off one may be."""
+"""Reference values from the recordings, and their tolerances."""

@@ -1,4 +1,4 @@
-"""What the student's own recordings say each parameter is, and what an honest reading may give."""
+"""Recompute each parameter from the student's recordings, with bounds for honest readings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +21,8 @@ class Reference:
 
     Attributes
     ----------
-    value : the estimate that is shown; `source` says where it comes from.
-    low, high : an honest reading of these recordings may lie anywhere between.
+    value : the estimate that is shown; `source` is its method.
+    low, high : an honest reading of these recordings lies between them.
     std : standard error of the bounds.
     """
 
@@ -39,21 +39,21 @@ class Reference:
 
     @property
     def said(self) -> str:
-        """What the recordings give, in words: a number, or from where to where it may lie."""
+        """The reference in words: a number or a range."""
         if self.low > 0 and self.within(limits.ONE_NUMBER):
             return f"{self.value:.4g}"
         return f"{self.low:.3g} to {self.high:.3g}"
 
     def within(self, factor: float) -> bool:
-        """Whether its bounds are no further apart than a factor."""
+        """Return whether the ratio of its bounds is at most a factor."""
         return self.high <= self.low * factor
 
     def including(self, value: float) -> "Reference":
-        """Return the reference with a value between its bounds."""
+        """Return the reference with bounds extended to include a value."""
         return replace(self, low=min(self.low, value), high=max(self.high, value))
 
     def widened(self, factor: float) -> "Reference":
-        """Return the reference with bounds that much further out."""
+        """Return the reference with bounds moved outwards."""
         return replace(self, low=self.low / factor, high=self.high * factor)
 
     def times(self, factor: float) -> "Reference":
@@ -69,24 +69,23 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class References:
-    """Both tables, by parameter name; what could not be recomputed, or is a guess, is not there."""
+    """Both tables by parameter name, without guesses and numbers that cannot be recomputed."""
 
     initial: dict[str, Reference]
     final: dict[str, Reference]
 
 
 def off_scale(analysis: Analysis) -> set[str]:
-    """Return which scales are not those stated: of the positions, of the input, of both."""
+    """Return which scales differ from the stated ones: positions, input or both."""
     return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
 def in_scale(
     references: References, chain: Chain | None, *, analysis: Analysis, per_count: float | None
 ) -> tuple[References, Chain | None]:
-    """Return the references and carts in the units asked for, where the recordings are in others.
+    """Return references and carts in the required units, if the recordings use others.
 
-    Counts are multiplied by the length of one, where it is stated; what is in a scale that nobody
-    stated is left out.
+    Counts are multiplied by their length, if stated. Numbers in an unknown scale are left out.
     """
     wrong = off_scale(analysis)
     if not wrong:
@@ -108,8 +107,8 @@ def in_scale(
 def recompute(analysis: Analysis) -> References:
     """Return the references of both tables.
 
-    A number that was measured in several ways is right anywhere between them, in either table.
-    Dry friction adds to every damping ratio; a student who took it out is right too.
+    A number measured in several ways is right anywhere between them, in either table. Dry friction
+    adds to every damping ratio; a student who removed it is right too.
     """
     chain = trusted_chain(analysis)
     trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []
@@ -123,7 +122,7 @@ def recompute(analysis: Analysis) -> References:
             final[row.name] = fitted
         elif measured is not None:
             final[row.name] = measured
-            # Where our fit of a gain goes astray, the students' may; they see it if it goes far.
+            # If our fit of a gain fails, the students' fit may fail too; they notice a large error.
             astray = (
                 row.final.value if row.final and read_name(row.name).is_gain else measured.value
             )
@@ -137,7 +136,7 @@ def recompute(analysis: Analysis) -> References:
             for table in (initial, final):
                 if row.name in table:
                     table[row.name] = table[row.name].widened(limits.STUCK)
-    # Without a fit nothing says that the peaks seen in the dwells are those they are taken for.
+    # Without a fit, the peaks in the dwells may be other ones than assumed.
     for table in (initial, final) if not trusted else ():
         for name in [n for n, r in table.items() if r.source == "frequency_response"]:
             del table[name]
@@ -145,10 +144,10 @@ def recompute(analysis: Analysis) -> References:
 
 
 def trusted_chain(analysis: Analysis) -> Chain | None:
-    """Return the fitted chain; None where dry friction or worse has led the fit astray.
+    """Return the fitted chain; None if dry friction or worse has spoilt the fit.
 
-    A fit that does not explain the data must at least find the frequencies and gains that were
-    measured without it, and must not leave them open.
+    A fit that does not explain the data must at least reproduce the frequencies and gains measured
+    without it, and must determine them.
     """
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
@@ -156,7 +155,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
         if read_name(row.name).is_damping:
             continue
         if row.name in analysis.fit.parameters and row.final is None:
-            return None  # the fit leaves it open
+            return None  # the fit does not determine it
         if row.initial is None or row.final is None:
             continue
         before, after = row.initial.value, row.final.value
@@ -169,15 +168,15 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
 
 
 def is_explained(analysis: Analysis) -> bool:
-    """Whether linear carts and noise explain the data; without a fit nothing says otherwise."""
+    """Return whether linear carts and noise explain the data; without a fit, assume so."""
     return analysis.fit is None or analysis.fit.explains_data
 
 
 def is_followed(analysis: Analysis) -> bool:
-    """Whether nearly all driven records move as the fitted carts do.
+    """Return whether nearly all driven recordings follow the fitted carts.
 
-    A dwell beside a sharp resonance hides what is left of its transient below a coarse encoder's
-    rounding: the point is off by several of its errors, the record follows all the same.
+    Near a sharp resonance, a coarse encoder hides the rest of a dwell's transient. Its point is
+    then off by several standard errors, although the recording follows the carts.
     """
     bad = {one.experiment for one in analysis.left_out}
     left = [share for name, share in analysis.unexplained.items() if name not in bad]
@@ -187,19 +186,19 @@ def is_followed(analysis: Analysis) -> bool:
 
 
 def is_linear(analysis: Analysis) -> bool:
-    """Whether the recordings are those of some linear carts, near enough.
+    """Return whether the recordings are close to those of linear carts.
 
-    Else every number depends on how far the carts moved and on how it is found, and two honest
-    students find two.
+    Otherwise every number depends on the amplitude and the method, and two honest students find
+    different values.
     """
     return is_explained(analysis) or is_followed(analysis)
 
 
 def in_doubt(references: References, *, analysis: Analysis) -> References:
-    """Return the references as far as they may be held against a student.
+    """Return the references that may count against a student.
 
-    Of recordings that no linear carts move like, first estimates are those of the runs they were
-    read off; a fit, ours or the students', is one to nothing.
+    If no linear carts move like the recordings, first estimates still belong to their own runs, but
+    a fit means nothing, ours or the students'.
     """
     if is_linear(analysis):
         return references
@@ -213,7 +212,7 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
         return {
             name: one.widened(factor(name, of_gains=of_gains))
             for name, one in table.items()
-            # Resonances of no linear carts are no numbers of any, nor is what rests on them.
+            # Resonances of nonlinear carts are not parameters, nor are numbers derived from them.
             if one.source != "frequency_response"
         }
 
@@ -226,10 +225,10 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
 def _final(
     row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
 ) -> Reference | None:
-    """Return the bounds of a final number: the fit, and all that was measured without it.
+    """Return the bounds of a final number: the fit, and all measurements without it.
 
-    A fit that holds a damping at zero, its bound, tells of no damping; one that neither explains
-    the points nor is followed by the records tells of no number that nothing else measures.
+    A fit that stops at a damping of zero, its bound, does not measure the damping. A fit that
+    neither explains the points nor the recordings does not count where it is the only measurement.
     """
     fitted, read_off = row.final, _readings(row.name, analysis)
     if read_name(row.name).is_damping:
@@ -240,8 +239,8 @@ def _final(
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
-    # No unit, sign or clock is in a damping; but dry friction adds to it, more to dwells than to
-    # decays, and where those are few the fit explains them all the same.
+    # A damping depends on no unit, sign or clock. But dry friction adds to it, more in dwells than
+    # in decays, and with few dwells the fit explains them anyway.
     if fitted and told and not read_name(row.name).is_damping and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
     read = row.initial.source if row.initial and not read_off else "log_decrement"
@@ -258,9 +257,9 @@ def _final(
 
 
 def _agrees(value: float, fitted: Estimate) -> bool:
-    """Whether a reading may be of the number that a fit explains the data with.
+    """Return whether a reading agrees with a fit that explains the data.
 
-    Else it is of a recording that holds something else, and no bound of what is right.
+    Otherwise its recording contains something else, and it is not used as a bound.
     """
     slack, factor = limits.SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
     least, most = fitted.value / factor, fitted.value * factor
@@ -268,14 +267,14 @@ def _agrees(value: float, fitted: Estimate) -> bool:
 
 
 def _undamped(analysis: Analysis) -> bool:
-    """Whether the fit has put a damping at zero, which is its bound and no measurement."""
+    """Return whether the fit stopped at zero damping, which is a bound and not a measurement."""
     return analysis.chain is not None and not np.all(analysis.chain.c > 0)
 
 
 def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
     """Return the numbers of the fitted carts with the least and the most damping of their decays.
 
-    What a cart's decays leave open is the fit's; none where that has put it at zero.
+    The fit supplies dampings without decays; there is no result if the fit stopped at zero.
     """
     readings = [_readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
     if not any(readings) or not chain.is_tied:
@@ -303,16 +302,16 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
         value=measured.value,
         low=min(bounds) / spread,
         high=max(bounds) * spread,
-        std=0.0 if len(readings) > 1 else measured.std or 0.0,  # the readings show their scatter
+        std=0.0 if len(readings) > 1 else measured.std or 0.0,  # else the bounds show it
         source=measured.source,
     )
 
 
 def _readings(name: str, analysis: Analysis) -> list[float]:
-    """Return the single readings of a gain or of a cart alone: a student may quote any.
+    """Return the single readings of a gain or of a cart alone; a student may quote any.
 
-    The damping of a decay is read with and without the dry friction that fits it best, also where
-    no test is sure of friction: with little damping a trace of it counts.
+    The damping of a decay is read with and without the best-fitting dry friction, even if friction
+    is not certain: with little damping a trace of it counts.
     """
     read = read_name(name)
     if read.is_by_eye:

@@ -1,4 +1,4 @@
-"""A bench on which a positive input drives the carts to negative x: numbers signed as logged."""
+"""Accept signs as logged on a bench whose positive input drives the carts to negative x."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -9,16 +9,16 @@ from pipeline.results import Record
 from pipeline.submission import Reported, ReportedFeedback, ReportedStateSpace
 
 _NOTE = (
-    "a positive input drives these carts towards negative x: what is reported with that sign is "
-    "taken as with the input turned round"
+    "a positive input drives these carts towards negative x: reported values with that sign are "
+    "read with the input reversed"
 )
 
 
 def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
-    """Return what is reported as with the input turned round, where the bench is, and a note.
+    """Return the reported numbers with the input reversed, if the bench is, and a note.
 
-    Gains, B and the controller change sign with the input; who signs all of a kind as the log has
-    it is right, as is who gives sizes.
+    Gains, B and the controller change sign with the input. Numbers with the signs of the log are
+    right, and so are absolute values.
     """
     if not is_reversed(records):
         return reported, ()

@@ -1,4 +1,4 @@
-"""The carts' springs, where those of the rubric leave the recordings unexplained."""
+"""Find further springs if those of the rubric cannot explain the recordings."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ def with_all_springs(
     *,
     progress: Progress = silent,
 ) -> tuple[Analysis, tuple[str, ...]]:
-    """Return the analysis with all springs, and those that are added, where these recordings ask.
+    """Return the analysis with all springs and the added ones, if the recordings need them.
 
-    A spring that is not there is fitted as none, so no other set of springs explains more; where
-    none of those added is there, the carts are the rubric's, found on another way. One cart has
-    one stiffness, whatever it stands for.
+    A missing spring is fitted with zero stiffness, so no other set of springs explains more. If
+    none of the added springs exists, the carts are still the rubric's. A single cart has one
+    stiffness in any case.
     """
     fit, springs = analysis.fit, submission.system.springs
     if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):
@@ -50,11 +50,11 @@ def with_all_springs(
 
 
 def _there(fit: ChainFit) -> list[bool]:
-    """Return whether each spring is there for certain, whatever the fit leaves unexplained."""
+    """Return for each spring whether it certainly exists, despite an imperfect fit."""
     wider = max(1.0, fit.chi_square_per_dof) ** 0.5
     std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))
     k = fit.chain.k
-    # One that the fit holds at none has no standard error. Ten of those, and a share of the
-    # stiffest: a delay or friction is easily taken for a weak spring.
+    # A spring fitted at zero has no standard error. The limits, ten standard errors and a share of
+    # the stiffest spring, are high because a delay or friction resembles a weak spring.
     least = [max(10 * std.get(f"k_{j + 1}", np.inf), 0.02 * k.max()) for j in range(k.size)]
     return [bool(stiffness > limit) for stiffness, limit in zip(k, least, strict=True)]

@@ -1,4 +1,4 @@
-"""How far off a number is, and what that earns: exact arithmetic, so that an edge is an edge."""
+"""The error of a number and the points it earns, in exact arithmetic so that limits are sharp."""
 
 import math
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from pipeline.grading.rubric import Late
 Number = TypeVar("Number", float, Fraction)
 
 NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
-# The most that rounding may excuse, of the number: that of two digits, 10 for 10.5. One digit says
-# too little of what was measured, and "0e2" nothing at all.
+# The largest share of a number that rounding may excuse: that of two digits, 10 for 10.5. One digit
+# says too little of the measurement, and "0e2" says nothing.
 _MOST_ROUNDING = Fraction(1, 20)
 
 
@@ -22,7 +22,7 @@ def half_digit(typed: Decimal) -> Fraction:
     """Return half a unit of the last digit as typed: 0.005 for 0.10, 0.5 for 29."""
     exponent = typed.as_tuple().exponent
     if not isinstance(exponent, int):
-        raise ValueError(f"{typed} is no finite number")
+        raise ValueError(f"{typed} is not a finite number")
     return Fraction(10) ** exponent / 2
 
 
@@ -37,21 +37,21 @@ def rounding(typed: Decimal) -> Fraction:
 
 
 def is_vague(typed: Decimal) -> bool:
-    """Whether rounding may hide more of a number than is excused: one digit does."""
+    """Return whether rounding hides more of a number than is excused, as with one digit."""
     return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
 
 
-@lru_cache(1024)  # a rubric has few numbers, and a class asks for each again and again
+@lru_cache(1024)  # a rubric has few numbers, which a class uses very often
 def exact(value: float) -> Fraction:
     """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
     return Fraction(repr(value))
 
 
 def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
-    """Return how far a number is off its reference, in percent of the smaller of the two.
+    """Return the error of a number against its reference, in percent of the smaller of the two.
 
-    5 % is a factor of 1.05 either way. What `rounding` excuses and `sigmas` standard errors of the
-    reference come off first; any value between the reference's bounds is right.
+    5 % is a factor of 1.05 either way. The excused `rounding` and `sigmas` standard errors of the
+    reference are subtracted first. Any value between the reference's bounds is right.
     """
     slack = exact(sigmas) * Fraction(reference.std)
     low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
@@ -62,13 +62,13 @@ def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fract
 
 @dataclass(frozen=True, kw_only=True)
 class Typed:
-    """A number of a table in floating point, to be held against many references in turn.
+    """A number of a table in floating point, for comparison with many references.
 
     Attributes
     ----------
-    excused : how far rounding may have moved it.
-    hidden : half a digit as share of it.
-    digits : that were typed.
+    excused : change that rounding may have caused.
+    hidden : half a digit as a share of the number.
+    digits : number of typed digits.
     """
 
     value: float
@@ -87,7 +87,7 @@ class Typed:
         )
 
     def percent_off(self, reference: Reference, *, sigmas: float) -> float:
-        """Return what `percent_off` does, but for its last digits: no edge of a credit is here."""
+        """Return `percent_off` in floating point, where exact limits do not matter."""
         slack = sigmas * reference.std
         low, high = reference.low - slack, reference.high + slack
         least, most = self.value - self.excused, self.value + self.excused
@@ -97,7 +97,7 @@ class Typed:
 def _apart(
     least: Number, most: Number, low: Number, high: Number, *, nothing: Number, worst: Number
 ) -> Number:
-    """Return how far two intervals are apart, in percent."""
+    """Return the gap between two intervals, in percent."""
     if most < low:
         above, below = low, most
     elif least > high:
@@ -108,9 +108,9 @@ def _apart(
 
 
 def credit(error: Fraction, *, full: float, none: float) -> Fraction:
-    """Return the share of the points: all up to and at `full`, none from `none`, a line between.
+    """Return the share of the points: full up to `full`, zero from `none`, linear in between.
 
-    Where the two are the same, an error of exactly that much still earns all.
+    If the two are equal, an error of exactly that size still earns everything.
     """
     top, bottom = exact(full), exact(none)
     if error <= top:
@@ -121,14 +121,14 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
 
 
 def to_step(points: Fraction, step: float) -> Fraction:
-    """Return points to the rubric's step, halves up: exact, so that no share loses its order."""
+    """Round points to the rubric's step, halves up, exactly, so that the order is kept."""
     return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
 
 
 def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
-    """Return the points off those earned: so much for every day begun after the grace.
+    """Return the deduction from the points earned, for every day begun after the grace period.
 
-    To the rubric's step, halves down: in the student's favour, as the points are.
+    It is rounded to the rubric's step, halves down: like the points, in the student's favour.
     """
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100

@@ -1,1 +1,1 @@
-"""The check that students ask: which of their numbers are off, then where to look."""
+"""The students' check: which of their numbers are wrong, then where to look."""

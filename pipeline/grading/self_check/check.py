@@ -1,4 +1,4 @@
-"""Check a submission's numbers as grading judges them; the answer has names only."""
+"""Check a submission's numbers like the grading; the answer has names but no values."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 from pipeline.words.progress import Progress, silent
 
-# The tables of `[reported]` whose numbers are held against the recordings, by check.
+# The tables of `[reported]` that are compared with the recordings, by check.
 _TABLE = {
     "initial": "initial",
     "final": "final",
@@ -47,28 +47,28 @@ def check_numbers(
     where: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> CheckAnswer:
-    """Answer which of the reported numbers disagree; asked again about them, where to look.
+    """Find the reported numbers that disagree; when asked again, find where to look.
 
     The answer is written into the submission's `checks.jsonl` before it is given.
 
     Parameters
     ----------
-    rubric : whose tolerances hold; None: those of the shipped rubric for so many carts, for the
+    rubric : sets the tolerances; None: the shipped rubric for this number of carts, with the
         submission's own system.
-    where : the numbers that a hint is asked for; None: all that may have one.
+    where : the numbers to give hints for; None: all that may have one.
 
     Raises
     ------
     SubmissionError : nothing is reported, no recording can be read, or the file of earlier answers
-        is not as it was written.
+        was changed.
     """
     if not _list_reported(submission.reported or Reported()):
         raise SubmissionError(
-            "no number is reported yet: write what you found under [reported.initial] or "
+            "no number is reported yet: enter what you found under [reported.initial] or "
             "[reported.final] of submission.toml, then check again"
         )
     folder, rubric = submission.folder, rubric or _default_rubric(submission)
-    read_answers(folder)  # a fault of the file is reported before the work
+    read_answers(folder)  # report a bad file before the work
     judged = analyse_under(submission, rubric=rubric, progress=progress)
     found = judge_numbers(judged.submission, judged.analysis, rubric=rubric)
     with turn_in(folder):
@@ -80,7 +80,7 @@ def check_numbers(
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedNumbers:
-    """The reported numbers by what became of them, and what it rests on."""
+    """The reported numbers by outcome, and the evidence."""
 
     work: Work
     flags: Sequence[Flag]
@@ -90,7 +90,7 @@ class JudgedNumbers:
 
 
 def judge_numbers(submission: Submission, analysis: Analysis, *, rubric: Rubric) -> JudgedNumbers:
-    """Judge every reported number as grading does; one that several criteria judge passes all.
+    """Judge every reported number like the grading; it must pass all criteria that judge it.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ def next_answer(
     basis: str,
     where: Collection[str] | None = None,
 ) -> CheckAnswer:
-    """Return the answer to one more ask.
+    """Return the answer to the next request.
 
     A number has a hint only if the last answer said that it disagrees, and nothing was changed
     since.
@@ -144,7 +144,7 @@ def next_answer(
 
 
 def _list_reported(reported: Reported) -> list[str]:
-    """Return the keys of what is reported; A and B are one."""
+    """Return the keys of the reported numbers; A and B count as one."""
     found = [f"initial.{name}" for name in reported.initial]
     found += [f"final.{name}" for name in reported.final]
     if reported.state_space and (reported.state_space.A or reported.state_space.B):

@@ -1,8 +1,8 @@
-"""Where to look for a number that is off: the kind of mistake and the stretch of the record.
+"""Hints for a wrong number: the kind of mistake and the part of the recording.
 
-Nothing here may tell a value. A stretch is one of six coarse parts, so that no period or settling
-time can be read from it; of sine dwells all are named, since the one nearest to a resonance would
-tell its frequency.
+A hint must not reveal a value. A part is one of six coarse ones, so that it shows no period or
+settling time. All sine dwells are named, because the one nearest to a resonance would reveal its
+frequency.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,9 +15,9 @@ from pipeline.names import read_name
 from pipeline.results import Analysis, Kind
 
 _TABLES = ("initial", "final")
-# Mistakes in reading a time record: also in a final table it is that record that tells.
+# Mistakes in reading a time record, which also explains them in a final table.
 _OF_TIME_RECORDS: tuple[Slip, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
-# What no stretch of a record tells.
+# Mistakes that no part of a recording shows.
 _OF_NO_RECORD: tuple[Slip, ...] = ("physically_impossible", "no_fit_done")
 _IN_FREQUENCY: tuple[Kind, ...] = ("sine", "sweep", "bode")
 _OF_LOOP: dict[str, Slip] = {
@@ -29,7 +29,7 @@ _OF_LOOP: dict[str, Slip] = {
 
 
 def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
-    """Return where to look for a number that disagrees.
+    """Return a hint for a number that disagrees.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
 
 def _find_slip(table: str, name: str, flags: Sequence[Flag]) -> tuple[Slip, tuple[Slip, ...]]:
     mine = [flag for flag in flags if _is_about(flag, table, name)]
-    # That the two tables differ says less than what is wrong with one.
+    # A difference between the tables says less than a mistake in one.
     mine.sort(key=lambda flag: flag.code == "initial_final_disagree")
     if not mine:
         return ("initial_off" if table == "initial" else "final_off"), ()
@@ -68,7 +68,7 @@ def _is_about(flag: Flag, table: str, name: str) -> bool:
 
 
 def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> Iterator[Stretch]:
-    """Yield the stretches that a number is read from."""
+    """Yield the parts of recordings from which a number is read."""
     if slip in _OF_NO_RECORD:
         return
     if table == "initial" or slip in _OF_TIME_RECORDS:
@@ -83,7 +83,7 @@ def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> It
 
 
 def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, Kind, Part]]:
-    """Yield the time records that a first estimate is read from: run, kind, which part."""
+    """Yield the recordings from which a first estimate is read: run, kind, part."""
     read = read_name(name)
     if read.is_by_eye and read.suffix != "n":
         return
@@ -113,7 +113,7 @@ def _find_kinds(analysis: Analysis) -> dict[str, Kind]:
 
 
 def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Part:
-    """Return which part of a record a window is in, coarsely."""
+    """Return the coarse part of a recording that contains a window."""
     record = next((one for one in analysis.records if one.id == run), None)
     if record is None:
         return "whole"
@@ -131,7 +131,7 @@ def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Par
 
 
 def _gather(told: Sequence[tuple[str, Kind, Part]]) -> Iterator[Stretch]:
-    """Yield the stretches with all recordings of one kind and part together."""
+    """Yield the parts, joining all recordings of the same kind and part."""
     order = [(kind, part) for kind in get_args(Kind) for part in get_args(Part)]
     for kind, part in order:
         runs = tuple(dict.fromkeys(run for run, k, p in told if (k, p) == (kind, part)))

@@ -1,7 +1,7 @@
-"""What the check answered, ask by ask: `checks.jsonl` in the submission, never with a value.
+"""The answers of the check, one per request: `checks.jsonl` in the submission, without values.
 
-Answers to many guesses lead to a number as a scale does to a weight. So every ask is counted, and
-the file goes with what is handed in.
+With enough guesses the answers would lead to the number. So every request is counted, and the file
+is part of the submission.
 """
 
 import hashlib
@@ -18,7 +18,7 @@ from pipeline.submission import Submission
 from pipeline.submission.load import outside
 
 FILE = "checks.jsonl"
-MAX_BYTES = 5_000_000  # some thousand asks
+MAX_BYTES = 5_000_000  # several thousand requests
 
 Part = Literal["whole", "beginning", "first_half", "middle", "second_half", "end"]
 Slip = Code | Literal["claims_off"]
@@ -37,7 +37,9 @@ class Hint(GradeTable):
 
     number: str
     slip: Annotated[Slip, Field(description="the kind of mistake")]
-    or_else: Annotated[tuple[Slip, ...], Field(description="what explains it as well")] = ()
+    or_else: Annotated[
+        tuple[Slip, ...], Field(description="another mistake that explains it equally well")
+    ] = ()
     stretches: tuple[Stretch, ...] = ()
 
 
@@ -47,28 +49,26 @@ class CheckAnswer(GradeTable):
     model_config = ConfigDict(json_schema_serialization_defaults_required=True)
 
     schema_: Annotated[Literal["cartlab-check/1"], Field(alias="schema")] = "cartlab-check/1"
-    ask: Annotated[int, Field(ge=1, description="how often it was asked, this time included")]
+    ask: Annotated[int, Field(ge=1, description="number of checks, including this one")]
     stage: Literal["which", "where"]
-    basis: Annotated[
-        str, Field(description="stays the same as long as set-up, tables and numbers do")
-    ]
+    basis: Annotated[str, Field(description="unchanged as long as set-up, tables and numbers are")]
     disagree: tuple[str, ...]
     agree: tuple[str, ...]
     not_checked: Annotated[
-        tuple[str, ...], Field(description="reported, and no recording decides them")
+        tuple[str, ...], Field(description="reported, but not decided by any recording")
     ]
     doubtful: Annotated[
-        tuple[str, ...], Field(description="recordings that do not hold what they should")
+        tuple[str, ...], Field(description="recordings with something wrong in them")
     ]
-    hints: Annotated[tuple[Hint, ...], Field(description="where it was asked where to look")] = ()
+    hints: Annotated[tuple[Hint, ...], Field(description="hints that were asked for")] = ()
 
 
 def read_answers(folder: Path) -> tuple[CheckAnswer, ...]:
-    """Return all answers so far; none where there is no file.
+    """Return all answers so far; empty without a file.
 
     Raises
     ------
-    SubmissionError : it is not as it was written.
+    SubmissionError : the file was changed.
     """
     path = folder / FILE
     if not path.exists() and not path.is_symlink():
@@ -87,15 +87,15 @@ def read_answers(folder: Path) -> tuple[CheckAnswer, ...]:
             answer = None
         if answer is None or answer.ask != number:
             raise SubmissionError(
-                f"{FILE}, line {number}: expected what `cartlab check` wrote, found something "
-                "else; put the file back as it was, or ask your instructor"
+                f"{FILE}, line {number}: this line was not written by `cartlab check`; restore "
+                f"the file, or ask your instructor"
             )
         answers.append(answer)
     return tuple(answers)
 
 
 def write_answer(folder: Path, answer: CheckAnswer) -> None:
-    """Write one more line; the caller has the turn and knows that the others can be read."""
+    """Write one more line; the caller holds the lock and has read the other lines."""
     path = folder / FILE
     before = path.read_bytes() if path.exists() else b""
     write_file(path, before + answer_line(answer).encode())
@@ -107,6 +107,6 @@ def answer_line(answer: CheckAnswer) -> str:
 
 
 def find_basis(submission: Submission) -> str:
-    """Return a text that stays the same as long as set-up, experiments and numbers do."""
+    """Return a text that changes only with set-up, experiments or numbers."""
     about = {"system", "design", "experiments", "reported"}
     return hashlib.sha256(submission.model_dump_json(include=about).encode()).hexdigest()[:12]

@@ -17,14 +17,14 @@ _NAMED = 4  # recordings named one by one; of more, the first and the last
 
 @dataclass(frozen=True, kw_only=True)
 class HintWords:
-    """A hint as it is read: the kind of mistake, then where to look, a sentence each."""
+    """A hint in words: the kind of mistake and where to look, one sentence each."""
 
     title: str
     look: tuple[str, ...]
 
 
 def number_words(number: str) -> str:
-    """Return what to call a reported number on a page: "K₁, first estimate"."""
+    """Return the name of a reported number on a page: "K₁, first estimate"."""
     table, _, name = number.partition(".")
     if table == "feedback":
         return WORDS.text(f"feedback_{name}")
@@ -47,7 +47,7 @@ def result_words(answer: CheckAnswer) -> str:
 
 
 def asked_words(times: int) -> str:
-    """Return how often it was asked, and who sees it."""
+    """Return the number of checks, and who sees it."""
     return WORDS.text("asked", times=count(times, "time"))
 
 
@@ -102,7 +102,7 @@ def answer_lines(answer: CheckAnswer) -> Iterator[str]:
 
 
 def asked_note(folder: Path) -> tuple[str, ...]:
-    """Return what a TA reads beside the grade: how often the check was asked, if it was."""
+    """Return the note for a TA on how often the check was used, if at all."""
     try:
         times = len(read_answers(folder))
     except SubmissionError:

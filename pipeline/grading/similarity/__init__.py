@@ -1,1 +1,1 @@
-"""Recordings and people that stand twice in a class."""
+"""Recordings and people found in several submissions of a class."""

@@ -1,4 +1,4 @@
-"""Who shares recordings with whom, and which: the pairs of a class put together."""
+"""Group the submissions of a class that share recordings."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,20 +14,20 @@ from pipeline.grading.grade import Flag
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """Submissions of which each shares a recording with another.
+    """Submissions each of which shares a recording with another.
 
-    `recordings` are those shared, each as the (submission, experiment)s in which it stands.
+    `recordings` are the shared ones, each as a list of (submission, experiment).
     """
 
     recordings: tuple[tuple[tuple[str, str], ...], ...]
 
     @property
     def submissions(self) -> tuple[str, ...]:
-        """Who stands in it."""
+        """The submissions of the cluster."""
         return tuple(sorted({name for recording in self.recordings for name, _ in recording}))
 
     def by_submissions(self) -> dict[tuple[str, ...], list[str]]:
-        """Return what is shared by whom: of the same submissions all recordings, in words."""
+        """Return the shared recordings in words, grouped by their submissions."""
         found: dict[tuple[str, ...], list[str]] = defaultdict(list)
         for recording in self.recordings:
             (_, first), *_ = recording
@@ -38,7 +38,7 @@ class Cluster:
 
 
 def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
-    """Return the clusters that flags for shared data make, given by submission."""
+    """Return the clusters that follow from flags for shared data, given by submission."""
     pairs = [
         ((name, mine["experiment"]), (mine["submission"], mine["other_experiment"]))
         for name, flag in flags.items()
@@ -55,7 +55,7 @@ def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
 
 
 def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str) -> list[Cluster]:
-    """Return clusters in which submissions have these names; who has none is `other`."""
+    """Return clusters with these names for submissions; unnamed ones become `other`."""
     return sorted(
         (
             Cluster(
@@ -73,7 +73,7 @@ def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str
 
 
 def _joined(pairs: Sequence[tuple[Any, Any]]) -> list[tuple[Any, ...]]:
-    """Return what pairs put together, in order."""
+    """Join pairs into groups, in order."""
     nodes = sorted({node for pair in pairs for node in pair})
     at = {node: i for i, node in enumerate(nodes)}
     ends = np.array([(at[a], at[b]) for a, b in pairs], dtype=int).reshape(-1, 2).T

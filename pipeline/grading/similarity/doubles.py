@@ -1,7 +1,7 @@
-"""People who stand in several submissions of a class.
+"""Find people who are authors of several submissions of a class.
 
-Submissions with an author in common are one team, whose sharing is no one's fault: whoever adds
-another's id to a copy would go unseen. So a TA is told, and no student accused.
+Submissions that share an author count as one team and are not flagged as copies. Somebody could
+hide a copy by adding another student's id, so the TA is informed, but no student is accused.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,18 +12,18 @@ from pipeline.grading.similarity.shared import find_shared
 from pipeline.words.numbers import count, listing
 from pipeline.words.text import clean
 
-_NAMED = 8  # submissions named of one person
+_NAMED = 8  # submissions named per person
 
 
 @dataclass(frozen=True, kw_only=True)
 class Double:
-    """Who stands in the same several submissions.
+    """The authors that several submissions have in common.
 
     Attributes
     ----------
-    authors : each "" where names are left out.
-    recordings : the most that one of the submissions has in common with the others.
-    compared : each has recordings that could be read.
+    authors : each "" if names are left out.
+    recordings : the largest number that one of the submissions shares with the others.
+    compared : whether each has readable recordings.
     """
 
     authors: tuple[str, ...]
@@ -32,7 +32,7 @@ class Double:
     compared: bool = True
 
     def __str__(self) -> str:
-        """What a TA is told."""
+        """The message for a TA."""
         named = [" ".join(clean(author).split()) for author in self.authors]
         several = len(named) > 1
         nameless = f"{len(named)} people" if several else "One person"
@@ -46,7 +46,7 @@ class Double:
 
 
 def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
-    """Return who stands in several submissions, given the authors of each."""
+    """Find the authors of several submissions, given the authors of each."""
     typed: dict[str, str] = {}
     found: dict[str, dict[str, None]] = {}
     for submission, people in authors.items():
@@ -64,7 +64,7 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
 
 
 def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list[Double]:
-    """Return them with what their submissions share; recordings handed out with the task count."""
+    """Return them with the number of shared recordings, including those given out by the lab."""
     alone = [replace(one, authors=(one.submission,)) for one in prints]
     shared = find_shared(alone)
     read = {one.submission for one in alone if one.fingerprints}

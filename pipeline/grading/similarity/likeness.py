@@ -1,10 +1,10 @@
-"""How alike two recordings are: in their noise, row by row, and beyond what a class shares.
+"""Measure the similarity of two recordings by their noise, beyond what the whole class shares.
 
-A copy has the noise of its original, whatever noise was added on top: the regression of one
-residual on the other, brought to one scale, has slope one. Honest runs share the bench: its knocks
-and limits are as sharp as noise and the same in every run, and an encoder with little noise of its
-own rounds one motion alike. So a class is its own reference: what the recordings of others explain
-of both is taken off, and slope and chance are told of the rest.
+A copy has the noise of its original, even if noise was added: the regression of one residual on
+the other, in the same scale, has slope one. Honest runs share the bench: its knocks and limits are
+as sharp as noise and equal in every run, and an encoder with little noise rounds motions equally.
+So the class is the reference: the part that recordings of others explain is subtracted from both,
+and slope and probability are computed from the rest.
 """
 
 from collections.abc import Sequence
@@ -15,31 +15,31 @@ from scipy.fft import next_fast_len
 
 from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
 
-LEAST_OVERLAP = 80  # samples that say something in both
+LEAST_OVERLAP = 80  # informative samples in both
 LEAST_SLOPE = 0.5
 _LEAST_SIGMAS = 4.5
-_SPREAD = 2.5  # standard deviations that the slope of a copy may be off one
-_SAMPLES_EACH = 10  # of a recording for each other one that is to explain it
-_RIDGE = 1e-6  # of a recording's power: recordings of others may be copies of one another
-_LEAST_PART = 1e-9  # of a recording's power that others leave
-_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # where the scale of two recordings is read off
+_SPREAD = 2.5  # standard deviations by which a copy's slope may differ from one
+_SAMPLES_EACH = 10  # samples of a recording per other recording used to explain it
+_RIDGE = 1e-6  # share of a recording's power; needed if others copied each other
+_LEAST_PART = 1e-9  # share of a recording's power that must remain unexplained
+_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # least noise for finding the scale of two recordings
 # A residual is kept to half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
 _EQUAL_PART = 0.5  # of the shorter recording
-_DIFFERENT_STEPS = 4  # that tell one reading from another
+_DIFFERENT_STEPS = 4  # encoder steps between clearly different readings
 
 
 @dataclass(frozen=True, kw_only=True)
 class Likeness:
-    """How alike two recordings are.
+    """The similarity of two recordings.
 
     Attributes
     ----------
-    slope : of the one's noise on the other's, of what the class does not explain.
-    sigmas : how far that is above chance.
-    experiments, times : of both; s, from and to, what is compared or equal.
-    equal_rows : how many rows in turn are equal but for one factor, 0 where they say too little.
-    different : how many readings of them differ from one another.
+    slope : of one noise on the other, after subtracting what the class explains.
+    sigmas : standard deviations above chance.
+    experiments, times : of both recordings; start and end of the compared or equal part, s.
+    equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
+    different : number of different readings among them.
     """
 
     experiments: tuple[str, str]
@@ -51,19 +51,19 @@ class Likeness:
 
     @property
     def is_sure(self) -> bool:
-        """Whether chance and the class do not explain it."""
+        """Return whether chance and the class cannot explain it."""
         return self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is sure, and a copy would be so alike."""
+        """Return whether it is sure and as strong as for a copy."""
         return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
 
 
 def compare(
     a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
 ) -> Likeness:
-    """Return how alike the noise of two recordings is, beyond what others' have of it.
+    """Compare the noise of two recordings, beyond what those of others explain.
 
     Sample i of `a` is sample i + shift of `b`, and of each of the others i + its shift.
     """
@@ -71,7 +71,7 @@ def compare(
     found = _between(a, b, shift=shift, first=first, last=last)
     if last - first < LEAST_OVERLAP:
         return found
-    # In units of b's noise, so that every cart has its say.
+    # In units of b's noise, so that every cart counts.
     of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
     factor = of_b / of_a * a.step / b.step if of_a * of_b > 0 else np.ones(len(a.step))
     in_a = a.noise[:, first:last] * factor[:, None]
@@ -81,7 +81,7 @@ def compare(
     if n.sum() < LEAST_OVERLAP:
         return found
     in_a, in_b = in_a * both, in_b * both
-    for row in range(len(a.measured), len(n)):  # an input has a scale of its own
+    for row in range(len(a.measured), len(n)):  # an input has its own scale
         in_a[row] *= np.linalg.norm(in_b[row]) / max(np.linalg.norm(in_a[row]), 1e-30)
     x = np.stack([in_a, in_b], axis=1)
     left = x @ x.transpose(0, 2, 1)
@@ -93,7 +93,7 @@ def compare(
             rest = _left(np.array([*x[row], *beside])[:, both[row]])
             left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
             n[row] -= len(beside)
-    # The signs of carts and of the input may be turned.
+    # The signs of carts and of the input may be reversed.
     product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
     of_a, of_b = np.diag(left.sum(axis=0)).tolist()
     if not of_a * of_b > 0:
@@ -103,7 +103,7 @@ def compare(
 
 
 def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likeness:
-    """Return two recordings' likeness, of which nothing is known but from where to where in `a`."""
+    """Return an empty likeness that only states the compared part of `a`."""
     return Likeness(
         experiments=(a.experiment, b.experiment),
         times=(a.times(first, last), b.times(first + shift, last + shift)),
@@ -111,7 +111,7 @@ def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likene
 
 
 def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
-    """Return a row's noise from one sample to another, 0 where there is none."""
+    """Return a row's noise between two samples, 0 where it is unknown."""
     part = np.zeros(last - first, dtype=np.float32)
     start, stop = max(first, 0), min(last, one.noise.shape[1])
     if start < stop:
@@ -130,9 +130,9 @@ def _left(x: np.ndarray) -> np.ndarray:
 
 
 def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
-    """Return the longest stretch in which two recordings are equal but for one factor a row.
+    """Return the longest stretch in which two recordings are equal up to one factor per row.
 
-    None where that says too little: rows that repeat, as a cart at rest makes them, are one.
+    None if it is not significant: repeated rows, as from a cart at rest, count once.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
     if last - first < LEAST_OVERLAP:
@@ -162,7 +162,7 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
 
 
 def align(a: Print, b: Print) -> tuple[float, int]:
-    """Return how well the noise of two recordings agrees where it does best, and at what shift."""
+    """Return the best agreement of the noise of two recordings, and its shift."""
     n = a.residual.shape[1] + b.residual.shape[1]
     length = next_fast_len(n, real=True)
     spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)

@@ -1,8 +1,8 @@
-"""Fingerprints of recordings: what no second run on the same bench repeats.
+"""Fingerprints of recordings: the part that no second run on the same bench repeats.
 
-Two honest teams that step the same bench get the same response, so the motion proves nothing. Its
-noise and the rounding of its encoder do: they are what a high-pass filter leaves, and they stay
-where a record is cut, shifted in time, rescaled, renamed or buried in further noise.
+Two honest teams that step the same bench get the same response, so the motion proves nothing. Noise
+and encoder rounding, isolated by a high-pass filter, are different in every run. They survive when
+a recording is cut, shifted in time, rescaled, renamed or covered with further noise.
 """
 
 import json
@@ -31,7 +31,7 @@ _KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a sto
 _JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
 _NOTHING = 1e-7  # of the travel: rounding in the filter
 
-_LEAST_SWING = 0.25  # of the largest: smaller swings move with the noise
+_LEAST_SWING = 0.25  # of the largest: smaller swings are affected by noise
 _FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of them
 _MOST_ANCHORS = 12  # in the motion
 _NOISE_ANCHORS, _APART = 12, 5  # samples
@@ -47,14 +47,14 @@ class Print:
 
     Attributes
     ----------
-    group : what was done: only recordings of the same kind of run are compared.
+    group : the kind of run; only recordings of the same kind are compared.
     residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
         input of a closed loop.
-    step : (n_rows,) what 1 stands for, in the record's position unit, or input unit.
-    anchors : lists of samples that are found again in a copy, the surest first, and so tell how it
-        is shifted: where the motion passes the middle between two extrema (they stand much noise),
-        and where the noise of the carts and of the input is loudest (they stand any cut).
-    motion : of the first cart, every so many samples: it tells how two recordings are scaled.
+    step : (n_rows,) value of 1 in the recording's position unit or input unit.
+    anchors : lists of samples that can be found again in a copy, the surest first, to find its
+        shift: midpoints between two extrema of the motion (robust against noise), and maxima of the
+        noise of carts and input (robust against cuts).
+    motion : of the first cart, at every few samples, to find the scale between two recordings.
     start, interval : s; the time of the first sample, and from one to the next.
     """
 
@@ -69,7 +69,7 @@ class Print:
 
     @property
     def measured(self) -> np.ndarray:
-        """The residual's rows of positions: the input is computed from them, not measured."""
+        """The residual's rows of positions, without the input, which is computed from them."""
         return self.residual[: -1 if self.group.startswith("closed_loop") else None]
 
     @cached_property
@@ -95,7 +95,7 @@ class Print:
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
-    """Return the fingerprints of a submission's recordings, packed; b"" where there are none."""
+    """Return the packed fingerprints of a submission's recordings; b"" without recordings."""
     rows = sum(len(record.carts) + 1 for record in records)
     most = min(_MOST_SAMPLES, _MOST_VALUES // max(rows, 1))
     prints = [found for record in records for found in _prints(record, most=most)]
@@ -119,7 +119,7 @@ def fingerprint(records: Sequence[Record]) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Print, ...]:
-    """Return the fingerprints that `fingerprint` packed, none of those of an older version."""
+    """Read fingerprints packed by `fingerprint`; those of an older version are ignored."""
     if not packed:
         return ()
     head, _, body = zlib.decompress(packed).partition(b"\0")
@@ -146,10 +146,10 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
 
 
 def _prints(record: Record, *, most: int) -> Iterator[Print]:
-    """Yield the fingerprint of a recording; none where a cart does not move or it is too short.
+    """Yield the fingerprint of a recording, unless a cart does not move or it is too short.
 
-    Under feedback the controller puts the noise of the measured positions into the input, where
-    noise added to the positions does not reach it.
+    Under feedback the controller passes the noise of the measured positions to the input. Noise
+    added to the positions later does not change it there.
     """
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
@@ -186,9 +186,9 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
 
 
 def _sigma(noise: Array, *, travel: float) -> float:
-    """Return the standard deviation of a residual (n,) where there is any; 0 where there is none.
+    """Return the standard deviation of a residual (n,) over its nonzero part; 0 if all is zero.
 
-    A cart at rest reads the same count for seconds: that would only tell how long it rested.
+    A cart at rest reads the same count for seconds, which would only measure how long it rested.
     """
     there = np.abs(noise[np.abs(noise) > _NOTHING * travel])
     return MEDIAN_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
@@ -196,7 +196,7 @@ def _sigma(noise: Array, *, travel: float) -> float:
 
 @cache
 def _high_pass() -> Array:
-    """Return the taps of the filter: 1 less a low pass, and nothing of a constant."""
+    """Return the taps of the filter: 1 minus a low pass, with no response to a constant."""
     cut = 1 - PASSED
     lag = np.arange(_TAPS) - MARGIN
     taps = -cut * np.sinc(cut * lag) * np.kaiser(_TAPS, _WINDOW)
@@ -205,7 +205,7 @@ def _high_pass() -> Array:
 
 
 def _noise_anchors(loudness: Array) -> list[int]:
-    """Return the samples where the residual (n,) is loudest, a kink of the motion included."""
+    """Return the samples with the largest residual (n,), including kinks of the motion."""
     peak = np.max(np.lib.stride_tricks.sliding_window_view(loudness, 2 * _APART + 1), axis=1)
     peaks = _APART + np.flatnonzero(loudness[_APART:-_APART] == peak)
     return peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]].tolist()
@@ -224,7 +224,7 @@ def _motion_anchors(motion: Array) -> list[int]:
 
 
 def _turning_points(motion: Array, *, least: float) -> np.ndarray:
-    """Return the extrema between which the motion swings by at least so much."""
+    """Return the extrema between which the motion changes by at least a given size."""
     if not least > 0:
         return np.zeros(0, dtype=np.int64)
     slope = np.sign(np.diff(motion))

@@ -1,7 +1,7 @@
-"""Recordings that stand in two submissions: found by their noise, named on both sides.
+"""Find recordings that two submissions share, by comparing their noise.
 
-Noise convicts where it agrees wholly beyond what the class shares, and nobody's agrees in part;
-equal rows convict whatever else is found. In a class of less than five teams only they do.
+Equal noise, beyond what the class shares, is evidence unless other pairs of the class agree in
+part. Equal rows are always evidence. In a class of less than five teams, only equal rows count.
 """
 
 from collections import Counter, defaultdict
@@ -27,42 +27,42 @@ from pipeline.grading.similarity.likeness import (
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.words.numbers import first_few
 
-_WIDTH = 512  # samples around an anchor that are compared at first
+_WIDTH = 512  # samples around an anchor in the first comparison
 _BEFORE = 128  # of them before it
-_FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors that all of the others are held against
-_PER_SIGMA, _LEVELS = 1.5, 5.0  # noise at first sight: in finer levels rounding looks alike
+_FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors with which all others are compared
+_PER_SIGMA, _LEVELS = 1.5, 5.0  # noise levels in the first comparison; finer ones show rounding
 _BLOCK = 2048  # anchors compared in one product
-_WORTH_A_LOOK = 3.2  # sigmas at first sight: one in a thousand by chance
-# The rest of the work grows with the number of recordings, not with its square. Chance offers so
-# many at first sight where 4,000 recordings are of one kind, and two honest teams with 20 runs of
-# that kind each a tenth of what is compared at most.
-_MOST_ALIKE = 16  # first anchors looked at for one anchor, the most alike; and what was handed out
-_MOST_COMPARED = 10  # times the recordings that two submissions have of one kind
-_COUNTS = 4.5  # sigmas of a recording that counts with others
+_WORTH_A_LOOK = 3.2  # sigmas in the first comparison: one in a thousand by chance
+# These limits make the remaining work grow with the number of recordings, not its square. With
+# 4,000 recordings of one kind, chance gives so many candidates. Two honest teams with 20 runs each
+# need a tenth of the limit on comparisons.
+_MOST_ALIKE = 16  # candidates per anchor, the most similar, plus the lab's own recordings
+_MOST_COMPARED = 10  # times the number of recordings of one kind in two submissions
+_COUNTS = 4.5  # sigmas for a recording that counts together with others
 _ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
 _TOGETHER = 7.5  # root of the summed squares of several
-# Where noise of a twenty-fifth of a count meets the very same motion and zero, one reading in so
-# many is rounded otherwise: chance e^-1 for as many equal ones, in each pair of recordings.
+# With noise of 1/25 count and the very same motion and zero, one reading in so many is rounded
+# differently. So that many equal ones have a probability of 1/e in each pair of recordings.
 _TO_A_ROUNDING = 22
-_MOST_ALIGNED = 60  # recordings of others that are looked at
-_MOST_OTHERS = 24  # of them that explain
+_MOST_ALIGNED = 60  # recordings of others that are aligned
+_MOST_OTHERS = 24  # of these that are used to explain
 _FEWEST_TEAMS = 3  # of them
-_COPIES = 1 / 3  # of the other teams, the most alike: they may have the same copy
-_MOST_IN_PART = 1  # pair of a class whose noise agrees in part: two knocks may meet once
-_MATCHES_TO_IN_PART = 10  # no chance, if that many agree wholly for each pair that does in part
+_COPIES = 1 / 3  # of the other teams, the most similar, are left out: they may have the same copy
+_MOST_IN_PART = 1  # pair of a class with partly equal noise: two knocks may coincide once
+_MATCHES_TO_IN_PART = 10  # not by chance, if so many pairs agree fully per partial agreement
 
 
 @dataclass(frozen=True, kw_only=True)
 class SharedRecord:
-    """A recording of one submission that is one of another's, too.
+    """A recording that another submission also contains.
 
     Attributes
     ----------
     submission : the other one.
-    sigmas : how far above chance their noise agrees.
-    equal_rows : how many rows in turn are equal, but for one factor a column; 0 where that is not
-        the evidence.
-    time, other_time : s, from and to, where they are equal or agree.
+    sigmas : agreement of the noise, in standard deviations above chance.
+    equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this
+        is not the evidence.
+    time, other_time : start and end of the equal part, s.
     """
 
     experiment: str
@@ -76,13 +76,13 @@ class SharedRecord:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Entry:
-    """A fingerprint and the submission (by number) it is of."""
+    """A fingerprint and the number of its submission."""
 
     owner: int
     print: Print
 
 
-# How alike, whose, the recording, and how it is shifted.
+# Likeness, owner, recording and shift.
 _Aligned = tuple[float, int, Print, int]
 
 
@@ -92,12 +92,12 @@ def find_shared(
     earlier: Iterable[Member] = (),
     examples: Iterable[bytes] = (),
 ) -> dict[str, tuple[SharedRecord, ...]]:
-    """Return, by submission of the batch, its recordings that stand in another submission.
+    """Return, by submission of the batch, its recordings that another submission also contains.
 
     Parameters
     ----------
-    earlier : of earlier batches; only held against the batch, not against one another.
-    examples : packed fingerprints of recordings that were handed out: those may be shared.
+    earlier : of earlier batches; compared only with the batch, not with each other.
+    examples : packed fingerprints of recordings given out by the lab, which may be shared.
     """
     everyone = [*batch, *earlier]
     names = [
@@ -139,11 +139,11 @@ def find_shared(
 
 
 def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
-    """Return the fingerprints that may be of one recording, each once an owner."""
+    """Group fingerprints that may be of the same recording, each once per owner."""
     groups: dict[str, list[_Entry]] = defaultdict(list)
     for owner, prints in enumerate(owners):
         once: dict[tuple[str, bytes], Print] = {}
-        for one in unpack(prints.fingerprints):  # one recording under many names is one
+        for one in unpack(prints.fingerprints):  # one recording under several names counts once
             once.setdefault((one.group, one.residual.tobytes()), one)
         for one in once.values():
             groups[one.group].append(_Entry(owner=owner, print=one))
@@ -151,7 +151,7 @@ def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
 
 
 def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> SharedRecord:
-    """Return a likeness as one side of it sees it."""
+    """Return a likeness from the view of one side."""
     return SharedRecord(
         experiment=one.experiments[mine],
         submission=submission,
@@ -164,7 +164,7 @@ def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> Shar
 
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
-    """Return the flag of one submission: which recordings, and where else they stand."""
+    """Return the flag of one submission: its shared recordings and their other places."""
     recordings = [asdict(record) for record in records]
     others = list(dict.fromkeys(record.submission for record in records))
     return Flag(
@@ -176,9 +176,9 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
 
 
 def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str]) -> str:
-    """Return the sentence for recordings that stand in other submissions, with the best evidence.
+    """Return the sentence about recordings in other submissions, with the best evidence.
 
-    `recordings` as in the evidence of a flag; a gradebook may hold some without times.
+    `recordings` are those of a flag's evidence; a gradebook may hold some without times.
     """
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     stand = "stands" if len(experiments) == 1 else "stand"
@@ -189,22 +189,21 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
     return (
         f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: "
         f"{same}, those {when} in {best['experiment']}. "
-        "That does not say whose they are; if they were shared for a reason, say so."
+        "This does not show whose they are; if they were shared for a reason, say so."
     )
 
 
 def told(flag: Flag) -> str:
-    """Return what a student reads of a flag: whose the other submission is, the instructor says."""
+    """Return the flag without the other submission's name, which only the instructor gives."""
     if flag.code != "shared_data":
         return flag.message
     return shared_message(flag.evidence["recordings"], ["another submission"])
 
 
 def same_team(a: Member, b: Member) -> bool:
-    """Tell whether two submissions are of one team.
+    """Return whether two submissions are from the same team.
 
-    That is with an author in common, or handed in under one number of a platform; without
-    authors, of the same name.
+    They share an author or a platform's number; without authors, they have the same name.
     """
     if same_number(a.owner, b.owner):
         return True
@@ -214,7 +213,7 @@ def same_team(a: Member, b: Member) -> bool:
 
 
 def same_recordings(a: Member, b: Member) -> bool:
-    """Tell whether one of two submissions has all recordings of the other, untouched."""
+    """Return whether one of two submissions has all recordings of the other, unchanged."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
@@ -222,10 +221,10 @@ def same_recordings(a: Member, b: Member) -> bool:
 def _telling(
     matches: Mapping[tuple[int, int], Sequence[Likeness]],
 ) -> dict[tuple[int, int], list[Likeness]]:
-    """Return what tells a copy, of all that looks alike in a class, by pair of submissions.
+    """Return the matches of a class that prove a copy, by pair of submissions.
 
-    Where the noise of several agrees in part, the bench or its encoder makes it do so, and says
-    nothing of those that agree wholly. Equal rows are a copy whatever else is found.
+    If the noise of several pairs agrees in part, the bench or its encoder causes this, and full
+    agreement proves nothing either. Equal rows always prove a copy.
     """
     sure = [one for found in matches.values() for one in found if one.is_sure]
     whole = sum(one.is_whole for one in sure)
@@ -238,9 +237,9 @@ def _telling(
 
 
 def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
-    """Return the matches of one pair of submissions, one for each recording, if they suffice.
+    """Return the matches of one pair of submissions, one per recording, if they suffice.
 
-    `compared` is how many pairs of recordings there are in which chance may have had its way.
+    `compared` is the number of pairs of recordings that chance had.
     """
     chosen: list[Likeness] = []
     for one in sorted(found, key=lambda one: (-one.different, -one.sigmas, one.experiments)):
@@ -259,7 +258,7 @@ def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
 ) -> Iterator[tuple[tuple[int, int], Likeness]]:
-    """Yield pairs of recordings of different teams that look alike, with their owners."""
+    """Yield pairs of similar recordings of different teams, with their owners."""
     best: dict[tuple[int, int], Likeness] = {}
     alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # at first comparison
     seen: set[tuple[int, int, int]] = set()
@@ -269,7 +268,7 @@ def _matches(
     def same(a: int, b: int) -> bool:
         return same_team(owners[a], owners[b])
 
-    partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: surely a copy
+    partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: certainly a copy
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
     for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
@@ -308,7 +307,7 @@ def _matches(
 
 
 def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
-    """Return recordings of others beside one of them, the most alike first."""
+    """Return recordings of others aligned with one, the most similar first."""
     rest = [one for one in entries if one.owner != entries[i].owner]
     found = []
     for one in rest[:: max(1, len(rest) // _MOST_ALIGNED)]:
@@ -318,9 +317,9 @@ def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
 
 
 def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
-    """Return the recordings that say what a class shares, with their shifts; none of a small one.
+    """Return recordings that show what a class shares, with their shifts; empty for a small class.
 
-    The most alike may be of teams that have the same copy, and are left out.
+    The most similar ones may belong to teams with the same copy, and are left out.
     """
     teams = list(dict.fromkeys(owner for _, owner, _, _ in aligned))
     if len(teams) < _FEWEST_TEAMS:
@@ -330,12 +329,12 @@ def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
 
 
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
-    """Yield (entry, its anchor, other entry, its anchor) whose surroundings look alike.
+    """Yield (entry, its anchor, other entry, its anchor) with similar surroundings.
 
-    All anchors are held against the first ones, in the motion and in the noise apart. No index
-    does better than this one product: under its own noise six times over a copy looks hardly more
-    alike than chance. The most alike come first, of those in the motion and of those in the noise.
-    What was handed out, by owners beyond `everyone`, is never crowded out by those who used it.
+    All anchors are compared with the first ones, separately in motion and noise. An index would not
+    be faster than this product: with six times its noise added, a copy is hardly more similar than
+    chance. The most similar come first, separately for motion and noise. Recordings given out by
+    the lab (owners beyond `everyone`) are always candidates.
     """
     owners = np.array([entry.owner for entry in entries])
     kinds = zip_longest(*(one.print.anchors for one in entries), fillvalue=())
@@ -346,7 +345,7 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
             continue
         columns = _windows(entries, first).T
         of_columns = owners[[i for i, _ in first]]
-        found: list[tuple[float, int, int]] = []  # how alike, the place, the first anchor
+        found: list[tuple[float, int, int]] = []  # similarity, place, first anchor
         for start in range(0, len(places), _BLOCK):
             block = places[start : start + _BLOCK]
             alike = np.abs(_windows(entries, block) @ columns)
@@ -364,7 +363,7 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
 def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the residuals around anchors, (n, n_free * _WIDTH).
 
-    Scaled so that a product of two is in sigmas, at first sight.
+    Scaled so that a product of two is approximately in sigmas.
     """
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)

@@ -34,7 +34,7 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
             continue
         if values.shape[0] < values.shape[1]:
             values = values.T
-            notes.append(f"{variable.name} lies on its side: its rows are taken as the columns")
+            notes.append(f"{variable.name} is transposed: its rows are read as columns")
         arrays += list(values.T)
         numbers = range(1, values.shape[1] + 1)
         names += [f"{variable.name} column {i}" if joined else str(i) for i in numbers]
@@ -54,7 +54,7 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
         refuse_unusable(wide[None, :], names=[name], place=lambda row: f"{source} sample {row + 1}")
         unwrapped = _unwrap(wide, column.dtype)
         if unwrapped is not wide:
-            notes.append(f"{name}: a {column.dtype} counter that ran over was made continuous")
+            notes.append(f"{name}: a {column.dtype} counter that overflowed was made continuous")
         columns.append(unwrapped)
     values = np.array(columns)
     return FileTable(
@@ -117,7 +117,7 @@ def _advice(variable: MatVariable, *, longest: int) -> str:
     if variable.values is not None:
         if variable.samples <= _MAX_COLUMNS:
             return ""
-        return f"if it is a recording, save it in a file of its own: save('new.mat', '{name}')"
+        return f"if it is a recording, save it in a separate file: save('new.mat', '{name}')"
     if variable.bytes < 8 * longest:  # too few to hold even the times
         return ""
     match variable.kind:
@@ -135,7 +135,7 @@ def _advice(variable: MatVariable, *, longest: int) -> str:
         case "sparse":
             return f"if it is a recording, save full({name})"
         case "complex" | "array of more than two dimensions" | "no real matrix":
-            return "if it is a recording, save it as real vectors, one a signal"
+            return "if it is a recording, save it as real vectors, one per signal"
     return ""
 
 

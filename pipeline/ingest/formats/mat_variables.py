@@ -98,7 +98,7 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
     # h5py raises many kinds of error.
     except (ArithmeticError, LookupError, NotImplementedError, OSError, RuntimeError, TypeError,
             ValueError, struct.error, zlib.error):  # fmt: skip
-        raise SubmissionError(f"{source}: the .mat file is broken or cut short") from None
+        raise SubmissionError(f"{source}: the .mat file is damaged or truncated") from None
     if len(variables) > _MOST_VARIABLES:
         raise SubmissionError(
             f"{source}: holds more than {_MOST_VARIABLES:,} variables; keep those of the recording"

@@ -76,7 +76,7 @@ class FileTable:
         """The fault of a truncated file, and what to do; "" for a complete one."""
         if self.cut is None:
             return ""
-        return f"{self.cut}; the file was cut short: export it again, or delete its last line"
+        return f"{self.cut}; the file is truncated: export it again, or delete its last line"
 
     def place(self, row: int) -> str:
         """Return "line 12" (or "row 12", or "sample 12") for a row counted from 0."""
@@ -152,7 +152,7 @@ def refuse_extreme(values: Array, *, what: str) -> None:
     largest = float(np.abs(values).max(initial=0.0))
     if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:
         raise SubmissionError(
-            f"{what} is {largest:.3g} at its largest; expected {_SMALLEST_MEASURED:g} to "
+            f"{what} reaches {largest:.3g}; expected {_SMALLEST_MEASURED:g} to "
             f"{_LARGEST_MEASURED:g}: check the file, its unit and `per_count`"
         )
 

@@ -120,14 +120,14 @@ def _fits(row: Sequence[str], *, width: int) -> bool:
 def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
     """Return why a row does not fit its heading."""
     if [field.strip(QUOTES).casefold() for field in fields] == [n.casefold() for n in names]:
-        return "a second heading: two records pasted together"
+        return "a second heading: two recordings were pasted together"
     if len(fields) != len(names):
         return f"expected {len(names)} columns, found {len(fields)}"
     for name, field in zip(names, fields, strict=True):
         if not is_number(field):
             if not field.strip():
                 return f"{name!r} is empty"
-            return f"{name!r} is no number: {field[:30]!r}"
+            return f"{name!r} is not a number: {field[:30]!r}"
     return "not a row of numbers"
 
 
@@ -177,7 +177,7 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
         raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
     if (longest := max(map(len, names), default=0)) > _LONGEST_HEADING:
         raise SubmissionError(
-            f"{place}: a heading of {longest:,} characters, at most {_LONGEST_HEADING} are read"
+            f"{place}: a heading of {longest:,} characters; the limit is {_LONGEST_HEADING}"
         )
     clean = [name.strip(QUOTES) or str(i) for i, name in enumerate(names, start=1)]
     clean = [name if name.isprintable() else repr(name)[1:-1] for name in clean]
@@ -224,8 +224,8 @@ def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
         line = text.count("\n", 0, end) + 1
         if "[" in rest:
             raise SubmissionError(
-                f"{source} line {line}: more data after the closing bracket; "
-                "two records pasted together"
+                f"{source} line {line}: more data after the closing bracket: two recordings were "
+                f"pasted together"
             )
         notes.append(f"text after line {line} is not data and was not read")
     return make_table(

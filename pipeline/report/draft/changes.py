@@ -98,7 +98,7 @@ def read_results(path: Path) -> Draft:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except ValidationError as error:
         what = first_refusal(error)
-        raise ConfigError(f"{path}: no results.json of cartlab ({what})") from None
+        raise ConfigError(f"{path}: not a results.json of cartlab ({what})") from None
 
 
 def check_comparable(before: Draft, *, bench: Bench) -> None:

@@ -53,9 +53,9 @@ def build_document(
 ) -> Document:
     """Return the report of an analysis; sections that have nothing to show are left out.
 
-    `gap` is the gap analysis of the same data, where there is one; `worked` are sections that
-    stand in the place of the one on the model; `changes` is what an earlier draft had otherwise.
-    `answer` gives the model answer to a question: then the students' notes are left out.
+    `gap` is the gap analysis of the same data, if there is one. `worked` sections replace the
+    section on the model. `changes` are the differences from an earlier draft. `answer` gives the
+    model answer to a question; the students' notes are then left out.
     """
     page = Page(analysis)
     asked = ask(analysis)

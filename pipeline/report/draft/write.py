@@ -71,13 +71,13 @@ def render_report(
     files: Files = Files(),
     progress: Progress = silent,
 ) -> None:
-    """Write `report.html`, `figures/*.svg` and what else is wanted into the folder `out`.
+    """Write `report.html`, `figures/*.svg` and the other requested files into the folder `out`.
 
-    The same analysis gives the same bytes. What the PDF's fonts cannot show is warned of, in the
-    report and through `progress`, which is also told of each section.
+    The same analysis gives the same bytes. The report and `progress` warn of characters that the
+    PDF's fonts lack; `progress` also gets the name of each section.
     """
     if files.pdf and (lost := missing_characters(_students_text(analysis))):
-        warning = f"report.pdf: no font there has {lost}; report.html shows them"
+        warning = f"report.pdf: its fonts lack {lost}; report.html shows them"
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)

@@ -194,7 +194,7 @@ def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart:
     arriving = run.residual_force(chain)[0] + run.u
     ax.plot(milliseconds, run.u[near], drawstyle="steps-post", **SECOND_LINE)
     ax.plot(milliseconds, arriving[near], color=MODEL, lw=1.1)
-    ax.set_xlabel("time about the step off [ms]")
+    ax.set_xlabel("time from the end of the step [ms]")
     ax.set_ylabel(f"force on cart 1 [{INPUT}]")
 
 

@@ -32,7 +32,7 @@ def build_gallery(effects: Sequence[Effect], *, progress: Progress = silent) -> 
     parts: list[Part] = [("summary", "Catalogue", lambda page: _overview(page, effects))]
     parts += [(e.key, e.title, lambda page, e=e: _entry(page, e)) for e in effects]
     return Document(
-        title="What a bench may do beyond the linear chain",
+        title="Effects beyond the linear chain",
         subtitle="The catalogue of effects",
         authors=(),
         sections=PageBuilder().sections(parts, doing="effects", progress=progress),

@@ -45,9 +45,9 @@ def formula(math: Math, *, copy: str = "") -> Formula:
 def equations_of_motion(
     springs: Sequence[bool], *, forces: Sequence[Term] | None = None
 ) -> Formula:
-    """Return Newton's law for every cart, with the springs that are there.
+    """Return Newton's law for every cart, with the existing springs.
 
-    `forces` stand on the right, one for each cart; default: the input on the first.
+    `forces` are the right-hand sides, one for each cart; default: the input on the first.
     """
     n = len(springs) - 1
     equations = []

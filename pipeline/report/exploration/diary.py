@@ -37,21 +37,21 @@ class WeighedExplanation:
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """What was known at one turn.
+    """The state of knowledge at one turn.
 
     Attributes
     ----------
     seconds : at the bench so far, rests included.
     recorded : ids of the recordings made in this turn.
-    errors : relative standard error of each named parameter, by name; None where it has none.
-    verdict : of the gap; "" where it could not be looked for.
-    explanations : in dispute, that of the model first, or the one that is named; none where the
-        linear chain does.
-    left, floor : what the model leaves of the motion, and what noise alone would.
-    reached : all that was asked for is known, and what else acts has a name or is not there.
-    said : what is known, what is doubted and why the next recording is made, in one sentence.
-    gap : as it was looked for at that turn; None where it could not be. Of an earlier turn it has
-        the one trace that the diary shows.
+    errors : relative standard error of each parameter, by name, or None.
+    verdict : of the gap analysis; "" if it was not possible.
+    explanations : the competing ones, that of the model first, or the named one; empty if the
+        linear chain is enough.
+    left, floor : error of the model as a share of the motion, and the noise floor.
+    reached : all requested parameters are known, and the gap is named or absent.
+    said : known results, doubts and the reason for the next recording, in one sentence.
+    gap : the gap analysis of that turn, or None; an earlier turn has only the trace that the
+        diary shows.
     """
 
     seconds: float
@@ -140,7 +140,7 @@ def _tone(gap: Gap | None) -> Tone:
 
 
 def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Tell each turn: when, what was recorded, what was said, and the run that decided it."""
+    """Show each turn: time, recordings, decision, and the run behind it."""
     blocks: list[Block] = []
     for number, turn in enumerate(turns, start=1):
         recorded = listing(turn.recorded) or _WORDS.text("nothing_new")
@@ -200,7 +200,7 @@ def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> Non
 
 
 def _explained(turn: Turn) -> list[str]:
-    """Return each explanation in dispute with its weight; of one alone there is none to tell."""
+    """Return the competing explanations with their weights; a single one has no weight."""
     if len(turn.explanations) < 2:
         return [one.name for one in turn.explanations]
     weights = [
@@ -229,11 +229,11 @@ def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
 
 
 def _left_figure(turns: Sequence[Turn], looked: Sequence[Turn]) -> Figure:
-    """Draw what the model leaves of the motion over time, and what noise alone would."""
+    """Draw the unexplained share of the motion and the noise floor over time."""
     figure, (ax,) = panels(1.5)
     seconds = [turn.seconds for turn in looked]
     left, floor = ([100 * (getattr(t, name) or 0.0) for t in looked] for name in ("left", "floor"))
-    ax.plot(seconds, left, "o-", label="left by the model")
+    ax.plot(seconds, left, "o-", label="linear model and effects")
     ax.plot(seconds, floor, "--", color=SECOND, label="noise alone")
     _whole_axes(ax, turns, [*left, *floor])
     ax.set_ylabel("of the motion [%]")

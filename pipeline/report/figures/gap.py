@@ -167,7 +167,7 @@ def force_figure(
             (f.velocity if axis == "velocity" else f.position, f.measured, f.model) for f in own
         ]
         what = f"velocity [{position}/s]" if axis == "velocity" else f"position [{position}]"
-        ax.set_ylabel(f"force left over [{drive}]")
+        ax.set_ylabel(f"unexplained force [{drive}]")
     if not shown:
         return None
     plot_force(ax, shown, added=added)

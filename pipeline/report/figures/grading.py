@@ -150,7 +150,7 @@ def reported_decay_figure(
     title: str,
     position_unit: str,
 ) -> Figure:
-    """Return a decay with the one that begins alike and has the reported numbers.
+    """Return a decay with the curve of the reported numbers from the same start.
 
     Parameters
     ----------

@@ -122,7 +122,7 @@ def panels(
 def small_multiples(
     titles: Sequence[str], *, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
-    """Return a panel under each title, on one time axis: repeats are seen to be alike, or not."""
+    """Return a panel under each title, on one time axis, so that repeats can be compared."""
     columns = 2 if len(titles) == 4 else min(len(titles), 3)
     rows = -(-len(titles) // columns)
     figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)

@@ -11,7 +11,7 @@ from matplotlib.transforms import ScaledTranslation
 
 from pipeline.arrays import Array
 
-# What a page that zooms draws anew or moves: grids, tick labels, letters that mark a place.
+# Parts that a zooming page redraws or moves: grids, tick labels, letters that mark a place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
 GRID = "#e4e4e4"
 _SIZE = 7.5  # points, of the labels

@@ -150,8 +150,8 @@ def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
     style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
     colour, _, mark, _ = CARTS[style]
     plot_points(ax, t, y, most=400, name=name, color=colour)
-    # Every cart's marks, 16 each, at times of their own, or where carts move alike one would hide
-    # the other:
+    # Every cart has 16 marks at its own times, because equal motions would otherwise hide each
+    # other.
     at = np.linspace(0, t.size - 1, 16 * len(CARTS)).astype(int)[style :: len(CARTS)]
     ax.plot(t[at], y[at], mark, ms=3.6, mfc="white", mec=colour, mew=0.9, label=name)
 

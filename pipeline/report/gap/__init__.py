@@ -1,1 +1,1 @@
-"""What the linear model leaves out: a report of its own, and a section of the other."""
+"""The gap analysis as a separate report and as a section of the main report."""

@@ -68,7 +68,7 @@ def _find(folder: Path, analysis: Analysis) -> tuple[Gap | None, str]:
         except ConfigError as error:
             return None, f"{place} cannot be used: {error}"
         if gap.provenance.files != analysis.files:
-            return None, f"{place} is of other data than this report: run cartlab gap again"
+            return None, f"{place} belongs to other data than this report: run cartlab gap again"
         return gap, ""
     return None, ""
 

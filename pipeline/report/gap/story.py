@@ -97,9 +97,9 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
     made = WORDS.text("made" if gap.complete else "made_so_far", version=__version__)
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
-        ("force-left", "What force is left", lambda page: _force_left(page, gap)),
+        ("force-left", "The unexplained force", lambda page: _force_left(page, gap)),
         ("hands", WORDS.text("hands"), lambda page: _hands(page, gap)),
-        ("apart", "What would tell the explanations apart", lambda page: _apart(page, gap)),
+        ("apart", "How to decide between the explanations", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
         ("warnings", "Warnings", lambda page: remarks(analysis.warnings)),
@@ -374,9 +374,9 @@ def _method(gap: Gap) -> list[Block]:
 
 
 def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
-    """Return the cart that moves least as the linear model says, in runs just recorded.
+    """Return the cart that the linear model describes worst, in the new runs.
 
-    Of all runs where the gap has none of these; None where it has no runs at all.
+    Without new runs, all runs count; None if there are no runs at all.
     """
 
     def size(trace: Trace) -> float:

@@ -18,7 +18,7 @@ WORDS = phrases("gap")
 
 
 def added_name(gap: Gap) -> str:
-    """Return what the model with more than the linear one is called; "" where there is none."""
+    """Return the name of the model with effects; "" without effects."""
     if not gap.effects:
         return ""
     return WORDS.text("with_suspects" if gap.verdict == "unexplained" else "with_effects")
@@ -206,13 +206,17 @@ def _errors(gap: Gap) -> str:
     return WORDS.text(
         "left",
         errors=errors,
-        times=f"So {significant(gap.final / least, digits=2)} times as much" if least else "More",
+        times=_times_left(gap.final / least) if least else "More remains",
         run=clean(worst.experiment),
         cart=worst.cart,
         start=f"{worst.start:.2f}",
         end=f"{worst.end:.2f}",
         what=phase(worst.what),
     )
+
+
+def _times_left(times: float) -> str:
+    return f"The error is still {significant(times, digits=2)} times that"
 
 
 def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
@@ -263,7 +267,7 @@ def _sizes_there(found: FoundEffect, *, several: bool) -> str:
 
 def _size(value: NamedValue) -> str:
     unit = unit_text(clean(value.unit))
-    # So small an error stands in the table alone.
+    # An error so small is only in the table.
     exact = value.std is not None and value.std < 1e-3 * abs(value.value)
     text = significant(value.value) if exact else with_error(value.value, value.std)
     return text + (f" {unit}" if unit else "")

@@ -86,7 +86,7 @@ def render_drawing(svg: str) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Return scripts as the one that stands in a page."""
+    """Join scripts into the one of a page."""
     return "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in names)
 
 
@@ -153,7 +153,7 @@ def _coloured(svg: str) -> str:
 
 
 def _tails(table: Table) -> list[str]:
-    """Return how wide the part from the decimal mark on is in each column, "" where none is."""
+    """Return the width from the decimal mark on for each column, "" without decimals."""
     columns = zip(*table.rows, strict=True)
     return [
         f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
@@ -162,7 +162,7 @@ def _tails(table: Table) -> list[str]:
 
 
 def _heads(table: Table) -> list[str]:
-    """Return the heading that a phone shows before each value of a row, "" where none is shown."""
+    """Return the heading that a phone shows before each value of a row, or ""."""
     return [plain(head.text) if table.told else "" for head in table.head]
 
 
@@ -177,5 +177,5 @@ def _digits_wide(text: str) -> float:
 
 @cache
 def _math_font() -> str:
-    """Return the font of the formulas: many phones have none, and brackets would not grow."""
+    """Return the font of the formulas; without it many phones cannot grow brackets."""
     return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

@@ -1,22 +1,22 @@
-"""How the pages of a PDF come to be full.
+"""Fill the pages of a PDF.
 
-Whatever does not fit on a page goes to the next one, and leaves white behind. Where that is much,
-two things are tried: the figures of the page and the one that comes next are drawn a little
-smaller; a table that was broken in two stays whole. What leaves less white is kept.
+A block that does not fit on a page moves to the next one and leaves white space. If that is much,
+two things are tried: the figures of the page and the next one are drawn a little smaller, or a
+broken table is kept whole. The version with less white space is used.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-_GAP = 28.0  # points, between what ends a page and what would follow, a heading say
-_WHITE = 0.3  # of a page: nobody minds less
+_GAP = 28.0  # points, between the end of a page and the next block, such as a heading
+_WHITE = 0.3  # of a page: less white space is accepted
 _LEAST = 0.75  # of the usual size: the labels of a figure are then still 6 points high
 _MOST_TRIES = 8  # each takes a quarter of the time that the first takes
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """What is set otherwise than usual, by the numbers of figures and tables."""
+    """Deviations from the default layout, by the numbers of figures and tables."""
 
     shares: Mapping[int, float] = field(default_factory=dict)  # of the usual size
     whole: tuple[int, ...] = ()  # tables that do not break
@@ -24,13 +24,13 @@ class Choices:
 
 @dataclass(frozen=True, kw_only=True)
 class End:
-    """Where a block ends.
+    """The end of a block.
 
     Attributes
     ----------
     page, y : its page, and points from the top.
-    picture, table : its number, 0 where it is none; of a table also the end of its caption is told.
-    share, height : of a figure: how large it is drawn, 1 as usual, and its height in points.
+    picture, table : its number, or 0; a table has a second entry for the end of its caption.
+    share, height : relative size of a figure (1 by default), and its height in points.
     """
 
     page: int

@@ -81,7 +81,7 @@ def _place(group: str) -> tuple[int, int]:
 
 
 def _excess(check: Check) -> float:
-    """Return how far beyond its limit a check is, where that can be told."""
+    """Return how far a check is beyond its limit, if that is known."""
     if check.value is None or not check.limit:
         return 0.0
     return abs(check.value / check.limit)
@@ -140,7 +140,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
     if to_run:
         yield say("next_run")
-    # What follows the carts waits for them, and for the recordings that are to be fixed.
+    # Later actions wait for the carts and for the recordings that must be fixed.
     if fit is not None and not asked & {"data", "record"}:
         run = {Stage.HARDWARE_CHECK} if to_run else frozenset[Stage]()
         lacking = [skip for skip in analysis.skipped if skip.stage not in run]

@@ -12,8 +12,8 @@ _LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
 _LEVEL = 2  # of a heading that is added
 _SPELT = str.maketrans({"ω": "omega", "ζ": "zeta", " ": " "})
 _OPEN = (
-    "this would run into other answers: close every block of code (```) and every comment "
-    "(<!-- -->), here and in notes.md, and let no heading begin with another question's id"
+    "this answer would merge with others: close every block of code (```) and every comment "
+    "(<!-- -->), here and in notes.md, and start no heading with another question's id"
 )
 
 
@@ -24,7 +24,7 @@ def named(heading: str) -> str:
 
 
 def written_answer(notes: str, id_: str) -> str:
-    """Return the answer to a question as it was typed, "" where there is none."""
+    """Return the answer to a question as typed, or ""."""
     lines = _lines(notes)
     found = _span(notes, id_)
     return "".join(lines[found[2] : found[3]]).strip() if found else ""
@@ -43,7 +43,9 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     level, heading, start, end = _span(notes, id_) or (_LEVEL, len(lines), None, len(lines))
     if any(at <= level for at, *_ in _headings(text)):
         least = "#" * (level + 1)
-        raise SubmissionError(f"a heading in an answer begins with {least}, or it would end there")
+        raise SubmissionError(
+            f"a heading in an answer must start with {least}, or it would end there"
+        )
     if len(_headings(f"{text}\n\n# end")) != len(_headings(text)) + 1:
         raise SubmissionError(_OPEN)
     if not text:
@@ -76,7 +78,7 @@ def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
 
 
 def _bodies(notes: str) -> dict[str, tuple[int, str]]:
-    """Return the line of every id's heading, and what stands below it up to the next of any."""
+    """Return the line of every id's heading, and the text up to the next heading."""
     lines, headings = _lines(notes), _headings(notes)
     found: dict[str, tuple[int, str]] = {}
     for i, (_, at, start, text) in enumerate(headings):
@@ -86,7 +88,7 @@ def _bodies(notes: str) -> dict[str, tuple[int, str]]:
 
 
 def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
-    """Return level, first line, line after and text of the headings; those in comments are none."""
+    """Return level, first line, line after and text of the headings outside comments."""
     text = COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), markdown)
     tokens = MarkdownIt("commonmark", {"html": False}).parse(text)
     found = []

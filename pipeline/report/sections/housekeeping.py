@@ -49,7 +49,7 @@ def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
 
 
 def assumption_blocks(page: Page) -> list[Block]:
-    """Return what all numbers rest on, where each was said, and how the data support it."""
+    """Return the assumptions behind all numbers, their sources, and the support by the data."""
     assumptions = page.analysis.assumptions
     if not assumptions:
         return []

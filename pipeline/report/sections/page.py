@@ -40,9 +40,9 @@ class Page(PageBuilder):
         return self.units.input
 
     def document(self, sections: Iterable[Section], *, about: str) -> Document:
-        """Return the sections under title, authors and what the document is about.
+        """Return the sections under title, authors and subject of the document.
 
-        What it is about is the title where the students gave none, and is then said once.
+        Without a title from the students, the subject is the title and appears once.
         """
         analysis = self.analysis
         title = clean(analysis.title).strip()
@@ -58,7 +58,7 @@ class Page(PageBuilder):
 
 
 def remarks(notes: Sequence[str]) -> list[Block]:
-    """Return notes as a list, nothing where there are none."""
+    """Return notes as a list, or nothing without notes."""
     return [bullet_list(rich(clean(note)) for note in notes)] if notes else []
 
 

@@ -41,7 +41,7 @@ def parameter_blocks(page: Page) -> list[Block]:
 
 
 def _origins(analysis: Analysis) -> Spans:
-    """Say which estimates come from what; only of sources that there are."""
+    """Name the sources of the estimates, for the existing sources only."""
     names: dict[str, list[str]] = {}
     for row in analysis.rows:
         if row.initial:

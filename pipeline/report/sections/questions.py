@@ -1,7 +1,7 @@
 """Questions that this data raises, and the students' answers from their notes.
 
 A question stands where its figures are. It is answered in `notes.md` under a heading that begins
-with the question's id; what stands under no such heading is the discussion.
+with the question's id; the other notes are the discussion.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

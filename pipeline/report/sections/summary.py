@@ -63,7 +63,7 @@ def terminal_summary(analysis: Analysis) -> str:
     ]
     only = f" {_WORDS.text('statistical_only')}" if any("±" in text for text in numbers) else ""
     failed = analysis.fit is not None and not analysis.fit.converged
-    has = "The fit that failed ended at" if failed else "It has"
+    has = "The failed fit ended at" if failed else "It has"
     it_has = [paragraph(f"{has} {'; '.join(numbers)}.{only}")] if numbers else []
     told = bullet_list(text for _, text in _findings(analysis))
     next_ = [paragraph(f"{_WORDS.text('next')}."), next_steps(analysis)]
@@ -116,7 +116,7 @@ def _identified(analysis: Analysis) -> Block:
 
 
 def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
-    """Return which recordings the initial estimates rest on, "" where none is measured."""
+    """Return the recordings behind the initial estimates, "" if nothing was measured."""
     runs = dict.fromkeys(
         run for row in analysis.rows if row.initial for run in row.initial.experiments
     )
@@ -130,7 +130,7 @@ def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
 
 
 def _runs(analysis: Analysis, ids: Collection[str]) -> str:
-    """Return how many recordings of each kind these are; a table stands for itself."""
+    """Return the number of recordings of each kind; a table counts separately."""
     known = {record.id: record.kind for record in analysis.records}
     kinds = Counter(known.get(id_, "bode") for id_ in dict.fromkeys(ids))
     return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])

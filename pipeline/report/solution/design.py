@@ -48,7 +48,7 @@ class WorkedDesign:
 
 
 def work_design(chain: Chain, design: FeedbackDesign) -> WorkedDesign:
-    """Work the gains of a design out anew, by the formulas a textbook has."""
+    """Compute the gains of a design again with textbook formulas."""
     phi, gamma = discretise(chain, design.sample_time)
     poles = design.poles if design.requested_poles is None else design.requested_poles
     z = np.exp(poles * design.sample_time)

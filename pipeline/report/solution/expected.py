@@ -36,9 +36,9 @@ class Expected:
     unit: str = written()
     value: float = written()
     std: float | None = written()
-    percent: float | None = written("beyond the reference's own bounds")
-    low: float | None = written("the least for full points, in its unit")
-    high: float | None = written("the most for full points, in its unit")
+    percent: float | None = written("added to the bounds of the reference value")
+    low: float | None = written("lowest value for full points, in its unit")
+    high: float | None = written("highest value for full points, in its unit")
 
     @property
     @computed()
@@ -66,18 +66,18 @@ class Solution:
 
     schema: Literal["cartlab-solution/1"] = written(default="cartlab-solution/1")
     submission: Submitted = written(part=("title", "carts", "springs", "units"))
-    rubric: str = written("title of the one that says what is accepted")
+    rubric: str = written("title of the rubric that sets the accepted ranges")
     parameters: tuple[Expected, ...] = written()
     state_space: ExpectedModel | None = written()
     feedback: FeedbackDesign | None = written(
-        "the reference design; gains are not unique, so others may be as right",
+        "the reference design; gains are not unique, so others may be right too",
         part=(
             "cart", "method", "sample_time", "gains", "prefilter", "poles", "overshoot_percent",
             "settling_time", "peak_input", "margins",
         ),
     )  # fmt: skip
     doubts: tuple[Check, ...] = written(
-        "the checks that failed: the numbers are no reference before they are explained",
+        "the checks that failed: explain them before you use these numbers as a reference",
         part=("id", "message"),
         older=(),
     )

@@ -91,12 +91,16 @@ def build_solution(
         ("transfer-functions", "Transfer functions", transfer_blocks),
         ("state-model", "From the table to the state model", state_blocks),
         ("worked-design", "The controller, worked", design_blocks),
-        ("expected", "What to expect of a hand-in", lambda page: expected_blocks(page, accepted)),
+        (
+            "expected",
+            "What to expect in a submission",
+            lambda page: expected_blocks(page, accepted),
+        ),
     )
     document = build_document(
         analysis, gap=gap, worked=worked, answer=model_answer, progress=progress
     )
-    told = ["Worked reference for instructors", count(analysis.bench.n, "cart")]
+    told = ["Worked solution for instructors", count(analysis.bench.n, "cart")]
     if analysis.failed_checks:
         told.append(f"doubtful: {count(len(analysis.failed_checks), 'check')} failed")
     return replace(document, subtitle=" · ".join(told))

@@ -315,7 +315,7 @@ def test_a_host_told_to_end_stops_the_motor_and_saves(tmp_path, number, real):
         _, said = process.communicate()
     assert last_run(real)["ended"] == "stopped"
     assert process.returncode == 130
-    assert "stopped; the same command goes on where this ended" in said
+    assert "stopped; repeat the command to continue" in said
     assert (work / "data" / "dwell.partial.txt").exists()
     assert load_submission(work).experiments == ()
 

@@ -357,7 +357,7 @@ def test_a_full_disk_stops_the_motor_and_says_what_to_do(tmp_path, real):
         _, said = process.communicate()
     assert real.event("run")["ended"] == "stopped"
     assert process.returncode == 2
-    assert f"`acquire` writes into {work}; make room there" in said
+    assert f"`acquire` writes into {work}; free some space" in said
     assert "--out" not in said
 
 

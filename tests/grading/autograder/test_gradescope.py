@@ -178,7 +178,7 @@ def test_students_who_find_the_numbers_read_none(root, team):
     assert {test["visibility"] for test in hidden["tests"]} == {"after_due_date"}
     assert "cartlab check" in hidden["output"]
     (wrong,) = [t for t in hidden["tests"] if t["tags"] == ["final-gains"]]
-    assert wrong["output"] == "not passed: a final value that the recordings do not give"
+    assert wrong["output"] == "not passed: a final value that disagrees with the recordings"
 
 
 HOSTILE = (
@@ -274,7 +274,7 @@ def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
     assert done.returncode == 0
     assert done.stderr.splitlines() == [
         "on Gradescope, set the autograder points to 20",
-        "points for lateness are not deducted: set the late policy on Gradescope",
+        "nothing is deducted for late work: set the late policy on Gradescope",
         "wrote autograder.zip",
     ]
     write_autograder(RUBRIC, tmp_path / "again" / "a.zip")
@@ -302,10 +302,10 @@ def test_all_that_grading_needs_is_pinned_to_what_is_installed():
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((), "name GRADES and --lms, or a rubric with --autograder"),
-        (("grades",), "name GRADES and --lms"),
-        (("grades", "--autograder", "throne-1dof"), "--autograder takes a rubric and --out"),
-        (("--autograder", "throne-1dof", "--lms", "canvas"), "--autograder takes a rubric"),
+        ((), "give GRADES and --lms, or --autograder with a rubric"),
+        (("grades",), "give GRADES and --lms"),
+        (("grades", "--autograder", "throne-1dof"), "--autograder takes only a rubric and --out"),
+        (("--autograder", "throne-1dof", "--lms", "canvas"), "--autograder takes only a rubric"),
         (("--autograder", "throne-9dof"), "there is no such rubric"),
         (("--autograder", "throne-1dof", "--out", "folder"), "an autograder is one zip file"),
     ],

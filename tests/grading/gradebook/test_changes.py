@@ -36,8 +36,8 @@ def test_a_rubric_is_compared_by_its_criteria():
     assert told(criteria=(dearer, second, *rest)) == [
         f"{first.id}: points {first.points:g} → {first.points + 1:g}"
     ]
-    assert told(criteria=(second, *rest)) == [f"criterion {first.id} is gone"]
-    assert told(criteria=(second, first, *rest)) == ["the criteria stand in another order"]
+    assert told(criteria=(second, *rest)) == [f"criterion {first.id} was removed"]
+    assert told(criteria=(second, first, *rest)) == ["the order of the criteria changed"]
     assert told(late=late, title="") == [
         f"title {RUBRIC.title[:39]}{'…' if len(RUBRIC.title) > 40 else ''} → nothing",
         "late.percent_per_day 10 → 50",
@@ -47,14 +47,14 @@ def test_a_rubric_is_compared_by_its_criteria():
 def test_a_rubric_of_another_version_is_said_to_be_one():
     """A rubric that cannot be read is not compared."""
     assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
-        "the rubric before is of another version of cartlab"
+        "the earlier rubric was written by another version of cartlab"
     ]
 
 
 def test_points_are_compared_by_name():
     """Teams with other points, new teams and teams that left."""
     assert points_changes({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.5, "b": 2.0, "d": 0.0}) == [
-        "a: 1 → 1.5", "d is new", "c is gone",
+        "a: 1 → 1.5", "d is new", "c was removed",
     ]  # fmt: skip
 
 
@@ -98,8 +98,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
     *progress, last = said.splitlines()  # progress, if that took more than two seconds
     assert all(f" of {_LEFT + 1}" in line for line in progress)
     assert last == (
-        f"stopped; what is graded is kept in {tmp_path / 'out'}, and the same command goes on "
-        "from there"
+        f"stopped; finished grades are kept in {tmp_path / 'out'}; repeat the command to continue"
     )
     before = n_graded(tmp_path / "out")
     again = cartlab_here(*command[3:], cwd=ROOT)

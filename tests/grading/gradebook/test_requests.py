@@ -98,7 +98,7 @@ def test_a_criterion_is_asked_for_once_unless_reopened(book):
     """Nobody else in the team can ask either; other criteria and teams are free."""
     book.ask("team-1", "laws", why="one", by="s1")
     for state in ("asked", "answered"):
-        with pytest.raises(RequestRefused, match="asked for already"):
+        with pytest.raises(RequestRefused, match="look at this criterion already"):
             book.ask("team-1", "laws", why="two", by="s2")
         assert book.own_feedback("team-1").requests["laws"].state == state
         if state == "asked":
@@ -117,11 +117,11 @@ def test_a_criterion_is_asked_for_once_unless_reopened(book):
 @pytest.mark.parametrize(
     ("criterion", "why", "message"),
     [
-        ("laws", " \n", "say what should be looked at"),
-        ("laws", "", "say what should be looked at"),
+        ("laws", " \n", "write what was judged wrongly"),
+        ("laws", "", "write what was judged wrongly"),
         ("laws", "x" * (MOST_LETTERS + 1), "at most 1,000 characters, found 1,001"),
-        ("nothing", "x", "for criteria that lost points"),
-        ("", "x", "for criteria that lost points"),
+        ("nothing", "x", "only where points were lost"),
+        ("", "x", "only where points were lost"),
     ],
 )
 def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message):
@@ -145,7 +145,7 @@ def test_few_requests_wait_at_once(book):
     """After an answer there is room for one more."""
     for criterion in CRITERIA[:MOST_OPEN]:
         book.ask("team-1", criterion, why="x", by="s1")
-    with pytest.raises(RequestRefused, match=f"{MOST_OPEN} requests of yours wait"):
+    with pytest.raises(RequestRefused, match=f"{MOST_OPEN} of your requests are waiting"):
         book.ask("team-1", CRITERIA[MOST_OPEN], why="x", by="s1")
     book.ask("team-2", CRITERIA[MOST_OPEN], why="x", by="s2")
     answer(book, None)
@@ -196,9 +196,9 @@ def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
     with pytest.raises(Conflict):
         book.answer("team-1", "pieces", 0.0, seen=pieces.version, **give)
     (settled,) = book.queue().settled
-    with pytest.raises(RequestRefused, match="answered already"):
+    with pytest.raises(RequestRefused, match="has an answer already"):
         book.answer("team-1", "laws", 0.0, seen=settled.version, **give)
-    with pytest.raises(RequestRefused, match="only a request that was answered"):
+    with pytest.raises(RequestRefused, match="only an answered request"):
         book.reopen("team-1", "pieces", by="Bob", seen=book.queue().waiting[0].version)
     with pytest.raises(ConfigError, match="expected 0 to 1 points"):
         answer(book, 99.0)

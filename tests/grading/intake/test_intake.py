@@ -218,7 +218,7 @@ def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
     archive(tmp_path / "class" / "one.zip", {"team-01/submission.toml": TOML})
     one, two = hand_ins(tmp_path, tmp_path / "class")
     assert (one.id, two.id) == ("team-01", "two")
-    with pytest.raises(SubmissionError, match="which one is to be graded"):
+    with pytest.raises(SubmissionError, match="which one should be graded"):
         opened(tmp_path, two)
 
 

@@ -51,7 +51,7 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
     """A member that would land outside is not written; the others are."""
     archive = zipped(tmp_path / "a.zip", {name: "evil", "good.txt": "good"})
     refused = unpack(archive, tmp_path / "in" / "out", limits=SMALL)
-    assert "leaves the archive" in "".join(refused.values())
+    assert "points outside the archive" in "".join(refused.values())
     assert files_below(tmp_path) == ["a.zip", "in/out/good.txt"]
 
 
@@ -62,7 +62,7 @@ def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
     monkeypatch.setattr("pipeline.grading.intake.unpack.sys.platform", "win32")
     (why,) = unpack(packed, tmp_path / "there", limits=SMALL).values()
-    assert why.endswith("is no name of a file on Windows")
+    assert why.endswith("is not a valid file name on Windows")
     assert files_below(tmp_path / "there") == ["good.txt"]
 
 

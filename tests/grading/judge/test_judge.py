@@ -112,7 +112,7 @@ def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
     for experiment in read.experiments:
         left = own if experiment.kind == "closed_loop" else InputOverride(sign=-1)
         assert experiment.input == left
-    assert any("scale is the rubric's" in note for note in notes)
+    assert any("scale of the input is the rubric's" in note for note in notes)
 
 
 @pytest.mark.parametrize("turned", [True, False])
@@ -248,7 +248,7 @@ def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
     assert outcomes["feedback"].outcome == "fail"
     assert outcomes["feedback-claims"].outcome == "skip"
     assert outcomes["feedback-claims"].points == 0
-    assert "builds on 'feedback'" in outcomes["feedback-claims"].message
+    assert "depends on 'feedback'" in outcomes["feedback-claims"].message
 
 
 @pytest.mark.parametrize("table", ["initial", "final"])
@@ -320,4 +320,4 @@ def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message
         assert ("a person should look at these numbers" in message) is loosely
-        assert ("As your own recordings say." in message) is not loosely
+        assert ("It agrees with your own recordings." in message) is not loosely

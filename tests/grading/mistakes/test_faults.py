@@ -198,7 +198,7 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "stated", "word"),
-    [("step", "decay", "free decay"), ("sine", "step", "no step"), ("step", "cut", "cut")],
+    [("step", "decay", "free decay"), ("sine", "step", "not a step"), ("step", "cut", "truncated")],
 )
 def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     kind, stated, word, bench, tmp_path
@@ -348,7 +348,7 @@ def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tm
     analysis = analyse(load_submission(folder), design=False)
     both = {path.stem for path in [*files(folder, "sine"), *files(folder, "step")]}
     assert {one.experiment for one in analysis.left_out} == both
-    assert all("nothing tells which" in one.reason for one in analysis.left_out)
+    assert all("nothing shows which" in one.reason for one in analysis.left_out)
     assert analysis.chain is None
     initial = {row.name for row in analysis.rows if row.initial is not None}
     assert initial == {"omega_1", "omega_2", "zeta_1", "zeta_2"}

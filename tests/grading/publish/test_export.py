@@ -379,7 +379,7 @@ def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
     assert canvas_import(rows) == {RUBRIC.title: {"1001": "20"}}
     assert remarks[:2] == (
         "not in roster.csv, so not exported: u1a, u1b, x, y",
-        "nobody of these is in roster.csv: o",
+        "none of these is in roster.csv: o",
     )
     assert remarks[2].endswith("one of the authors: doejane (t)")
 

@@ -54,7 +54,7 @@ def test_a_remark_s_evidence_keeps_its_words():
     shown = {plain(h.text): plain(c.text) for h, c in zip(table.head, table.rows[0], strict=True)}
     assert shown == {
         "Table": "initial", "Reported": "3", "Stable": "no",
-        "Slip": "rows 1 and 2 are exchanged", "Also in": "final",
+        "Mistake": "rows 1 and 2 are exchanged", "Also in": "final",
     }  # fmt: skip
     assert table.align == "lrlll"
 
@@ -184,7 +184,7 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
         book.put(make_outcome(make_grade(name), key="k"))
         book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
         (tmp_path / "out").mkdir()
-        with pytest.raises(ConfigError, match="no name for a folder"):
+        with pytest.raises(ConfigError, match="cannot be the name of a feedback folder"):
             write_outputs(book, tmp_path / "out")
     assert [p.name for p in (tmp_path / "out").rglob("*") if p.is_file()] == []
 

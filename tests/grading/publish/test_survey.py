@@ -85,7 +85,7 @@ def test_the_tables_read_as_markdown(tmp_path):
         ("Pre knowledge: x\n3\n5\n", "line 3, 'Pre knowledge: x': '5' is no score from 1 to 4"),
         ("Pre knowledge: x\n3.5\n", "'3.5' is no score from 1 to 4"),
         ("Pre knowledge: x,pre-course Knowledge [x]\n3,4\n", "two columns are"),
-        ("name,age\nann,20\n", "no question in it"),
+        ("name,age\nann,20\n", "contains no question"),
         ("Q\n", "needs a heading and at least one row"),
         ("", "needs a heading and at least one row"),
     ],

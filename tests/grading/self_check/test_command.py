@@ -99,7 +99,7 @@ def test_nothing_reported_cannot_be_checked(honest):
     path.write_text(text, encoding="utf-8")
     done = check(honest)
     assert done.returncode == 2
-    assert "no number is reported yet: write what you found under" in done.stderr
+    assert "no number is reported yet: enter what you found under" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
     done = check(honest)
     if text:
         assert done.returncode == 2
-        assert f"{FILE}, line 1: expected what `cartlab check` wrote" in done.stderr
+        assert f"{FILE}, line 1: this line was not written by `cartlab check`" in done.stderr
         assert (honest / FILE).read_text(encoding="utf-8") == text
     else:
         assert done.returncode == 0
@@ -151,7 +151,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
 
     assert "cartlab check was asked 2 times." in notes()
     (in_hertz / FILE).write_text("{}\n", encoding="utf-8")
-    assert "is not as it was written" in notes()[-1]
+    assert "was changed and cannot be read" in notes()[-1]
 
 
 def test_what_students_see_is_report_or_check(honest, tmp_path):

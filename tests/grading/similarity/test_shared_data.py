@@ -220,7 +220,7 @@ def test_earlier_batches_count(teams):
     assert {r.submission for r in found["a"]} == {"x (an earlier batch)", "y (an earlier batch)"}
     flag = shared_flag(found["a"])
     assert flag.parameters == tuple(r.id for r in teams[0][:4])
-    assert "does not say whose" in flag.message
+    assert "does not show whose" in flag.message
 
 
 @pytest.fixture
