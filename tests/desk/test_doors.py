@@ -381,16 +381,19 @@ def test_forged_names_are_refused(lab):
         ((PROXY + USERS).replace("the-proxy-and-the-desk-know-it", "short"), "secret"),
         ((PROXY + USERS).replace("X-Proxy-Secret", "x-remote-user"), "a header other than"),
         ((PROXY + USERS).replace("127.0.0.1", "proxy.lab"), "proxy.address"),
-        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta has no folders"),
-        ((PROXY + USERS).replace('"ta"', '"student"'), "a student has no gradebooks"),
+        ((PROXY + USERS).replace('"student"', '"ta"', 1), "a ta cannot have folders"),
+        ((PROXY + USERS).replace('"ta"', '"student"'), "a student cannot have gradebooks"),
         ((PROXY + USERS).replace('"two"', '"twoo"'), "does not exist"),
         ((PROXY + USERS).replace('"shop"', '"shops"'), "does not exist"),
-        (PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n', "a ta has no workshop"),
+        (
+            PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n',
+            "a ta cannot have workshop",
+        ),
         (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
         ((PROXY + USERS).replace('"s2"', '"s1"'), "listed twice"),
         (
             (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),
-            "in UTF-8 is 'Ã¼' in Latin-1, which is there too",
+            "in UTF-8 equals 'Ã¼' in Latin-1, which is also listed",
         ),
         ((PROXY + USERS).replace("folders", "folder", 1), "did you mean 'folders'"),
         ((PROXY + USERS).replace("https://Lab.example.edu", "lab"), "site"),
@@ -423,11 +426,11 @@ def test_a_list_that_everybody_may_change_is_none(tmp_path):
     folder.mkdir()
     path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
     path.chmod(0o602)
-    with pytest.raises(ConfigError, match=r"users.toml: everybody .* may write it.*chmod o-w"):
+    with pytest.raises(ConfigError, match=r"users.toml: everybody .* can write it.*chmod o-w"):
         read_users(path)
     path.chmod(0o600)
     folder.chmod(0o777)
-    with pytest.raises(ConfigError, match=r"may put another users\.toml there"):
+    with pytest.raises(ConfigError, match=r"can replace users\.toml there"):
         read_users(path)
     folder.chmod(0o1777)  # there, as in /tmp, a file is only its owner's to replace
     assert read_users(path)[0].header == "X-Remote-User"

@@ -261,8 +261,8 @@ def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
         done = grade(own, out=out)
         assert done.sharing == 0
     assert done.remarks == (
-        "team-1 is now by others, 's 17' in place of ' S1 ': where both count, give one folder "
-        "another name",
+        "team-1 now has other authors, 's 17' in place of ' S1 ': if both submissions count, "
+        "rename one folder",
     )
 
 
@@ -300,7 +300,7 @@ def test_who_is_removed_is_off_every_list_but_history(tmp_path):
                 "b",
                 ["graded", "listed", "removed"],
             )
-        assert history_text(name, events).endswith("removed   off the class list")
+        assert history_text(name, events).endswith("removed   removed from the class list")
         with pytest.raises(ConfigError, match="b: no such submission"):
             book.remove(["b"])
         book.finish(everybody, rubric=RUBRIC)

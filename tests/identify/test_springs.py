@@ -79,9 +79,9 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
         for key in ("springs = ", "position = ")
     )
     assert "# unsure: is there wall-1?" in springs
-    assert "# unsure: a count has no fractions" in position
+    assert "# unsure: counts are whole numbers" in position
     assert "springs: unsure: is there wall-1?" in done.stderr
-    assert "position: unsure: a count has no fractions" in done.stderr
+    assert "position: unsure: counts are whole numbers" in done.stderr
     assert "or an encoder that is stuck" not in done.stdout  # its table says that it is held
     assert fill(folder).doubts == tuple(
         line.removeprefix("cartlab: ") for line in done.stderr.splitlines() if "unsure: " in line

@@ -225,7 +225,7 @@ def test_a_bare_matrix_has_numbered_columns():
     assert upright.names == ("1", "2", "3", "4")
     assert_array_equal(upright.values, matrix.T)
     assert_array_equal(lying.values, matrix.T)
-    assert "data lies on its side" in lying.notes[0]
+    assert "data is transposed" in lying.notes[0]
     assert upright.whole == (True, False, True, False)
 
 

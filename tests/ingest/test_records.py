@@ -121,7 +121,7 @@ def test_a_copied_file_is_no_repeat(tmp_path):
         (tmp_path / f"{name}.csv").write_text(csv(time=T, input=U, x1=X1))
     (tmp_path / "submission.toml").write_text(toml)
     warnings = read_data(load_submission(tmp_path)).warnings
-    assert "two.csv is a copy of one.csv: a repeat is a recording of its own" in warnings
+    assert "two.csv is a copy of one.csv; a repeat must be recorded separately" in warnings
 
 
 def test_time_in_other_units_is_suspected(tmp_path):
@@ -424,7 +424,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
     signs = read_data(load_submission(tmp_path)).signs
     (check,) = check_signs(signs, without=())
     assert check.value == 2.0
-    assert "one, two (2 of the 3 that tell it): set sign = -1 there" in check.message
+    assert "one, two (2 of the 3 that show a sign): set sign = -1 there" in check.message
 
 
 def test_signs_may_differ_between_experiments(tmp_path):

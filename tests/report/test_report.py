@@ -631,7 +631,7 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
     )
     assert "Check springs" in terminal_summary(asked)
     for other in ({"bench": Bench(springs=(True, True, True))}, {"fit": analysis.fit}):
-        assert "See whether springs" not in terminal_summary(replace(asked, **other))
+        assert "Check springs" not in terminal_summary(replace(asked, **other))
 
 
 def test_a_wrong_sign_is_said_first():

@@ -47,7 +47,7 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
     assert "identified from 5 steps" in text
     assert "The initial estimates come from the same recordings" in text
     assert [row.independent for row in analysis.rows] == [False] * 3
-    assert "all 3 parameters estimated in two ways. Both ways use the same recordings" in text
+    assert "all 3 parameters estimated in two ways. Both estimates use the same recordings" in text
     assert "shows in the ringing of cart 1 after a step (step-1, step-3 and step-4)" in text
     assert "decays of" not in text
     assert not any("the decay of cart" in check.message for check in analysis.checks)
@@ -69,7 +69,7 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
     text = terminal_summary(analysis)
     assert "identified from 4 steps, by a joint fit" in text
     assert "from the same recordings, and from 5 decays and 5 steps." in text
-    assert "For K_1, K_2, ω_a and ω_b both ways use the same recordings." in text
+    assert "For K_1, K_2, ω_a and ω_b both estimates use the same recordings." in text
     assert every_failed_check_is_named(analysis)
     advice = next_part(analysis)
     assert advice[0].startswith("Fix the recordings that were left out")  # the worst first

@@ -83,7 +83,7 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
         assert "team-0: cannot be read (No space left on device); the next run tries again" in (
             full.stderr
         )
-        assert "the disk is full: for 2 of 2 there was no room to unpack them in" in full.stderr
+        assert "the disk is full: 2 of 2 submissions could not be unpacked in" in full.stderr
         assert "is throne-1dof the rubric" not in full.stderr
         subprocess.run(["mount", "-o", "remount,size=60m", disk], check=True)
         again = grade(zips, disk / "out")

@@ -147,7 +147,7 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
 def test_the_class_list_is_the_last_batch_that_ended(open_book):
     """Outcomes of a run that was killed count only when a later batch ends with them."""
     book = open_book()
-    with pytest.raises(ConfigError, match="no grading of 'lab' ran to its end"):
+    with pytest.raises(ConfigError, match="no grading of 'lab' is complete"):
         list(book.entries())
     finish(book, make_outcome(make_grade("b"), key="b1"), make_outcome(make_grade("a"), key="a1"))
     book.put(make_outcome(make_grade("a", share=0.0), key="a2"))
@@ -454,5 +454,5 @@ def test_a_file_that_is_no_gradebook_is_an_error(tmp_path):
         book.execute("DROP TRIGGER settings_no_update")
         book.execute("UPDATE settings SET value = '2'")
     book.close()
-    with pytest.raises(ConfigError, match="is a gradebook of version 2, this cartlab has 1"):
+    with pytest.raises(ConfigError, match="is a gradebook of version 2, and this cartlab uses 1"):
         Gradebook(tmp_path)

@@ -125,7 +125,7 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
     nobody = make_outcome(failed_grade("team-8", "broken"))
     rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
     assert len(rows) == 4
-    assert remarks[0] == "nobody is named in it, so not exported: team-8"
+    assert remarks[0] == "it names no author, so not exported: team-8"
 
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
@@ -280,8 +280,8 @@ def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path
     rows, remarks = write(tmp_path, HALF, other, platform=platform)
     assert not [cell for row in rows for cell in row if re.search(r"^(10|5)$|omega_1", cell)]
     assert remarks == (
-        "s-team-1 is in team-1 (10) and team-9 (5): left out, until cartlab remove takes the "
-        "wrong one off",
+        "s-team-1 is in team-1 (10) and team-9 (5): left out until the "
+        "wrong one is removed with cartlab remove",
     )
 
 
@@ -315,7 +315,7 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
     rows, remarks = write(tmp_path, one, other, platform="canvas", title="Lab 3", roster=roster)
     assert canvas_import(rows) == {"Lab 3": {"1001": "3"}}
     assert [r for r in remarks if "left out" in r] == [
-        "s1 is in a (10) and b (5): left out, until cartlab remove takes the wrong one off"
+        "s1 is in a (10) and b (5): left out until the wrong one is removed with cartlab remove"
     ]
 
 
@@ -341,7 +341,7 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
         )
     (remark,) = [remark for remark in done.remarks if remark.left_out]
     assert remark.text == (
-        "has no points, since another's account handed it in and got them: s1 (b)"
+        "has no points, because another account submitted it and received them: s1 (b)"
     )
 
 
@@ -354,7 +354,7 @@ def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, pla
     )
     (row,) = [row for row in rows if "team-8" in row]
     assert "0.75" in row
-    assert remarks == ("nobody is named in it, so exported as who its folder is called: team-8",)
+    assert remarks == ("it names no author, so exported under the name of its folder: team-8",)
 
     outcomes = make_outcome(make_grade("team-8"), key="1"), replace(broken, key="2")
     (tmp_path / "again").mkdir()

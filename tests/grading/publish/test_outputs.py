@@ -244,7 +244,7 @@ def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
     ("reason", "shown"),
     [
         ("3/submission.toml line 3: no key", "anon-a/submission.toml line 3: no key"),
-        ("doejane_1024_77_lab.zip: not a whole zip", "the archive: not a whole zip"),
+        ("doejane_1024_77_lab.zip: not a complete zip", "the archive: not a complete zip"),
     ],
 )
 def test_a_reason_names_nobody(reason, shown):
