@@ -382,7 +382,7 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
     if not is_count(unit) or not fractions:
         return ""
     have = "has" if len(fractions) == 1 else "have"
-    return f"counts are whole numbers, but {first_few(fractions, 1)} {have} some: is it cm?"
+    return f"counts are whole numbers, but {first_few(fractions, 1)} {have} decimals: is it cm?"
 
 
 def system_doubts(folder: Path) -> dict[str, str]:

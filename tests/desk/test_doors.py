@@ -389,7 +389,10 @@ def test_forged_names_are_refused(lab):
             PROXY + '[[users]]\nname = "t"\nrole = "ta"\nworkshop = "one"\n',
             "a ta cannot have workshop",
         ),
-        (PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n', "no ports"),
+        (
+            PROXY + '[[users]]\nname = "s"\nrole = "student"\nports = ["COM3"]\n',
+            "cannot have ports",
+        ),
         ((PROXY + USERS).replace('"s2"', '"s1"'), "listed twice"),
         (
             (PROXY + USERS).replace('"s1"', '"ü"').replace('"s2"', '"Ã¼"'),

@@ -93,7 +93,7 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
     assert fill(folder).doubts == ()
 
 
-@pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "fractions")])
+@pytest.mark.parametrize(("unit", "said"), [("furlong", "is not known"), ("count", "decimals")])
 def test_fill_speaks_of_a_unit_that_somebody_else_wrote(unit, said, tmp_path):
     """An existing file gets no mark, but a message."""
     folder = folder_of(EXAMPLES / "one-cart" / "data", tmp_path / "s")

@@ -320,7 +320,7 @@ def test_nothing_to_fill_in_is_one_line(tmp_path):
     """No folder, no file, a broken `submission.toml`: an error, and nothing is written."""
     with pytest.raises(ConfigError, match="no such folder"):
         fill_submission(tmp_path / "nowhere")
-    with pytest.raises(ConfigError, match="no recording in it"):
+    with pytest.raises(ConfigError, match="contains no recordings"):
         fill_submission(tmp_path)
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "submission.toml").write_text("version = 1\n[system]\ncarts = 9\n")

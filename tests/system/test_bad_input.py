@@ -80,7 +80,10 @@ def test_the_good_one_is_read(tmp_path):
 
 
 BAD_TOML = {
-    "syntax": (HEAD + "title = two carts\n", r"team-01/submission\.toml line 5: text in quotes"),
+    "syntax": (
+        HEAD + "title = two carts\n",
+        r"team-01/submission\.toml line 5: put text in quotes",
+    ),
     "ends in the middle": (GOOD + "[[experiments", r"line 9: .*; found \[\[experiments$"),
     "long title": (f'title = "{"t" * 201}"\n' + GOOD, r"title: expected at most 200 characters"),
     "many authors": (

@@ -78,7 +78,7 @@ def export(
             remarks.append(
                 Remark(
                     text="matched only by their authors' ids; with a roster also by the number "
-                    "in the file name: {', '.join(sent)}"
+                    f"in the file name: {', '.join(sent)}"
                 )
             )
     else:

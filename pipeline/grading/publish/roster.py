@@ -167,7 +167,7 @@ class Roster:
             remarks.append(
                 Remark(
                     text="matched by the number in the file name, so the same person as one of "
-                    "the authors: {', '.join(by_number)}"
+                    f"the authors: {', '.join(by_number)}"
                 )
             )
         return remarks

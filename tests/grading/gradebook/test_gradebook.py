@@ -341,7 +341,7 @@ def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
         make_outcome(make_grade("c")),
     )
 
-    assert [e.text for e in book.history("team-1")[1]][-1].endswith("goes on as group-1")
+    assert [e.text for e in book.history("team-1")[1]][-1].endswith("continues as group-1")
     assert "was team-1 before" in [e.text for e in book.history("group-1")[1]]
     assert [e.text for e in book.history("c")[1]] == ["", ""]
 

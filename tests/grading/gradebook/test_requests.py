@@ -134,7 +134,7 @@ def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message)
 def test_whole_points_are_not_asked_about(book):
     """A criterion that was never judged can be asked about: its points are lost too."""
     finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new ")
-    with pytest.raises(RequestRefused, match="lost points"):
+    with pytest.raises(RequestRefused, match="points were lost"):
         book.ask("team-1", "laws", why="more", by="s1")
     book.ask("team-2", "laws", why="the file was in the zip", by="s2")
     answer(book, 0.5, text="found it")
