@@ -239,7 +239,7 @@ def test_data_that_identify_nothing_say_so():
     submission = recorded("one-cart", "sweep")
     rigid = submission.system.model_copy(update={"springs": (False, False)})
     submission = submission.model_copy(update={"system": rigid})
-    with pytest.raises(DataError, match="the carts are not identified"):
+    with pytest.raises(DataError, match="need identified carts"):
         extend_plan(propose_plan(submission), submission)
 
 

@@ -119,7 +119,7 @@ BAD_LVM = {
     "two clocks": (multi(TIME + 0.001), r"line 18: the channels were sampled at different times"),
     "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X differently for each"),
     "no interval": (no_times(Delta_X=["a", "b"]), r"states Delta_X 'a, b', which is no number"),
-    "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is no number: '0.03x'"),
+    "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is not a number: '0.03x'"),
     "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), r"line 22: 'input' is empty"),
     "text between": (GOOD.replace("\r\n0.03", "\r\nhere\r\n0.03"), r"line 22: expected 3 columns"),
     "no end of header": (GOOD.replace("***End_of_Header***", ""), r"line 1: the header .* no \*"),

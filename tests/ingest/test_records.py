@@ -447,7 +447,7 @@ def test_signs_may_differ_between_experiments(tmp_path):
     (said,) = data.warnings
     assert said == (
         "sign of the input found from the data: +1, but -1 in step; "
-        "taken from the others where the data do not tell: blind"
+        "taken from the others where the data do not show it: blind"
     )
     assert list(data.files) == sorted(f"{name}.csv" for name in runs)
 
@@ -480,7 +480,7 @@ def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
     assert_allclose(first.magnitude, [2.0, 3.0, 5.0], rtol=1e-15)
     assert_allclose(second.magnitude_std, 0.01 * second.magnitude, rtol=1e-15)
     assert first.phase is None
-    assert "taken as 1%: the table has no repeats" in data.warnings[0]
+    assert "taken as 1%, because the table has no repeats" in data.warnings[0]
 
 
 def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
@@ -507,4 +507,4 @@ def test_a_bode_table_with_held_carts_is_left_out_and_said(tmp_path):
     content = csv(frequency=np.array([1.0, 2.0]), x1=np.array([1.0, 2.0]))
     data = read(tmp_path, "", 'kind = "bode"\ncarts = [1]', content)
     assert data.tables == ()
-    assert "a: not used: a bode table is fitted with all carts free" in data.warnings[0]
+    assert "a: not used: a bode table needs all carts free" in data.warnings[0]

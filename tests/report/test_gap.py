@@ -584,7 +584,7 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
     warned, gap = with_gap(changed, bench.folder)
 
     assert gap is None
-    assert warned.warnings[-1].startswith("gap/gap.json is of other data than this report")
+    assert warned.warnings[-1].startswith("gap/gap.json belongs to other data than this report")
     assert with_gap(analysis, tmp_path) == (analysis, None)
     for text in ("{", "[" * 200_000, " " * 20_000_000):
         (tmp_path / "gap.json").write_text(text, encoding="utf-8")

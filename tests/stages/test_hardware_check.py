@@ -160,7 +160,7 @@ def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
         assert_allclose(known(check.input_scale), factor, rtol=1e-3)
         assert check.nrmse < 1.35 * noise_floor(y[check.cart - 1])
     assert (
-        f"only if taken {known(of(checks, 'open')[1].input_scale):.3g} times"
+        f"only if multiplied by {known(of(checks, 'open')[1].input_scale):.3g}"
         in checks[chain.n].note
     )
 
@@ -536,7 +536,7 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
 
     closed, opened = of(checks, "closed")[1], of(checks, "open")[1]
     assert 2.0 < sign * known(closed.input_scale) < 4.0
-    assert "the logged input explains the motion only if taken" in opened.note
+    assert "the logged input explains the motion only if multiplied by" in opened.note
     assert ("opposite sign" in closed.note) == (sign < 0)
     assert closed.nrmse < closed_limit
     if name == "closed_loop_pid.csv":  # integral action: within a percent of 1000 counts

@@ -256,7 +256,7 @@ def test_the_command_takes_what_is_there(work, source):
     )
     assert result.exit_code == 0
     assert "A.txt: step-1, a step" in result.stderr
-    assert "1 files taken" in result.stderr
+    assert "1 files imported" in result.stderr
 
 
 def test_a_folder_that_is_none_is_said(work, source):

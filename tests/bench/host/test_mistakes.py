@@ -57,7 +57,7 @@ def test_a_second_session_in_a_folder_is_refused(tmp_path, real, fast):
     work = write_work(tmp_path / "work", [sine("dwell", seconds=6)])
     with host(work, real.address, "--only", "dwell", "--yes") as process:
         until_bytes(work / "raw" / "dwell-1.raw", process)
-        refused = rf"another cartlab \(process {process.pid}\) writes"
+        refused = rf"another cartlab \(process {process.pid}\) is writing"
         with pytest.raises(ConfigError, match=refused):
             acquire(work, port=fast.address, observers=[Notes()])
         process.communicate()
@@ -135,7 +135,7 @@ def test_a_new_submission_says_what_the_bench_does_not_know(tmp_path):
     assert prepare_submission(folder, bench, stock=False).authors == ()
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8")
-    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false where" in text
+    assert "springs = [true, true, true]  # check: wall-1, 1-2, 2-wall; false if" in text
     path.write_text(re.sub(r"(?m)^#(?! )", "", text), encoding="utf-8")
     submission = load_submission(folder)
     assert [author.id for author in submission.authors] == ["s1024"]
@@ -159,4 +159,4 @@ def test_files_need_a_submission_to_go_to(tmp_path):
     where = str(tmp_path / "new")
     done = CliRunner().invoke(app, ["acquire", where, "--import", str(tmp_path), "--once"])
     assert isinstance(done.exception, ConfigError)
-    assert f"begin with `cartlab new {where} --carts N`" in str(done.exception)
+    assert f"run `cartlab new {where} --carts N`" in str(done.exception)

@@ -510,7 +510,7 @@ def test_points_are_read_as_typed(text, points):
 
 def test_points_that_are_none_are_refused():
     """The message says what is allowed."""
-    with pytest.raises(ConfigError, match="two: points are a number, or auto"):
+    with pytest.raises(ConfigError, match="two: expected a number of points, or auto"):
         read_points("two")
 
 
