@@ -54,6 +54,7 @@ class Inspection:
     variables : of a binary file, read or not.
     guessed : column numbers by role, if the file has no headings but the signals reveal them.
     doubts : why a person should look at those numbers.
+    cut_short : the file ends in the middle of a recording.
     """
 
     file: str
@@ -72,6 +73,7 @@ class Inspection:
     variables: tuple[Variable, ...]
     guessed: Mapping[str, int]
     doubts: tuple[str, ...]
+    cut_short: bool
 
     @property
     def positions(self) -> dict[int, ColumnInspection]:
@@ -89,7 +91,9 @@ class Inspection:
 
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
-        return {"state": "read", **asdict(self), "advice": ""}
+        shown = asdict(self)
+        del shown["cut_short"]  # one of the problems
+        return {"state": "read", **shown, "advice": ""}
 
 
 def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspection:
@@ -155,6 +159,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         variables=table.variables,
         guessed=guessed,
         doubts=told.doubts,
+        cut_short=bool(table.cut_short),
     )
 
 

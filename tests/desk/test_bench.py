@@ -152,7 +152,7 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         assert visitor.post("/bench/0/press", wish="stop", number="0").status == 204
         until(lambda: "Waiting for the bench" not in visitor.get("/bench/0/").text)
         assert not any('id="positions"' in page for page in shown)  # nothing to watch, ever
-        assert "nobody listens there" in shown[-1]
+        assert "no bench listens there" in shown[-1]
     assert load_plan(load_submission(work)).recordings
 
 
@@ -185,7 +185,7 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
             assert answer.status == 422
             assert said in answer.text
         assert visitor.post("/bench/0/explore", **sound).status == 303
-        until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
+        until(lambda: "no bench listens there" in visitor.get("/bench/0/").text)
 
 
 def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
@@ -231,7 +231,7 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
         visitor = Visitor.of(server.url)
         assert f'<option value="{real.address}">virtual bench' in visitor.get("/bench/0/").text
         visitor.post("/bench/0/acquire", port=real.address, other=NOBODY)  # what is typed counts
-        until(lambda: "nobody listens there" in visitor.get("/bench/0/").text)
+        until(lambda: "no bench listens there" in visitor.get("/bench/0/").text)
         page = visitor.get("/bench/0/").text
         assert f'<option value="{NOBODY}">{NOBODY} (used last, not found now)' in page
         begun(visitor, work, "long", port=real.address)

@@ -371,7 +371,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
-    assert page.count("Not known without a current report.") == 2
+    assert page.count("Not known without a report of these files.") == 2
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
@@ -381,7 +381,7 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     page = handed_in(visitor)
     assert "is a link" in page
     assert "There is no report yet, so the zip has none." in page
-    assert page.count("Not known without a current report.") == 2  # not: none, nothing
+    assert page.count("Not known without a report of these files.") == 2  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 
@@ -770,7 +770,7 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
     """In the words of the command; the process goes on."""
     with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
-    with pytest.raises(Failed, match="leaves"):
+    with pytest.raises(Failed, match="outside"):
         workers.do("look_at_file", folder=str(tmp_path), file="../x.csv", columns={})
     assert workers.do("list_files", folder=str(tmp_path)) == []
 

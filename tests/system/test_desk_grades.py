@@ -116,7 +116,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
             given = [book.entry(one).overrides.get("data") for one in teams]
         assert [one.points for one in given if one and one.why == REASON].count(0.75) == 3
         press(window, "u")
-        expect(window.get_by_text("3 teams taken back")).to_be_visible()
+        expect(window.get_by_text("3 teams undone")).to_be_visible()
         press(window, "a")
         expect(heading).to_have_text(teams[1])
 

@@ -139,7 +139,7 @@ def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
     ("name", "content", "why"),
     [
         ("notes.txt", "Remember to zero the encoders\n", "not a table of numbers"),
-        ("cut.txt", STEP[: len(STEP) // 2], "cut short"),
+        ("cut.txt", STEP[: len(STEP) // 2], "truncated"),
         ("sheet.csv", b"PK\x03\x04rest", "a zip archive"),
     ],
 )

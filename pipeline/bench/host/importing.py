@@ -166,7 +166,7 @@ class Importer:
         except SubmissionError as error:
             self._observer.remark(f"not imported: {error}")
             return None
-        if any("cut short" in problem for problem in inspection.problems):
+        if inspection.cut_short:
             if not final and self._looks[path] < 20:  # its last line may still come
                 self._over.discard(path)
             else:

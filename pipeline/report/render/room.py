@@ -68,30 +68,34 @@ class Pages:
         last = {end.table: end.page for end in self.ends if end.table}
         return {table: page for table, page in first.items() if page < last[table]}
 
-    @property
-    def white(self) -> float:
-        """Return how white the pages are in all: one that is half empty is worse than two."""
-        pages = range(1, self.count)
+    def white(self, last: int) -> float:
+        """Return how white pages 1 to `last` are: one that is half empty is worse than two."""
+        pages = range(1, last + 1)
         return sum(max(self.white_under(page) - _WHITE, 0.0) ** 2 for page in pages)
 
 
 def fill_pages(lay_out: Callable[[Choices], Pages]) -> Choices:
-    """Return what is best set otherwise than usual; `lay_out` lays the document out."""
-    chosen = Choices()
+    """Return what is best set otherwise than usual; `lay_out` lays the document out.
+
+    Pages are filled from the first to the last. A remedy may leave white space on a later page,
+    whose turn comes later; the best layout of all is returned.
+    """
+    chosen = best = Choices()
     pages = lay_out(chosen)
+    least = pages.white(pages.count)
     page = tries = 0
-    while pages.white and (page := page + 1) < pages.count:
+    while least and tries < _MOST_TRIES and (page := page + 1) < pages.count:
         if pages.white_under(page) <= _WHITE:
             continue
         for choices in _remedies(pages, page, chosen):
             tries += 1
             tried = lay_out(choices)
-            if tried.white < pages.white:
+            if tried.white(page) < pages.white(page):
                 chosen, pages = choices, tried
                 break
-        if tries >= _MOST_TRIES:
-            break
-    return chosen
+        if (white := pages.white(pages.count)) < least:
+            best, least = chosen, white
+    return best
 
 
 def _remedies(pages: Pages, page: int, chosen: Choices) -> Iterator[Choices]:
