@@ -1,4 +1,4 @@
-"""The one-cart lab drawn by hand: the cells of a notebook, run in the submission's folder."""
+"""The one-cart lab with figures coded by hand: notebook cells, run in the submission's folder."""
 
 # %%
 import tomllib

@@ -50,8 +50,8 @@ def matlab_file(analysis: Analysis) -> bytes:
 
     `parameters.initial.K_1`, `parameters.initial_std.K_1`, the same for `final`; `A`, `B`, `C`,
     `D`, and `m`, `c`, `k` of the chain; `gains`, `prefilter`, `sample_time`, `margins`; one
-    structure a cart in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A
-    number that could not be had is NaN; what was not found at all is not there.
+    structure per cart in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A
+    number that could not be computed is NaN; a result that was not found at all is left out.
     """
     chain, design, bench = analysis.chain, analysis.feedback, analysis.bench
     variables: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""The limits that decide statements about a plant, a loop or an effect, each with its reason."""
+"""The limits behind each verdict on a plant, a loop or an effect, each with its reason."""
 
 HEAVY_DAMPING = 0.3  # of a damping ratio: above it the orders of frequencies may fail
 CALIBRATION = 1e-3  # no teaching bench's encoder and motor are known better than this share

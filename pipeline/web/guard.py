@@ -82,7 +82,7 @@ def list_own_names(port: int) -> frozenset[str]:
 
 
 def find_site(sites: Collection[str], headers: Headers) -> str:
-    """Return the one of some addresses by which a request asks; "" if it is none of them."""
+    """Return which of the addresses a request asks for, or "" if it matches none."""
     host = headers.get("host", "")
     return next((site for site in sites if site.partition("://")[2] == host), "")
 

@@ -351,7 +351,7 @@ def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
 
 
 def test_forged_names_are_refused(lab):
-    """No name, an unknown one, two at once, and one from another address than the proxy's."""
+    """No name, an unknown one, two at once, or an address other than the proxy's."""
     assert lab("").get("/").status == 403
     assert lab("root").get("/").status == 403
     assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403

@@ -103,7 +103,7 @@ def test_every_kind_of_field_goes_there_and_back():
     [
         ('kind = "decay"', ""),
         ('kind = "sine"', "frequency"),
-        ('kind = "step"\nfrequency = 2', "frequency"),  # what is wrong in the file can be mended
+        ('kind = "step"\nfrequency = 2', "frequency"),  # a mistake in the file can be corrected
         ('kind = "closed_loop"', "controlled_cart reference controller.type"),
         (
             'kind = "closed_loop"\ncontroller = { type = "pid", gains = [1] }',

@@ -231,7 +231,7 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
         assert "data/bad.csv" in visitor.get(HERE).text
         assert visitor.post(HERE + "aside", file="data/bad.csv").status == 303
         assert (folder / "set-aside" / round_).read_bytes() == b"nothing in it"
-        assert round_ in visitor.get(HERE).text  # is said
+        assert round_ in visitor.get(HERE).text
         assert "data/bad.csv" not in visitor.get(HERE).text
         visitor.upload(HERE + "files", [("bad.csv", b"nothing in it")])
     named = load_submission(folder).experiments[0].file

@@ -186,7 +186,7 @@ def test_a_touch_after_the_decay_is_left_out():
 @pytest.mark.parametrize("on_off", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
-    """After an edge the cart swings about its new rest point, also without a logged input."""
+    """After an edge the cart swings about its new rest point."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = sign * 0.03 * ((t > 0.5) & ((t < 4.0) | (not on_off)))
     run = record(t, simulate_linear(chain, t, u)[0], u=u, kind="step")

@@ -162,7 +162,7 @@ def test_any_number_of_a_benchs_description(number, key):
 
 @pytest.mark.parametrize("number", ["1e1000000", "-1e-1000000", "9" * 5000, "0x" + "f" * 5000])
 def test_what_changes_a_file_refuses_such_a_number_too(tmp_path, number):
-    """`fill` and the desk give the same message as every command: with the key or the line."""
+    """`fill` and the desk name the key or the line, as every other command does."""
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "a.csv").write_text("time,input,x1\n0,0,0\n0.1,0,0\n", encoding="utf-8")
     (tmp_path / NAME).write_text(

@@ -28,7 +28,7 @@ def plan_ids(folder: Path) -> frozenset[str] | None:
 def read_plan(
     folder: Path, *, session: BenchSession | None, before: Collection[str] | None
 ) -> dict[str, Any]:
-    """Return the plan, what can be wanted of it, and what is wrong with what is there.
+    """Return the plan, the runs that may still be asked of it, and the faults of its rows.
 
     Parameters
     ----------

@@ -127,7 +127,7 @@ class Parametrisation:
 
     @cached_property
     def orders(self) -> NDArray[np.intp]:
-        """Power of s (n_p,) with each parameter: 2 for a mass, 1 for a damper, 0 for a spring."""
+        """Power of s of each parameter (n_p,): 2 for a mass, 1 for a damper, 0 for a spring."""
         return np.array(["kcm".index(symbol) for symbol, _ in self.places])
 
     @cached_property

@@ -132,7 +132,7 @@ def _span(record: Record, cart: int) -> float:
 
 
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
-    """Return the records, with carts marked as held that move in no record."""
+    """Return the records; carts that move in none of them are marked as held."""
     seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
     # A cart that stays within three encoder steps is at rest.
     moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}

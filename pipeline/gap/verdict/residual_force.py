@@ -26,7 +26,7 @@ class ResidualForce:
     measured, model : residual force of the linear part for the measured motion, and for the motion
         of the model with its effects; both agree if the effects are right.
     u : the logged input, on cart 1; 0 elsewhere.
-    arriving : the input behind the model's dead zone and saturation, which is subtracted from the
+    arriving : the input after the model's dead zone and saturation; it is subtracted from the
         forces.
     velocity, position : of the measured cart, without its encoder zero.
     neighbours : (2, n) positions of the carts before and after, 0 for a wall or a held cart.

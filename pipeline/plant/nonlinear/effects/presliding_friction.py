@@ -16,7 +16,7 @@ EFFECT = Effect(
     ),
     fingerprint="The half period shortens as the amplitude falls, and the cart never quite stops "
     "dead: it rings stiffly about where it came to rest.",
-    deciding_run="Small free decays: the frequency rises as the swing comes below δ.",
+    deciding_run="Small free decays: the frequency rises as the amplitude falls below δ.",
     reference="P. R. Dahl, AIAA Journal 14 (1976), 1675-1682",
     axis="velocity",
     family="dry friction",
