@@ -98,8 +98,8 @@ def check_decays(
             f"±{test.drop:.3g} {bench.units.position} of its rest. The envelope's ζ = "
             f"{decay.zeta:.3g} is biased; ζ = {test.zeta:.3g} once friction is taken out."
             if test.present
-            else "is exponential as far as its noise can show "
-            f"(F = {test.f_statistic:.1f}; dry friction would show above {test.threshold:.1f})."
+            else "is exponential within the noise "
+            f"(F = {test.f_statistic:.1f}; above {test.threshold:.1f} would mean dry friction)."
         )
         what = f"the decay of cart {decay.cart}"
         if kinds.get(decay.experiment) == "step":
