@@ -363,7 +363,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
         expect(window.get_by_text("Saved.")).to_be_visible()
         window.locator("#drop").set_input_files([FILES[0]])
         window.get_by_role("button", name="Upload", exact=True).click()
-        expect(window.get_by_text("exists already")).to_be_visible()
+        expect(window.get_by_text("already exists")).to_be_visible()
     assert load_submission(folder).title == "Plain"
 
 
