@@ -138,7 +138,7 @@ def nbgrader(folder: Path, base: Path) -> Graded | None:
         _run("nbgrader", "autograde", "lab", cwd=course)
         _run("nbgrader", "generate_feedback", "lab", cwd=course)
     with Book(f"sqlite:///{course / 'gradebook.db'}") as book:
-        graded = book.assignment_submissions("lab")
+        graded: list[Any] = book.assignment_submissions("lab")
         assert len(graded) == len(list(folder.iterdir()))
         lost = frozenset(one.student.id for one in graded if one.score < one.max_score)
     return Graded(cost=costs[0], lost=lost, named={})
