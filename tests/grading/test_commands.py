@@ -218,30 +218,31 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
     """Neither while it works, nor in reasons, warnings or changes of the class list."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)
-    names = ["doe-jane", "roe-richard", "poe-anna", "moe-max"]
+    # No pseudonym has a 1: they are in base 32, which has 2 to 7 only.
+    names = ["doe1-jane1", "roe1-richard1", "poe1-anna1", "moe1-max1"]
     toml = 'version = 1\n[[authors]]\nid = "{name}"\n[system]\ncarts = {carts}\n'
     for name, carts in zip(names, ("1", "1", '"two"', "1"), strict=True):
         (tmp_path / "c" / name).mkdir(parents=True)
         text = toml.format(name=name, carts=carts)
         (tmp_path / "c" / name / "submission.toml").write_text(text, encoding="utf-8")
-    (tmp_path / "c" / "moe-max" / "submission.toml").unlink()
-    (tmp_path / "c" / "moe-max" / "feedback").mkdir()
-    (tmp_path / "c" / "moe-max" / "feedback" / ".made.json").write_text("{}", encoding="utf-8")
-    (tmp_path / "c" / "moe-max" / "class.html").write_text("", encoding="utf-8")
+    (tmp_path / "c" / "moe1-max1" / "submission.toml").unlink()
+    (tmp_path / "c" / "moe1-max1" / "feedback").mkdir()
+    (tmp_path / "c" / "moe1-max1" / "feedback" / ".made.json").write_text("{}", encoding="utf-8")
+    (tmp_path / "c" / "moe1-max1" / "class.html").write_text("", encoding="utf-8")
     late, out = tmp_path / "late.csv", tmp_path / "out"
-    late.write_text("submission,days_late\ndoe-jane,2.5\nmoe-max,1\n", encoding="utf-8")
+    late.write_text("submission,days_late\ndoe1-jane1,2.5\nmoe1-max1,1\n", encoding="utf-8")
     words = ("grade", tmp_path / "c", "--rubric", "throne-1dof", "--out", out, "--jobs", 1,
              "--anonymous", "--no-figures", "--lateness", late)  # fmt: skip
     said = [run(*words)[2]]
     assert "1 folder skipped: they look like results of a grading" in said[0]
     assert "late.csv: no such submission: 1 name" in said[0]
     assert re.search(r"anon-\w+: anon-\w+/submission.toml: system.carts", said[0])
-    run("override", out, "roe-richard", "pieces", "1", "--why", "x", "--by", "Ada")
-    (tmp_path / "c" / "roe-richard").rename(tmp_path / "c" / "coe-richard")
-    text = toml.format(name="poe-anna", carts="1") + '[design]\nmethod = "place"\n'
-    (tmp_path / "c" / "poe-anna" / "submission.toml").write_text(text, encoding="utf-8")
-    (tmp_path / "c" / "doe-jane" / "submission.toml").unlink()
-    (tmp_path / "c" / "doe-jane").rmdir()
+    run("override", out, "roe1-richard1", "pieces", "1", "--why", "x", "--by", "Ada")
+    (tmp_path / "c" / "roe1-richard1").rename(tmp_path / "c" / "coe1-richard1")
+    text = toml.format(name="poe1-anna1", carts="1") + '[design]\nmethod = "place"\n'
+    (tmp_path / "c" / "poe1-anna1" / "submission.toml").write_text(text, encoding="utf-8")
+    (tmp_path / "c" / "doe1-jane1" / "submission.toml").unlink()
+    (tmp_path / "c" / "doe1-jane1").rmdir()
     said.append(run(*words)[2])
     assert "not in this run, kept as they were: anon-" in said[1]
     for text in said:
