@@ -28,6 +28,7 @@ from pipeline.grading.gradebook.rows import (
     by_other_rubrics,
     carry_over,
     class_list,
+    final_entries,
     final_entry,
     known_grading,
     last_named,
@@ -225,10 +226,8 @@ class Gradebook:
         for page in pages(positions):
             with self._database.reading() as connection:
                 rows = connection.execute(lines.where(entries.c.position.in_(page))).all()
-                found = [
-                    final_entry(connection, r, shared=read_flag(r.shared), rubric=rubric)
-                    for r in rows
-                ]
+                read = [(row, read_flag(row.shared)) for row in rows]
+                found = final_entries(connection, read, rubric=rubric)
             yield from found
 
     def entry(self, team: str) -> Entry:

@@ -1,7 +1,7 @@
 """A gradebook that several people read and change at the same time."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from pipeline.grading.gradebook.rows import (
     as_it_counts,
     class_list,
     final_entry,
+    first_keys,
     read_flag,
     read_rubric,
 )
@@ -149,7 +150,7 @@ class OpenBook(Gradebook):
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
-            given, first_keys = _given(connection, last), _first_keys(connection, last)
+            given, keys = _given(connection, last), first_keys(connection, _in_class(last))
             seen = _seen(connection, last)
             known = before.listings if before and before.rubric == rubric else ()
             made = {listing.made_of: listing for listing in known}
@@ -175,7 +176,7 @@ class OpenBook(Gradebook):
                     grading=row.id,
                     seen=seen.get(row.id, ""),
                     shared=read_flag(row.shared),
-                    first_key=first_keys[row.submission_id],
+                    first_key=keys[row.submission_id],
                     made_of=rests_on[row.position],
                 )
             return ClassNow(rubric=rubric, listings=tuple(listed[at] for at in rests_on))
@@ -190,13 +191,13 @@ class OpenBook(Gradebook):
         with self._database.reading() as connection:
             last, row = self._find(connection, name)
             rubric = read_rubric(last)
-            newest = _newest_overrides(connection, row.submission_id)
+            newest = newest_overrides(connection, [row.submission_id])[row.submission_id]
             marks = select(looks).where(looks.c.grading_id == row.id)
             mark = connection.execute(marks.order_by(looks.c.id.desc()).limit(1)).one_or_none()
             return TeamNow(
                 rubric=rubric,
                 entry=final_entry(connection, row, shared=read_flag(row.shared), rubric=rubric),
-                versions={c.id: _version(row, newest.get(c.id)) for c in rubric.criteria},
+                versions={c.id: name_version(row, newest.get(c.id)) for c in rubric.criteria},
                 changed=frozenset(newest),
                 seen=mark.by if mark is not None and mark.seen else "",
                 events=read_events(connection, row.submission_id, named=not rubric.anonymous),
@@ -282,7 +283,7 @@ class OpenBook(Gradebook):
                     raise ConfigError(f"{where}no such submission is in the class")
                 if wish.seen:
                     _check_seen(connection, row, wish.criterion, wish.seen)
-                newest = _newest_overrides(connection, row.submission_id)
+                newest = newest_overrides(connection, [row.submission_id])[row.submission_id]
                 ever = map(_read_override, newest.values())
                 asked = wish.beside(one for one in ever if one.concerns(row.authors))
                 if _is_same(asked, newest.get(asked.criterion)):
@@ -334,12 +335,11 @@ class OpenBook(Gradebook):
         """Return the sets of changes to at least so many submissions at once, newest first."""
         with self._database.reading() as connection:
             last = self._last(connection)
-            of_class = select(entries.c.submission_id).where(entries.c.batch_id == last.id)
             columns = overrides.c.at, overrides.c.by
             teams = func.count(overrides.c.submission_id.distinct())
             mine = select(*columns, func.min(overrides.c.criterion).label("criterion"),
                           func.max(overrides.c.why).label("why"), teams.label("teams"))  # fmt: skip
-            mine = mine.where(overrides.c.submission_id.in_(of_class)).group_by(*columns)
+            mine = mine.where(overrides.c.submission_id.in_(_in_class(last))).group_by(*columns)
             mine = mine.having(teams >= least).order_by(func.max(overrides.c.id).desc())
             return [Together(**row) for row in connection.execute(mine).mappings()]
 
@@ -388,23 +388,18 @@ def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -
     return line.sharing() if shared else line
 
 
+def _in_class(batch: Row) -> Select:
+    """Return the query for the numbers of the submissions on a class list."""
+    return select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
+
+
 def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
     """Return all points ever given by hand in a class, by the number of the submission."""
-    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
     given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
-    mine = _overrides().where(overrides.c.submission_id.in_(of_class))
+    mine = _overrides().where(overrides.c.submission_id.in_(_in_class(batch)))
     for row in connection.execute(mine):
         given[row.submission_id][row.id] = _read_override(row)
     return given
-
-
-def _first_keys(connection: Connection, batch: Row) -> dict[int, str]:
-    """Return, by submission, the key of the first version."""
-    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
-    firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(of_class))
-    firsts = firsts.group_by(gradings.c.submission_id)
-    keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
-    return {row.submission_id: row.key for row in connection.execute(keys)}
 
 
 def _seen(connection: Connection, batch: Row) -> dict[int, str]:
@@ -450,8 +445,7 @@ def points_of(grade: Grade, criterion: str) -> float | None:
 
 def _changed_at(batch: Row, at: str) -> Select:
     """Return the query for all points given by hand at one moment in a class."""
-    of_class = select(entries.c.submission_id).where(entries.c.batch_id == batch.id)
-    return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(of_class))
+    return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(_in_class(batch)))
 
 
 def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
@@ -467,7 +461,7 @@ def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric
         submission=row.name,
         now=as_it_counts(row, ever, shared=shared, rubric=rubric).grade,
         after=as_it_counts(row, [*ever, new], shared=shared, rubric=rubric).grade,
-        version=_version(row, newest),
+        version=name_version(row, newest),
     )
 
 
@@ -476,19 +470,24 @@ def _read_override(row: Row) -> HandPoints:
     return HandPoints(**{column.name: row._mapping[column.name] for column in OVERRIDE})
 
 
-def _newest_overrides(connection: Connection, submission: int) -> dict[str, Row]:
-    rows = connection.execute(_overrides().where(overrides.c.submission_id == submission))
-    return {row.criterion: row for row in rows}
+def newest_overrides(connection: Connection, submitted: Iterable[int]) -> dict[int, dict[str, Row]]:
+    """Return the last points by hand, by the number of the submission and the criterion."""
+    rows = connection.execute(_overrides().where(overrides.c.submission_id.in_(set(submitted))))
+    newest: dict[int, dict[str, Row]] = defaultdict(dict)
+    for row in rows:
+        newest[row.submission_id][row.criterion] = row
+    return newest
 
 
-def _version(row: Row, newest: Row | None) -> str:
+def name_version(row: Row, newest: Row | None) -> str:
+    """Name the state behind the points of a criterion: the grading, and the last points by hand."""
     return f"{row.id}.{newest.id if newest is not None else 0}"
 
 
 def find_version(connection: Connection, row: Row, criterion: str) -> tuple[str, HandPoints | None]:
     """Return the state behind the points of a criterion, and the last points by hand."""
-    newest = _newest_overrides(connection, row.submission_id).get(criterion)
-    return _version(row, newest), _read_override(newest) if newest is not None else None
+    newest = newest_overrides(connection, [row.submission_id])[row.submission_id].get(criterion)
+    return name_version(row, newest), _read_override(newest) if newest is not None else None
 
 
 def _check_seen(connection: Connection, row: Row, criterion: str, seen: str) -> None:

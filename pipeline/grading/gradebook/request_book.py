@@ -7,7 +7,14 @@ from sqlalchemy import Connection, Row
 
 from pipeline.errors import ConfigError
 from pipeline.grading.grade import Grade
-from pipeline.grading.gradebook.open_book import Conflict, OpenBook, find_version, points_of
+from pipeline.grading.gradebook.open_book import (
+    Conflict,
+    OpenBook,
+    find_version,
+    name_version,
+    newest_overrides,
+    points_of,
+)
 from pipeline.grading.gradebook.override import WantedPoints
 from pipeline.grading.gradebook.requests import (
     MOST_OPEN,
@@ -16,6 +23,7 @@ from pipeline.grading.gradebook.requests import (
     RequestRefused,
     find_requests,
     is_released,
+    read_all_requests,
     read_requests,
     read_words,
 )
@@ -23,6 +31,7 @@ from pipeline.grading.gradebook.rows import (
     Entry,
     add_row,
     class_list,
+    final_entries,
     final_entry,
     last_named,
     read_flag,
@@ -99,14 +108,12 @@ class RequestBook(OpenBook):
                 [row for row in rows if not of or row.name == of]
                 for rows in find_requests(connection, last)
             )
-            shown = (
-                tuple(self._queued(connection, last, row) for row in rows[:_MOST_SHOWN])
-                for rows in (waiting, settled)
-            )
+            shown = [*waiting[:_MOST_SHOWN], *settled[:_MOST_SHOWN]]
+            queued = _read_queued(connection, last, shown)
             return Queue(
                 rubric=rubric,
-                waiting=next(shown),
-                settled=next(shown),
+                waiting=queued[: len(waiting[:_MOST_SHOWN])],
+                settled=queued[len(waiting[:_MOST_SHOWN]) :],
                 n_waiting=len(waiting),
                 n_settled=len(settled),
             )
@@ -256,20 +263,9 @@ class RequestBook(OpenBook):
         if request is None:
             raise ConfigError(f"{criterion}: nobody asked for another look")
         version, given = find_version(connection, row, criterion)
-        if seen != f"{version}.{request.number}":
+        if seen != _name_version(version, request):
             raise Conflict(f"{criterion}: was changed after this page was shown", now=given)
         return last, row, request
-
-    def _queued(self, connection: Connection, last: Row, found: Row) -> Queued:
-        row = connection.execute(class_list(last).where(entries.c.position == found.position)).one()
-        version, _ = find_version(connection, row, found.criterion)
-        requests = read_requests(connection, row.submission_id, row.authors)
-        request = requests[found.criterion]
-        return Queued(
-            entry=_entry(connection, last, row),
-            request=request,
-            version=f"{version}.{request.number}",
-        )
 
     def _add(self, connection: Connection, row: Row, said: RequestEvent) -> None:
         """Add an event to a request, with the current time and authors."""
@@ -284,6 +280,30 @@ def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
     """Return the criteria of the rubric without full points, judged or not."""
     points = {criterion.id: criterion.points for criterion in grade.criteria}
     return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
+
+
+def _read_queued(connection: Connection, last: Row, events: Sequence[Row]) -> list[Queued]:
+    """Return requests given by their newest events; there are five queries, however many."""
+    positions = {event.position for event in events}
+    rows = connection.execute(class_list(last).where(entries.c.position.in_(positions))).all()
+    read = [(row, read_flag(row.shared)) for row in rows]
+    final = final_entries(connection, read, rubric=read_rubric(last))
+    newest = newest_overrides(connection, [row.submission_id for row in rows])
+    requests = read_all_requests(connection, {row.submission_id: row.authors for row in rows})
+    lines = {row.submission_id: (row, entry) for row, entry in zip(rows, final, strict=True)}
+    queued = []
+    for event in events:
+        row, entry = lines[event.submission_id]
+        request = requests[event.submission_id][event.criterion]
+        points = name_version(row, newest[event.submission_id].get(event.criterion))
+        version = _name_version(points, request)
+        queued.append(Queued(entry=entry, request=request, version=version))
+    return queued
+
+
+def _name_version(points: str, request: Request) -> str:
+    """Name the state of a request that an answer must have seen."""
+    return f"{points}.{request.number}"
 
 
 def _entry(connection: Connection, last: Row, row: Row) -> Entry:

@@ -1,8 +1,7 @@
 """Requests for another look: events of a criterion, the newest of which sets the state."""
 
 import re
-from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -74,18 +73,27 @@ def read_requests(
     connection: Connection, submission: int, authors: tuple[str, ...]
 ) -> dict[str, Request]:
     """Return the requests of a submission's current authors, by criterion."""
-    mine = select(request_events.c.id, *EVENT).where(request_events.c.submission_id == submission)
-    events: dict[str, list[RequestEvent]] = defaultdict(list)
-    numbers: dict[str, int] = {}
+    return read_all_requests(connection, {submission: authors})[submission]
+
+
+def read_all_requests(
+    connection: Connection, authors: Mapping[int, tuple[str, ...]]
+) -> dict[int, dict[str, Request]]:
+    """Return the requests of the current authors of each submission, by criterion."""
+    mine = select(request_events.c.id, request_events.c.submission_id, *EVENT)
+    mine = mine.where(request_events.c.submission_id.in_(authors))
+    found: dict[int, dict[str, Request]] = {submission: {} for submission in authors}
     for row in connection.execute(mine.order_by(request_events.c.id)):
         event = RequestEvent(**{column.name: row._mapping[column.name] for column in EVENT})
-        if go_with(event.authors, authors):
-            events[event.criterion].append(event)
-            numbers[event.criterion] = row.id
-    return {
-        criterion: Request(criterion=criterion, events=tuple(steps), number=numbers[criterion])
-        for criterion, steps in events.items()
-    }
+        if go_with(event.authors, authors[row.submission_id]):
+            theirs = found[row.submission_id]
+            known = theirs.get(event.criterion)
+            theirs[event.criterion] = Request(
+                criterion=event.criterion,
+                events=(*(known.events if known else ()), event),
+                number=row.id,
+            )
+    return found
 
 
 def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:

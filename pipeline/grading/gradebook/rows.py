@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 
@@ -174,16 +175,44 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
     """Return the current grade, with the flag for shared data and points given by hand."""
-    mine = select(*OVERRIDE).where(overrides.c.submission_id == row.submission_id)
-    rows = connection.execute(mine.order_by(overrides.c.id)).mappings()
-    first = select(gradings.c.key).where(gradings.c.submission_id == row.submission_id)
-    return as_it_counts(
-        row,
-        [HandPoints(**o) for o in rows],
-        shared=shared,
-        rubric=rubric,
-        first_key=connection.scalar(first.order_by(gradings.c.id).limit(1)) or "",
-    )
+    return final_entries(connection, [(row, shared)], rubric=rubric)[0]
+
+
+def final_entries(
+    connection: Connection, lines: Sequence[tuple[Row, Flag | None]], *, rubric: Rubric
+) -> list[Entry]:
+    """Return the current grade of each line; there are two queries, however many lines there are.
+
+    Parameters
+    ----------
+    lines : rows of a class list, each with its flag for shared data.
+    """
+    numbers = {row.submission_id for row, _ in lines}
+    given: dict[int, list[HandPoints]] = defaultdict(list)
+    theirs = select(overrides.c.submission_id, *OVERRIDE).order_by(overrides.c.id)
+    theirs = theirs.where(overrides.c.submission_id.in_(numbers))
+    for override in connection.execute(theirs).mappings():
+        values = dict(override)
+        given[values.pop("submission_id")].append(HandPoints(**values))
+    keys = first_keys(connection, numbers)
+    return [
+        as_it_counts(
+            row,
+            given[row.submission_id],
+            shared=shared,
+            rubric=rubric,
+            first_key=keys.get(row.submission_id, ""),
+        )
+        for row, shared in lines
+    ]
+
+
+def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
+    """Return, by the number of the submission, the key of its first version."""
+    firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
+    firsts = firsts.group_by(gradings.c.submission_id)
+    keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))
+    return {row.submission_id: row.key for row in connection.execute(keys)}
 
 
 def as_it_counts(
