@@ -1,4 +1,4 @@
-"""Read CSV tables from platforms and people."""
+"""Read CSV tables that learning platforms and people write."""
 
 import csv
 import io
@@ -11,18 +11,18 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _MOST_BYTES = 20_000_000
-_MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # no class and no questionnaire is larger
+_MOST_ROWS, _MOST_COLUMNS = 100_000, 2_000  # more than any class or questionnaire has
 
 
 def read_table(path: Path) -> "pd.DataFrame":
-    """Return the cells of a CSV as text, indexed by the line on which each row ends.
+    """Return the cells of a CSV file as text, one row per record.
 
-    Separators are commas, semicolons or tabs. Empty rows are left out, short rows are padded, and
-    cells beyond the heading are dropped.
+    The index is the line of the file on which the row ends. Separators are commas, semicolons or
+    tabs. Empty rows are left out, short rows are padded, and cells beyond the heading are dropped.
 
     Raises
     ------
-    ConfigError : it is not such a table, or too large.
+    ConfigError : the file is not such a table, or it is too large.
     """
     import pandas as pd
 
@@ -35,7 +35,7 @@ def read_table(path: Path) -> "pd.DataFrame":
     except UnicodeDecodeError:
         raise ConfigError(f"{path.name}: is not UTF-8 text; save it as CSV UTF-8") from None
     delimiter = max(",;\t", key=text.partition("\n")[0].count)
-    # Not pandas' reader: it does not report the line of a row, which messages need.
+    # Messages need the line of each row, which the reader of pandas does not report.
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     head: list[str] = []
     rows: dict[int, list[str]] = {}

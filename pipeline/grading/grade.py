@@ -30,17 +30,20 @@ Code = Literal[
     "data_problem",
 ]
 CODES: tuple[Code, ...] = get_args(Code)
-Values = dict[str, Any]  # numbers, texts, or lists of them
+Values = dict[str, Any]  # numbers, texts, or lists of numbers or texts
 
 
 class GradeTable(BaseModel):
-    """A table of the file; unknown keys are allowed, because later versions may add some."""
+    """A table in `grade.json`; unknown keys are allowed, because later versions may add keys."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
 
 
 class Criterion(GradeTable):
-    """One line of the grade; `skip` if a required criterion failed or nothing could be judged."""
+    """The result of one criterion.
+
+    The outcome is `skip` if a criterion that it depends on failed, or if nothing could be judged.
+    """
 
     id: str
     title: str
@@ -53,7 +56,7 @@ class Criterion(GradeTable):
 
 
 class Flag(GradeTable):
-    """A named mistake: its place and the evidence."""
+    """A named mistake, with its place and the evidence for it."""
 
     code: Code
     parameters: Annotated[
@@ -65,7 +68,7 @@ class Flag(GradeTable):
 
 
 class GradeOverride(GradeTable):
-    """Points given by hand, already included in the criterion."""
+    """Points given by hand; the points of the criterion already include them."""
 
     criterion: str
     points: float
@@ -124,18 +127,18 @@ class Grade(GradeTable):
         )
 
     def with_flags(self, *flags: Flag) -> "Grade":
-        """Return the grade with further flags, in the order of the codes."""
+        """Return the grade with further flags; all flags are sorted by the order of `Code`."""
         together = sorted((*self.flags, *flags), key=lambda flag: CODES.index(flag.code))
         return self.model_copy(update={"flags": tuple(together)})
 
 
 def grade_text(grade: Grade) -> str:
-    """Return `grade.json` as text; same grade, same bytes."""
+    """Return `grade.json` as text; the same grade gives the same bytes."""
     return json_text(grade)
 
 
 def read_grade(text: str) -> Grade:
-    """Read the grade in a `grade.json`.
+    """Return the grade that a `grade.json` contains.
 
     Raises
     ------

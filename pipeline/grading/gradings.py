@@ -17,9 +17,11 @@ class Member:
     ----------
     submission : its id, unique in the batch.
     owner : the account that submitted it, as the learning platform names it, or "".
-    key : hash of everything the grading depends on: submitted files, rubric, code, name and
-        lateness; after a hyphen, the hash of the files alone.
-    fingerprints : used to find its recordings in other submissions; see `shared.py`.
+    key : hash of everything that affects the grade (submitted files, rubric, code, name and
+        lateness),
+        a hyphen, and the hash of the files alone.
+    fingerprints : noise patterns of its recordings, to find them in other submissions; see
+        `shared.py`.
     reason : why it could not be graded, in one line, or "".
     grading : the number of its grading in the gradebook.
     of_class : whether it belongs to the assignment being graded.
@@ -41,7 +43,7 @@ class Member:
 
     @property
     def content(self) -> str:
-        """The part of the key that depends on the files alone, or ""."""
+        """The part of the key that depends only on the files, or ""."""
         return self.key.partition("-")[2]
 
 
@@ -52,10 +54,10 @@ class Grading(Member):
     Attributes
     ----------
     status : `failed` if it could not be graded.
-    settled : False if a limit or a crash ended it; the next run tries again.
-    grade : `grade.json` without shared data and overrides.
-    findings : results of the checks, in the form of `judge.reweigh`; "" if grading failed.
-    figures : (file name, SVG) for the feedback.
+    settled : False if a limit or a crash ended the grading; the next run tries again.
+    grade : text of `grade.json`, without shared data and overrides.
+    findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.
+    figures : file names and SVG texts for the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
     lacks_room : the disk was full. This concerns only this run; the gradebook does not keep it.
     """
@@ -71,19 +73,19 @@ class Grading(Member):
 
     @property
     def member(self) -> Member:
-        """The part of a grading that a batch needs; the rest stays in the gradebook."""
+        """The part that a batch keeps in memory; the gradebook stores the whole grading."""
         return Member(**{own.name: getattr(self, own.name) for own in fields(Member)})
 
 
 def person(author: str) -> str:
-    """Return an author's id in a normal form, so that different spellings match."""
+    """Return an author's id in a normal form, so that different spellings are equal."""
     return " ".join(unicodedata.normalize("NFKC", author).split()).casefold()
 
 
 def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
     """Return whether points given to some people still apply to a submission of these authors.
 
-    A submission that cannot be read has no authors; then its name decides.
+    A submission that cannot be read has no authors. Then points given under its name apply.
     """
     if not authors or not given:
         return True
@@ -92,15 +94,16 @@ def go_with(given: tuple[str, ...], authors: tuple[str, ...]) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class Batch:
-    """A complete batch; the gradings themselves stay in the gradebook.
+    """A complete batch; the gradings themselves are in the gradebook.
 
     Attributes
     ----------
     keys : of the gradings, in the order of the submissions' ids.
     shared : by submission, the flag for recordings that another submission also contains.
-    failed : (submission, reason) of those that could not be graded.
-    unsettled : failed ones that the next run tries again; lacks_room : failed for a full disk.
-    kept, moved, taken_over : changes since the last class list, see `so_far.SoFar`.
+    failed : submission and reason, for those that could not be graded.
+    unsettled : number of failed submissions that the next run tries again.
+    lacks_room : number of submissions that failed because the disk was full.
+    kept, moved, taken_over : changes since the last class list; see `so_far.SoFar`.
     """
 
     keys: tuple[str, ...]

@@ -1,7 +1,7 @@
 """Write the zip that Gradescope builds an autograder from.
 
-It holds cartlab itself, as files: Gradescope's machines reach the package index, where cartlab is
-not, and files need neither a build tool nor a checkout.
+The zip contains the source files of cartlab. Gradescope's machines can install packages from the
+index, but cartlab is not there; and plain files need no build tool on the instructor's computer.
 """
 
 import io
@@ -22,8 +22,8 @@ from pipeline.output import write_file
 from pipeline.resources import TEMPLATES
 
 _SCRIPTS = TEMPLATES / "gradescope"
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # same files, same bytes
-_PROGRAM, _FILE = 0o100755 << 16, 0o100644 << 16  # as zip files keep modes
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same bytes
+_PROGRAM, _FILE = 0o100755 << 16, 0o100644 << 16  # file modes, in the format of zip files
 
 
 def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
         for name, content in sorted(_files(text, rubric)):
             info = zipfile.ZipInfo(name, _FIXED_TIME)
             info.external_attr = _PROGRAM if (_SCRIPTS / name).is_file() else _FILE
-            info.create_system = 3  # Unix, whose modes these are
+            info.create_system = 3  # 3 is Unix; the file modes are those of Unix
             archive.writestr(info, content, zipfile.ZIP_DEFLATED)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_file(out, buffer.getvalue())
@@ -55,12 +55,12 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
 
 
 def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
-    """Yield (name in the zip, content)."""
+    """Yield name and content of each file in the zip."""
     for script in _SCRIPTS.iterdir():
         yield (
             script.name,
             script.read_bytes().replace(b"\r\n", b"\n"),
-        )  # for bash, also from Windows
+        )  # without \r, which bash refuses
     yield "python-version", f"{sys.version_info.major}.{sys.version_info.minor}\n".encode()
     head = f"# cartlab {pipeline.__version__} was installed with:"
     yield "requirements.txt", "\n".join([head, *pin_requirements(), ""]).encode()

@@ -1,4 +1,4 @@
-"""The installed versions of everything that cartlab needs, as a `requirements.txt` for Linux."""
+"""List the installed versions of all packages that cartlab needs, as a `requirements.txt`."""
 
 import importlib.metadata as installed
 from collections.abc import Set
@@ -10,7 +10,7 @@ from packaging.version import Version
 
 from pipeline.errors import ConfigError
 
-# Gradescope's machines, whatever this computer is.
+# The environment of Gradescope's machines, even if this computer runs another system.
 _LINUX: dict[str, str | Set[str]] = {
     "os_name": "posix",
     "sys_platform": "linux",
@@ -20,10 +20,10 @@ _LINUX: dict[str, str | Set[str]] = {
 
 
 def pin_requirements(package: str = "cartlab") -> list[str]:
-    """Return `name==version` of all packages that a package needs on Linux, sorted.
+    """Return `name==version` of a package's requirements on Linux, direct and indirect, sorted.
 
-    A package that only Linux needs is left out if this computer does not have it; pip then finds
-    one by itself.
+    A package that is needed only on Linux is left out if this computer does not have it. On Linux,
+    pip then chooses its version.
 
     Raises
     ------

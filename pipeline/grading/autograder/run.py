@@ -1,6 +1,6 @@
-"""Grade the one submission of a Gradescope container: `run_autograder` calls this.
+"""Grade the submission in a Gradescope container: the script `run_autograder` calls this.
 
-The folders are those of Gradescope's *Autograder Specifications*, below whatever root is named.
+The folder names below the root are those of Gradescope's *Autograder Specifications*.
 """
 
 import sys
@@ -14,17 +14,20 @@ from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.output import write_file
 
-_TIME_LIMIT = 420.0  # s of the 600 that Gradescope gives; the rest is for starting
+_TIME_LIMIT = 420.0  # s; Gradescope stops after 600, which include the start of the container
 
 
 def grade_upload(root: Path) -> str:
-    """Grade `submission/`, write `results/results.json`; return what the instructor may look up."""
+    """Grade `submission/` and write `results/results.json`; return the traceback of a grader error.
+
+    Gradescope shows the returned text only to the instructor; it is "" if there was no error.
+    """
     rubric = load_rubric(root / "source" / "rubric.toml")
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch:
         setup = Setup(rubric=rubric, scratch=Path(scratch), time_limit=_TIME_LIMIT)
         grader = Grader(setup)
         try:
-            # Lateness is Gradescope's own affair, which knows extensions.
+            # Gradescope itself deducts for lateness, because it knows the extensions.
             task = Task(id="submission", key="", sources=(str(root / "submission"),))
             grading = grader.run(task)
         finally:

@@ -27,12 +27,17 @@ _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 
 def run_on(address: str) -> Executor:
-    """Return a function that runs tasks on a scheduler's cluster (`tcp://HOST:PORT`, `tls://…`).
+    """Return a function that runs tasks on the cluster of a Dask scheduler.
+
+    Parameters
+    ----------
+    address : of the scheduler, `tcp://HOST:PORT` or `tls://HOST:PORT`.
 
     Raises
     ------
-    ConfigError : the address is another machine's without encryption (a scheduler runs any code
-        it receives), nobody answers, certificates are missing, or the cluster's version differs.
+    ConfigError : the address is on another machine and not encrypted (a scheduler runs any code
+        that
+        it receives), nobody answers, certificates are missing, or the cluster runs another version.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:
@@ -57,7 +62,7 @@ def run_on(address: str) -> Executor:
                 client.wait_for_workers(1, timeout=_CONNECT_LIMIT)
             except TimeoutError:
                 raise ConfigError(f"{address}: the scheduler has no workers") from None
-            # Runs that share a cluster each have their own graders and rubric.
+            # Several runs can share a cluster. A unique name keeps their graders and rubrics apart.
             graders = f"cartlab-graders-{uuid4()}"
             client.register_plugin(Graders(setup), name=graders)
             try:
@@ -69,21 +74,21 @@ def run_on(address: str) -> Executor:
 
 
 class Graders(WorkerPlugin):
-    """The worker processes of one Dask worker, started when needed, ended with it."""
+    """The grading processes of one Dask worker, started when needed and ended with the worker."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
         self._code = code_version()
 
     def setup(self, worker: DaskWorker) -> None:
-        """Make a folder for submissions; processes start with the first task."""
+        """Make a folder for submissions; each process starts when a task needs it."""
         self._folder = tempfile.TemporaryDirectory(prefix="cartlab-", ignore_cleanup_errors=True)
         self._idle: SimpleQueue[Grader] = SimpleQueue()
         self._all: list[Grader] = []
         self.same_code = self._code == code_version()
 
     def teardown(self, worker: DaskWorker) -> None:
-        """End the processes."""
+        """End the grading processes."""
         for process in self._all:
             process.close()
         self._folder.cleanup()
@@ -106,7 +111,7 @@ class Graders(WorkerPlugin):
 
 
 def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
-    """Run on a Dask worker."""
+    """Grade a task; this function runs on a Dask worker, whose plugin grades it."""
     graders = get_worker().plugins[plugin]
     assert isinstance(graders, Graders)
     if not graders.same_code:
@@ -115,7 +120,7 @@ def _grade(task: Task, archive: bytes, plugin: str) -> Grading:
 
 
 def _threads(client: Client) -> int:
-    """Return how many tasks the cluster can run at once at the moment."""
+    """Return how many tasks the cluster can run at once now; workers may come and go."""
     workers = client.scheduler_info(n_workers=-1)["workers"]
     return sum(worker["nthreads"] for worker in workers.values())
 
@@ -123,7 +128,7 @@ def _threads(client: Client) -> int:
 def _through(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
-    """Yield the outcomes as they come; tasks of a lost worker go to another."""
+    """Yield each outcome when it is ready; if a worker is lost, Dask moves its tasks to another."""
     waiting = list(reversed(tasks))
     under_way: dict[str, Task] = {}
     answers = as_completed(loop=client.loop)

@@ -1,4 +1,4 @@
-"""The whole of `cartlab grade`: intake, grading, gradebook and output files."""
+"""Run the whole of `cartlab grade`: intake, grading, gradebook and output files."""
 
 import os
 import re
@@ -32,16 +32,21 @@ from pipeline.submission.load import NAME
 from pipeline.words.numbers import count, listing
 
 _SCRATCH = re.compile(r"\.scratch(-\d+)?")
-_NAMED = 8  # submissions in a remark
+_NAMED = 8  # submissions named in one message
 
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Counts of a run, and the submissions that could not be graded (id, reason).
+    """The counts of a run and its messages.
 
-    The next run tries the `unsettled` ones again; `lacks_room` of them failed for a full disk.
-    `remarks` are further messages for the command line, `changes` the differences from the last
-    class list.
+    Attributes
+    ----------
+    failed : submission and reason, for those that could not be graded.
+    sharing : number of submissions with recordings that another one also contains.
+    unsettled : number of failed submissions that the next run tries again.
+    lacks_room : number of submissions that failed because the disk was full.
+    remarks : further messages for the command line.
+    changes : differences from the last class list.
     """
 
     total: int
@@ -54,7 +59,7 @@ class Summary:
 
     @property
     def counted(self) -> str:
-        """The numbers, in words."""
+        """Sentence with the counts."""
         shared = (
             f", {self.sharing} with recordings that another also contains" if self.sharing else ""
         )
@@ -67,12 +72,14 @@ class Options:
 
     Attributes
     ----------
-    jobs : processes on this machine; cluster : or the address of a Dask scheduler.
-    time_limit, memory_limit : for each submission, in s and bytes.
+    jobs : processes on this machine.
+    cluster : address of a Dask scheduler, used instead of `jobs`.
+    time_limit : for each submission, in s.
+    memory_limit : for each submission, in bytes.
     figures : draw the figures of the feedback.
     anonymous : leave names out of all files; a rubric may also require this.
-    gradebook : a database URL; default: `gradebook.sqlite` in the folder of the results.
-    lateness : a table of late submissions.
+    gradebook : a database URL; default: `gradebook.sqlite` in the output folder.
+    lateness : path of a table of late submissions.
     """
 
     jobs: int = 1
@@ -103,12 +110,12 @@ def grade_class(
     options: Options,
     progress: Progress = silent,
 ) -> Summary:
-    """Grade everything in `paths` into the folder `out`.
+    """Grade all submissions in `paths` and write the results into the folder `out`.
 
     Raises
     ------
-    ConfigError : the rubric, the table, a path, the folder or the cluster cannot be used, the
-        folder holds another class, or another run is writing there.
+    ConfigError : the rubric, the late table, a path, the folder or the cluster cannot be used; the
+        folder holds another class; or another run is writing there.
     """
     rubric = load_rubric(rubric_file)
     late_table = read_late_table(options.lateness) if options.lateness else {}
@@ -122,7 +129,8 @@ def grade_class(
         passed: list[str] = []
         found = find_hand_ins(paths, scratch=scratch, skip=[out], known=known, say=passed.append)
         hand_ins, unknown = settle_lateness(found, late=rubric.late, table=late_table)
-        # The rubric's file says which assignment it is: its title may be corrected later.
+        # The rubric's file name identifies the assignment, because its title may be corrected
+        # later.
         with Gradebook(place, assignment=rubric_file.stem, create=True) as book:
             shown = _pseudonyms(book) if hidden else str
             batch = grade_batch(
@@ -147,7 +155,7 @@ def grade_class(
             doubles = write_outputs(book, out, progress=lambda what: progress(total, total, what))
     return Summary(
         total=total,
-        failed=tuple(sorted(failed)),  # the order would reveal the names
+        failed=tuple(sorted(failed)),  # sorted, because the order of grading would reveal the names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
         lacks_room=len(batch.lacks_room),
@@ -157,7 +165,7 @@ def grade_class(
 
 
 def _refuse_submission(out: Path) -> None:
-    """Refuse to write into a folder of submissions, which would change them."""
+    """Refuse to write into the folder of a submission, because that would change the submission."""
     for folder in (out.resolve(), *out.resolve().parents):
         if (folder / NAME).is_file():
             raise ConfigError(
@@ -166,12 +174,12 @@ def _refuse_submission(out: Path) -> None:
 
 
 def _refuse_another_class(out: Path, *, assignment: str) -> None:
-    """Refuse to overwrite a class with one of another rubric, including points by hand."""
+    """Refuse to overwrite a class of another rubric, because its overrides would be lost."""
     try:
         with Gradebook(out) as book:
             before = book.assignment
     except ConfigError:
-        return  # no class there yet
+        return  # the folder has no class yet
     if before != assignment:
         raise ConfigError(
             f"{out}: holds the class of {before}.toml, and a rubric with another name is another "
@@ -180,13 +188,13 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
 
 
 def _pseudonyms(book: Gradebook) -> Callable[[str], str]:
-    """Return a function that gives submissions their pseudonyms, for use after the class list."""
+    """Return a function from names to pseudonyms; call it only after the class list is stored."""
     names = cache(lambda: pseudonyms_in(book))
     return lambda name: names().get(name, STRANGER)
 
 
 def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
-    """Return a progress function that shows no submission names."""
+    """Return a progress function that leaves out the names of submissions."""
     names = {hand_in.id for hand_in in hand_ins}
     return lambda done, total, last: progress(done, total, "" if last in names else last)
 
@@ -194,7 +202,7 @@ def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
 def _beside(
     passed: Sequence[str], unknown: Sequence[str], *, late_file: Path | None, hidden: bool
 ) -> Iterator[str]:
-    """Yield messages on skipped folders and on unknown names in the late table."""
+    """Yield messages about skipped folders and unknown names in the late table."""
     if not hidden:
         yield from passed
     elif passed:
@@ -205,7 +213,7 @@ def _beside(
 
 
 def _told(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
-    """Yield messages on springs that the rubric lacks and on changes to the class list."""
+    """Yield messages about springs that the rubric lacks and about changes of the class list."""
     grades = (entry.grade for entry in book.entries())
     if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
         yield asked
@@ -235,7 +243,7 @@ def _names(names: Sequence[str]) -> str:
 
 
 def _names_so_far(place: Path | str, *, assignment: str) -> list[str]:
-    """Return the submissions of the current class list, without creating a gradebook."""
+    """Return the submissions of the current class list; if there is no gradebook, create none."""
     try:
         with Gradebook(place, assignment=assignment) as book:
             return [member.submission for member in book.listed()]
@@ -254,7 +262,14 @@ def _executor(options: Options) -> Executor:
 
 
 def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
-    """Yield the fingerprints of the rubric's examples and the shipped ones with as many carts."""
+    """Yield fingerprints of recordings that several teams may use: those of example submissions.
+
+    These are the rubric's own examples, and the examples of cartlab with the same number of carts.
+
+    Raises
+    ------
+    ConfigError : an example of the rubric cannot be read.
+    """
     for example in rubric.examples:
         try:
             data = read_data(load_submission(folder / example))
@@ -272,9 +287,9 @@ def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
 
 @contextmanager
 def scratch_in(out: Path) -> Iterator[Path]:
-    """Make a scratch folder and remove it at the end; the caller must hold the folder's lock.
+    """Make a scratch folder and remove it at the end; the caller must hold the lock of `out`.
 
-    Remains of stopped runs are removed first.
+    Scratch folders that stopped runs left in `out` are removed first.
     """
     for left in sorted(out.iterdir()):
         if _SCRATCH.fullmatch(left.name) and left.is_dir() and not left.is_symlink():

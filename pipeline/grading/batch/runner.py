@@ -27,7 +27,7 @@ Executor = Callable[[Sequence[Task], Setup], Iterator[Grading]]
 
 
 def silent(done: int, total: int, what: str) -> None:
-    """Ignore progress."""
+    """Report no progress."""
 
 
 def grade_batch(
@@ -39,18 +39,18 @@ def grade_batch(
     examples: Callable[[], Iterable[bytes]] = tuple,
     progress: Progress = silent,
 ) -> Batch:
-    """Grade submissions that the gradebook does not know; store each outcome at once.
+    """Grade the submissions that the gradebook does not know; store each outcome at once.
 
-    The class is everything the gradebook lists. Submissions that are not in `hand_ins` keep their
-    grades, and their recordings are still compared.
+    Recordings are compared across the whole class that the gradebook lists. So submissions that are
+    not in `hand_ins` keep their grades, and their recordings are compared too.
 
     A run that is stopped and started again gives the same result.
 
     Parameters
     ----------
     execute : runs the tasks: `run_here(jobs=…)` or `cluster.run_on(address)`.
-    examples : returns packed fingerprints of recordings given out with the assignment; called
-        only if recordings are shared.
+    examples : returns the fingerprints of recordings given out with the assignment; called only if
+        submissions share recordings.
     progress : called with the number done, the total, and the last submission done.
     """
     rows, new = _known_and_new(hand_ins, setup=setup, book=book)
@@ -84,7 +84,10 @@ def grade_batch(
 def _known_and_new(
     hand_ins: Sequence[HandIn], *, setup: Setup, book: Gradebook
 ) -> tuple[dict[str, Member], list[Task]]:
-    """Return outcomes that are known or cannot be opened, and tasks for the rest."""
+    """Split the hand-ins into known outcomes and tasks that must run.
+
+    A hand-in that cannot be opened is stored as failed. It counts as known.
+    """
     basis = code_version(), setup.rubric.model_dump_json(), setup.figures
     rows, new = {}, []
     for hand_in in hand_ins:
@@ -107,7 +110,8 @@ def run_here(*, jobs: int) -> Executor:
         waiting: queue.SimpleQueue[Task] = queue.SimpleQueue()
         for task in tasks:
             waiting.put(task)
-        # At most one outcome per worker waits to be stored, so that memory stays flat.
+        # A short queue: each worker waits until its last outcome is stored, so memory use stays
+        # flat.
         answers: queue.Queue[Grading | Exception] = queue.Queue(maxsize=jobs)
         stop = threading.Event()
         graders = [Grader(setup) for _ in range(min(jobs, len(tasks)))]
@@ -132,7 +136,7 @@ def run_here(*, jobs: int) -> Executor:
 
 
 class Grader:
-    """A grading process; a crash or exceeded limit becomes the outcome of the submission."""
+    """A grading process; if it crashes or exceeds a limit, the submission gets a failed outcome."""
 
     def __init__(self, setup: Setup) -> None:
         self._setup = setup
@@ -149,7 +153,7 @@ class Grader:
 
         Raises
         ------
-        ConfigError : no process starts on this machine.
+        ConfigError : no grading process can be started on this machine.
         """
         too_large = f"needed more than {self._setup.memory_limit / 1e9:g} GB of memory"
         try:
@@ -161,7 +165,7 @@ class Grader:
             reasons = {"memory": too_large, "crash": f"the grader crashed ({end.status})"}
             return self._failed(task, reasons.get(end.how, str(end)), detail=end.said)
         except Failed as error:
-            self.close()  # after a fault a new process is safer
+            self.close()  # after a failure, a new process is safer
             return self._failed(task, str(error))
         outcome = read_grading(plain)
         if not outcome.settled:
@@ -200,13 +204,16 @@ def _work(
             return grader.close()
         try:
             answers.put(grader.run(task, stop=stop))
-        except Exception as error:  # raised again by the thread that collects the outcomes
+        except Exception as error:  # the thread that collects the outcomes raises it again
             answers.put(error)
             return
 
 
 def code_version() -> str:
-    """Return a hash of code, words and libraries, which changes whenever a grade might."""
+    """Return a hash of code, texts and library versions.
+
+    It changes whenever a grade might change.
+    """
     root = Path(pipeline.__file__).parent
     computes_with = (f"{name} {version(name)}" for name in ("numpy", "scipy", "h5py"))
     versions = [pipeline.__version__, *computes_with]
@@ -217,7 +224,10 @@ def code_version() -> str:
 
 
 def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
-    """Return the task of a submission; its key covers everything the outcome depends on."""
+    """Return the task that grades a hand-in.
+
+    Its key is a hash of everything that affects the outcome.
+    """
     files = digest(hand_in.sources)
     plain = asdict(hand_in) | {"sources": files}
     everything = json.dumps([*basis, plain], sort_keys=True)
@@ -235,10 +245,14 @@ def _task(hand_in: HandIn, *, basis: tuple[str, str, bool]) -> Task:
 def _shared(
     rows: Sequence[Member], book: Gradebook, *, examples: Callable[[], Iterable[bytes]]
 ) -> dict[str, Flag]:
-    """Return the flags for recordings found in two submissions of this or earlier batches."""
+    """Return a flag for each submission of the batch that shares recordings with another one.
+
+    The other one may be in this batch or in an earlier one.
+    """
     batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
-    here = {(prints.authors, prints.fingerprints) for prints in batch}  # also under another name
+    # A team may rename its submission, which is then no copy.
+    here = {(prints.authors, prints.fingerprints) for prints in batch}
     earlier = [
         prints
         for prints in book.prints()
@@ -253,9 +267,10 @@ def _shared(
 
 
 def _is_before(earlier: Member, now: Member | None) -> bool:
-    """Return whether `earlier` is a version of `now`: same team or, in this class, same data.
+    """Return whether `earlier` is an earlier version of `now`, so that sharing data is no copying.
 
-    If only the authors' ids were corrected, the recordings decide.
+    It is one if the team is the same. Within the same assignment, the same recordings are enough,
+    because authors may have corrected their ids.
     """
     if now is None:
         return False

@@ -1,8 +1,8 @@
-"""Match a run with the current class list: unchanged, renamed and replaced submissions.
+"""Compare a run with the current class list: which submissions are unchanged, renamed or replaced?
 
-Folder names depend on the person who packs them, and equal names are both extended. So a
-submission is recognised by more than its name: the platform's number of its account, its files,
-its authors and their recordings.
+A name does not identify a submission: the person who packs a folder chooses its name, and equal
+names are extended. So a submission is also recognised by its account number on the learning
+platform, its files, its authors and their recordings.
 """
 
 from collections.abc import Mapping
@@ -20,10 +20,11 @@ class SoFar:
 
     Attributes
     ----------
-    kept : lines that are not in the run.
-    moved : the new name of each renamed submission.
-    taken_over : (submission, authors before, authors now) where the authors differ; they do not
-        inherit points given by hand.
+    kept : submissions of the list that are not in this run.
+    moved : for each renamed submission, its old and its new name.
+    taken_over : (submission, authors before, authors now), for names that now belong to other
+        people;
+        these people do not inherit points given by hand.
     """
 
     kept: Mapping[str, Member]
@@ -32,7 +33,7 @@ class SoFar:
 
 
 def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
-    """Return how a run with these rows changes the current class list."""
+    """Return how a run changes the current class list; `rows` are the run's submissions by name."""
     now = {name.casefold(): name for name in rows}
     left: dict[str, Member] = {}
     new, moved = dict(rows), {}
@@ -43,7 +44,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
             left[line.submission] = line
         else:
             del new[name]
-            if name != line.submission:  # in capitals, for example
+            if name != line.submission:  # for example, if only the capitals differ
                 moved[line.submission] = name
     before = {one.submission: one for one in book.prints([one.grading for one in left.values()])}
     moved |= _matched(before, new)
@@ -60,7 +61,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
 
 
 def _others(before: Member, now: Member) -> bool:
-    """Return whether a submission now belongs to another team; unnamed authors do not count."""
+    """Return whether a submission now has another team; without known authors, it has not."""
     return _strangers(before, now) and not same_number(before.owner, now.owner)
 
 
@@ -69,7 +70,10 @@ def _strangers(before: Member, now: Member) -> bool:
 
 
 def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[str, str]:
-    """Match old with new submissions, those with the most in common first."""
+    """Return the new name of each renamed submission.
+
+    The pairs with most evidence are matched first.
+    """
     pairs = [
         (evidence, old, new)
         for old in before
@@ -84,12 +88,13 @@ def _matched(before: Mapping[str, Member], now: Mapping[str, Member]) -> dict[st
 
 
 def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
-    """Return the evidence that two are the same submission, strongest first."""
+    """Return the evidence that two entries are the same submission, strongest first."""
     if _others(before, now):
         return ()
     both = before.people & now.people
     names = [f"-{row.submission}" for row in (before, now)]
-    # Several unnamed teams may submit the same: nothing, or the files of `cartlab new`.
+    # Several teams without author ids may submit the same files, such as those of `cartlab new`. So
+    # equal files count only with a common author or a similar name.
     kin = both or any(a.endswith(b) for a, b in (names, names[::-1]))
     prints = before.fingerprints and now.fingerprints
     (_, was, number), (_, is_, number_now) = (read_owner(r.owner) for r in (before, now))
@@ -97,6 +102,7 @@ def _in_common(before: Member, now: Member) -> tuple[bool, ...]:
         same_number(before.owner, now.owner),
         bool(kin) and before.content == now.content != "",
         bool(both and prints) and same_recordings(before, now),
-        # Anybody can write other people's ids into a file, but not use their platform number.
+        # Equal author ids are weak evidence, because anybody can type another person's id. They do
+        # not count against a different account number on the same platform.
         bool(both) and before.people == now.people and (was != is_ or number == number_now),
     )

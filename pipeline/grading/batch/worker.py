@@ -1,4 +1,4 @@
-"""The process that grades one submission after another, and can be stopped."""
+"""The process that grades one submission after another and can be stopped at a limit."""
 
 import base64
 import re
@@ -31,12 +31,13 @@ _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
 
 @dataclass(frozen=True, kw_only=True)
 class Setup:
-    """How to grade, the same for all submissions of a batch.
+    """Settings for grading, the same for all submissions of a batch.
 
     Attributes
     ----------
     scratch : folder for copies of the submissions during grading.
-    time_limit : s for each submission; memory_limit : bytes beyond the worker's own need.
+    time_limit : for each submission, in s.
+    memory_limit : for each submission, in bytes beyond the worker's own need.
     figures : draw the figures of the feedback.
     """
 
@@ -49,9 +50,14 @@ class Setup:
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """One submission to grade; see `intake.HandIn` and, for the key, `batch.Grading`.
+    """One submission to grade.
 
-    `digest` is the hash of the files in the key; "" if it need not be checked.
+    Attributes
+    ----------
+    id, owner, days_late : see `intake.HandIn`.
+    key : hash of everything that affects the outcome; see `gradings.Member`.
+    sources : paths of the submitted files.
+    digest : the hash of the files that the key contains; "" if it need not be checked.
     """
 
     id: str
@@ -63,7 +69,7 @@ class Task:
 
 
 def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
-    """Open, analyse and grade one submission; any problem becomes the reason of the outcome."""
+    """Open, analyse and grade one submission; if it fails, the outcome holds the reason."""
     authors: tuple[str, ...] = ()
     reason = detail = ""
     settled, no_room = True, False
@@ -98,16 +104,16 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
                 settled=not detail,
                 detail=detail,
             )
-    except Changed:  # by a synchronised folder, for example
+    except Changed:  # for example, because the folder is being synchronised
         reason, settled = "its files changed during the grading: grade it again", False
     except PipelineError as error:
         reason = str(error)
-    except OSError as error:  # a full disk or a lost folder may not be the submission's fault
+    except OSError as error:  # the cause may be this computer: a full disk or a lost folder
         reason = f"cannot be read ({error.strerror or error}); the next run tries again"
         settled, no_room = False, lacks_room(error)
     except MemoryError:
         reason, settled = OUT_OF_MEMORY, False
-    except Exception as error:  # a bug of ours or a library: retry once it is fixed
+    except Exception as error:  # a bug in cartlab or a library: the next run tries again
         reason = f"the grader failed: {type(error).__name__}: {quote(str(error))}"
         detail, settled = _traceback(), False
     outcome = failed(
@@ -137,9 +143,12 @@ def named_authors(folder: Path) -> tuple[str, ...]:
 def _figures(
     submission: Submission, graded: Graded, rubric: Rubric
 ) -> tuple[tuple[tuple[str, str], ...], str]:
-    """Return the figures, or none and the reason: a failed figure must not affect the grade."""
+    """Return the figures of the feedback, and a traceback if drawing failed.
+
+    A drawing error leaves the grade unchanged.
+    """
     from pipeline.grading.publish.feedback_figures import (
-        draw_figures,  # takes half a second to import
+        draw_figures,  # imported late, because the import takes half a second
         draw_records,
     )
 
@@ -167,7 +176,15 @@ def failed(
     settled: bool = True,
     detail: str = "",
 ) -> Grading:
-    """Return the outcome of a submission that could not be graded, with one reason per line."""
+    """Return the outcome of a submission that could not be graded.
+
+    Parameters
+    ----------
+    reason : one reason per line.
+    out_of : points of the rubric.
+    settled : whether the outcome is final; if not, the next run tries again.
+    detail : traceback of an error in the grader.
+    """
     lines = (" ".join(line.split()) for line in reason.split("\n"))
     reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
     people = tuple(authors)
@@ -187,12 +204,12 @@ def failed(
 
 
 def plain_grading(outcome: Grading) -> dict[str, Any]:
-    """Return an outcome as plain data."""
+    """Return an outcome as a dictionary that JSON can store."""
     return asdict(outcome) | {"fingerprints": base64.b64encode(outcome.fingerprints).decode()}
 
 
 def read_grading(plain: Mapping[str, Any]) -> Grading:
-    """Read back an outcome from `plain_grading`, after JSON."""
+    """Return the outcome from a dictionary that `plain_grading` made and JSON stored."""
     return Grading(
         **{
             **plain,
@@ -206,7 +223,7 @@ def read_grading(plain: Mapping[str, Any]) -> Grading:
 def _prepare(
     rubric: str, scratch: str, *, figures: bool
 ) -> Callable[[dict[str, Any], object], dict[str, Any]]:
-    """Return a function that grades submissions by a rubric, given as JSON."""
+    """Return a function that grades submissions by a rubric, which is given as JSON."""
     asked = Rubric.model_validate_json(rubric)
 
     def grade(task: dict[str, Any], _: object) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The gradebook: all gradings, the current class list, and points given by hand.
 
-Each submission is stored when it is graded, in its own transaction; a complete batch becomes the
-class list. Results contain no dates: those are here, and in `cartlab history`.
+Each submission is stored when it is graded, in its own transaction. When a batch is complete, it
+becomes the class list. Grades contain no dates; the gradebook has the dates, and `cartlab history`
+shows them.
 """
 
 import json
@@ -61,12 +62,12 @@ if TYPE_CHECKING:
 
 
 class Gradebook:
-    """A store of outcomes, and the class list made from them.
+    """A database of all gradings and of the class lists made from them.
 
     Parameters
     ----------
     place : a folder, a SQLite file or any SQLAlchemy URL.
-    assignment : selects one of several class lists in the database; default: the last graded.
+    assignment : selects one of several class lists in the database; default: the last one graded.
     create : create the gradebook if it is missing.
     now : the clock for the times of entries.
 
@@ -100,12 +101,15 @@ class Gradebook:
     # ------------------------------------------------------------------ while grading
 
     def known(self, key: str, *, figures: bool = True) -> Grading | None:
-        """Return the newest grading of this key, with figures if asked, or None."""
+        """Return the newest grading with this key, or None.
+
+        `figures` tells whether to read its figures.
+        """
         with self._database.reading() as connection:
             return known_grading(connection, key, assignment=self._assignment or "", drawn=figures)
 
     def put(self, grading: Grading) -> None:
-        """Add a grading in one transaction that is durable on return.
+        """Store a grading; when this returns, it is on disk.
 
         Raises
         ------
@@ -133,14 +137,22 @@ class Gradebook:
                 add_row(connection, findings, kept)
 
     def prints(self, numbers: Sequence[int] | None = None) -> Iterator[Member]:
-        """Return all different fingerprints, or those of some gradings (see `Entry.grading`).
+        """Return the different fingerprints of recordings, with the submissions that contain them.
 
-        Replaced versions count too, because their recordings may have been passed on.
+        Replaced versions of a submission count too, because their recordings may have been passed
+        on.
+
+        Parameters
+        ----------
+        numbers : of the gradings to read, as in `Entry.grading`; default: all gradings.
         """
         return read_prints(self._database, numbers, assignment=self._assignment or "")
 
     def listed(self) -> Iterator[Member]:
-        """Return the current class list without fingerprints; empty before the first batch."""
+        """Yield the submissions of the current class list, without fingerprints.
+
+        None before the first.
+        """
         with self._database.reading() as connection:
             last = self._newest(connection)
             lines = [] if last is None else lines_of(connection, last)
@@ -149,13 +161,15 @@ class Gradebook:
     def finish(
         self, batch: Batch, *, rubric: Rubric, shown: Callable[[str], str] = str
     ) -> list[str]:
-        """Make a complete batch the class list, unless it changes nothing.
+        """Make a complete batch the new class list, unless that changes nothing.
 
-        Returns the differences from the last class list, one phrase each, the rubric first.
+        Returns the differences from the last class list, one phrase each, beginning with the
+        rubric.
 
         Parameters
         ----------
-        shown : returns the name of a submission in these phrases; called after the list is made.
+        shown : returns the name of a submission as the phrases show it; called after the list is
+            made.
 
         Raises
         ------
@@ -217,7 +231,7 @@ class Gradebook:
             return read_rubric(self._last(connection))
 
     def entries(self) -> Iterator[Entry]:
-        """Yield the class list in order, keeping only some submissions in memory."""
+        """Yield the class list in order; only a page of it is in memory at a time."""
         with self._database.reading() as connection:
             last = self._last(connection)
             of_batch = select(entries.c.position).where(entries.c.batch_id == last.id)
@@ -231,11 +245,11 @@ class Gradebook:
             yield from found
 
     def entry(self, team: str) -> Entry:
-        """Return the line of a submission, given its id or one of its authors.
+        """Return the class-list entry of a submission, found by its id or by one of its authors.
 
         Raises
         ------
-        ConfigError : no submission matches, or several.
+        ConfigError : no submission matches, or several do.
         """
         with self._database.reading() as connection:
             last, row = self._find(connection, team)
@@ -249,40 +263,40 @@ class Gradebook:
         return class_frame(lines, rubric=self.rubric)
 
     def by_other_rubrics(self) -> list[str]:
-        """Return the submissions of the class list that another rubric graded."""
+        """Return the submissions of the class list that were graded with another rubric."""
         with self._database.reading() as connection:
             return by_other_rubrics(connection, self._last(connection))
 
     def figures(self, entry: Entry) -> tuple[tuple[str, str], ...]:
-        """Return the figures of a submission's feedback: file names and SVG."""
+        """Return the figures of a submission's feedback, as pairs of file name and SVG text."""
         with self._database.reading() as connection:
             return read_figures(connection, entry.grading)
 
     def findings(self, entry: Entry) -> str:
-        """Return the results of the checks of a submission; "" if they were not kept."""
+        """Return the stored results of a submission's checks; "" if there are none."""
         mine = select(findings.c.found).where(findings.c.grading_id == entry.grading)
         with self._database.reading() as connection:
             return connection.scalar(mine) or ""
 
     def history(self, team: str, *, named: bool = True) -> tuple[str, list[Event]]:
-        """Return a submission's id and its whole history, see `read_events`.
+        """Return the id of a submission and all its events; see `read_events`.
 
         Raises
         ------
-        ConfigError : there is no such submission, or several.
+        ConfigError : there is no such submission, or there are several.
         """
         with self._database.reading() as connection:
             row = self._find_ever(connection, team)
             return row.name, read_events(connection, row.submission_id, named=named)
 
     def remove(self, teams: Sequence[str]) -> list[str]:
-        """Remove submissions from the class list and return their names.
+        """Remove submissions from the class list; return their names.
 
         Their history stays. If they are graded again, they return to the list.
 
         Raises
         ------
-        ConfigError : a name matches no submission on it, or several.
+        ConfigError : a name matches no submission of the class list, or several.
         """
         with self._database.writing() as connection:
             found = [self._find(connection, team) for team in teams]
@@ -299,11 +313,12 @@ class Gradebook:
         return list(gone.values())
 
     def erase(self, teams: Sequence[str]) -> list[str]:
-        """Delete submissions with all that ever happened to them, and return their names.
+        """Delete submissions with their whole history; return their names.
 
         Raises
         ------
-        ConfigError : there is no such submission, or several; the database's user may not delete.
+        ConfigError : there is no such submission, there are several, or the database user may not
+            delete.
         """
         with self._database.erasing() as connection:
             found = [self._find_ever(connection, team) for team in teams]
@@ -314,12 +329,13 @@ class Gradebook:
     def override(
         self, team: str, criterion: str, points: float | None, *, why: str, by: str
     ) -> HandPoints:
-        """Give a criterion points by hand, kept by every later grading; None removes them.
+        """Give a criterion points by hand, which later gradings keep; None removes them.
 
         Raises
         ------
-        ConfigError : there is no such submission or criterion, the points are not possible, or
-            the person or reason is missing.
+        ConfigError : there is no such submission or criterion, the points are not possible, or the
+            name of
+            the person or the reason is missing.
         """
         with self._database.writing() as connection:
             last, row = self._find(connection, team)
@@ -331,7 +347,7 @@ class Gradebook:
     def _give(
         self, connection: Connection, row: Row, asked: WantedPoints, *, by: str, rubric: Rubric
     ) -> HandPoints:
-        """Add an override for the submission of a line."""
+        """Store an override of a submission; `row` is its line in the class list."""
         criterion, points = asked.criterion, asked.points
         why, by = asked.why.strip(), by.strip()
         if not why or not by:
@@ -375,7 +391,7 @@ class Gradebook:
         return row
 
     def _find(self, connection: Connection, team: str) -> tuple[Row, Row]:
-        """Return the last batch and the line of a team in it."""
+        """Return the last complete batch, and the line of a team in its class list."""
         last = self._last(connection)
         names = class_list(last, submissions.c.name, gradings.c.authors)
         rows = connection.execute(names).all()
@@ -389,7 +405,7 @@ class Gradebook:
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
-        """Return a team on the class list, or one that was graded but is not on it."""
+        """Return the row of a team, even if it was graded but is no longer in the class list."""
         try:
             return self._find(connection, team)[1]
         except ConfigError:
@@ -403,7 +419,10 @@ class Gradebook:
             return found.popitem()[1]
 
     def _newest(self, connection: Connection) -> Row | None:
-        """Return the latest complete batch of this assignment, or of any, or None."""
+        """Return the last complete batch of the assignment; without an assignment, the last of all.
+
+        Returns None if there is no complete batch.
+        """
         newest = select(batches).order_by(batches.c.id.desc()).limit(1)
         if self._assignment is not None:
             newest = newest.where(batches.c.assignment == self._assignment)
@@ -411,6 +430,6 @@ class Gradebook:
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with this name, or else with this author (in any spelling)."""
+    """Return the rows with this submission name; if there is none, those with this author."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]

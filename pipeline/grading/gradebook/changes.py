@@ -10,7 +10,7 @@ from pipeline.grading.words import points_text
 
 
 def rubric_changes(before: str, now: str) -> list[str]:
-    """Return the differences between two rubrics stored as JSON, one phrase each."""
+    """Return the differences between two rubrics as phrases; both are given as JSON."""
     if before == now:
         return []
     try:
@@ -38,7 +38,14 @@ def points_changes(
     by_hand: Container[str] = (),
     shown: Callable[[str], str] = str,
 ) -> list[str]:
-    """Return changed points, new and removed submissions; `shown` gives the names to print."""
+    """Return changed points and new and removed submissions, one phrase each.
+
+    Parameters
+    ----------
+    before, now : points by submission, in the last class list and in the new one.
+    by_hand : submissions with points given by hand, which the phrase then mentions.
+    shown : returns the name of a submission as the phrase shows it.
+    """
     in_order = sorted(now.items(), key=lambda one: shown(one[0]))
     changes = [
         f"{shown(name)}: {points_text(before[name])} → {points_text(points)}"

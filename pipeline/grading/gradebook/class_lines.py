@@ -1,11 +1,11 @@
-"""The class as a table: one line per submission, or one row per submission and criterion."""
+"""The class as a table, with one row per submission or per submission and criterion."""
 
 from collections.abc import Iterable
 from functools import cached_property
 from math import nan
 from typing import TYPE_CHECKING
 
-from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
+from typing_extensions import TypedDict  # pydantic cannot use the standard one before Python 3.12
 
 from pipeline.grading.grade import CODES, Code, Grade, GradeOverride, GradeTable, Outcome
 from pipeline.grading.rubric import Rubric
@@ -34,9 +34,10 @@ class Flagged(TypedDict):
 
 
 class Line(GradeTable):
-    """The part of one `grade.json` that the pages and tables of a class need.
+    """The parts of one `grade.json` that the pages and tables of a class need.
 
-    Values and messages are left out: reading them for 2,000 submissions takes a third of a second.
+    Numbers and messages of the criteria are left out, because for 2,000 submissions they take a
+    third of a second to read.
     """
 
     submission: str
@@ -54,11 +55,14 @@ class Line(GradeTable):
 
     @classmethod
     def of(cls, grade: Grade) -> "Line":
-        """Return the line of a grade."""
+        """Return the parts of a grade that the line needs."""
         return cls.model_validate(grade.model_dump(include=set(cls.model_fields)))
 
     def sharing(self) -> "Line":
-        """Return the line with the flag for recordings that other submissions also contain."""
+        """Return the line with the flag `shared_data`.
+
+        It says that other submissions contain the same recordings.
+        """
         codes = {flag["code"] for flag in self.flags} | {"shared_data"}
         flags = tuple(Flagged(code=code) for code in CODES if code in codes)
         return self.model_copy(update={"flags": flags})
@@ -75,16 +79,18 @@ class Line(GradeTable):
 
     @property
     def by_hand(self) -> tuple[str, ...]:
-        """The criteria with points given by hand."""
+        """The ids of the criteria with points given by hand."""
         return tuple(given.criterion for given in self.overrides)
 
 
 def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
     """Return a question to the instructor if recordings need springs that the rubric lacks.
 
+    Returns "" if there is nothing to ask.
+
     Parameters
     ----------
-    graded : the springs that each graded submission needs.
+    graded : for each graded submission, the springs that the rubric lacks.
     """
     every = list(graded)
     asking = [springs for springs in every if springs]
@@ -98,14 +104,16 @@ def wrong_springs(graded: Iterable[tuple[str, ...]]) -> str:
 
 
 def class_frame(lines: Iterable[Line], *, rubric: Rubric) -> "pd.DataFrame":
-    """Return the class, one row per submission and criterion.
+    """Return the class as a table with one row per submission and criterion.
 
     Columns of the submission: `submission`, `authors`, `status`, `days_late`, `total` (after the
-    deduction for lateness), `total_out_of`, `remarks` (codes of flags). Lists are separated by
-    blanks, as in `grades.csv`. Columns of the criterion: `criterion`, `outcome`, `points`,
-    `out_of`, `by_hand`. A criterion that was never judged has no outcome and NaN points.
+    deduction for lateness), `total_out_of`, `remarks` (codes of flags). Lists in a cell are
+    separated by spaces, as in `grades.csv`.
+
+    Columns of the criterion: `criterion`, `outcome`, `points`, `out_of`, `by_hand`. A criterion
+    that was never judged has no outcome, and its points are NaN.
     """
-    import pandas as pd  # imported late: it takes 0.2 s and grading does not need it
+    import pandas as pd  # imported late: it takes 0.2 s, and grading does not need it
 
     rows = []
     for line in lines:

@@ -1,4 +1,4 @@
-"""Erase submissions for good: every row about them, and their names in the flags of others."""
+"""Erase submissions for good: all their rows, and their names in the flags of other submissions."""
 
 import json
 import re
@@ -21,9 +21,9 @@ NOBODY = "an erased submission"
 
 
 def erase_rows(connection: Connection, gone: Mapping[int, str]) -> None:
-    """Delete all rows about submissions, given by number and name.
+    """Delete all rows about some submissions; `gone` has their names by number.
 
-    The flag of a team that shared recordings with one of them stays, without its name.
+    If a team shared recordings with an erased submission, the team's flag stays, without that name.
     """
     numbers = list(gone)
     graded = select(gradings.c.id).where(gradings.c.submission_id.in_(numbers))

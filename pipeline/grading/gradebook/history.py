@@ -1,4 +1,4 @@
-"""The history of a submission in order: gradings, class lists, overrides."""
+"""The history of a submission: gradings, class lists, overrides and requests, in order."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -20,23 +20,27 @@ from pipeline.grading.gradebook.schema import (
 )
 from pipeline.grading.words import on_one_line
 
-FAILED = "could not be graded: "  # before the reason, in the text of an event
+FAILED = "could not be graded: "  # precedes the reason in the text of an event
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """One line of a history.
+    """One event in the history of a submission.
 
     Attributes
     ----------
     at : ISO 8601, UTC.
-    what : `graded`: by the rubric alone; `listed`: in a class list, with shared data and
-        overrides; `removed`: from the class list; `override`: by hand, `points` None if undone;
-        `comment`: by hand, while points stay automatic; `asked`, `answered`,
-        `reopened`: another look at a criterion, `points` where the answer gave others.
-    points, out_of : of the submission, or of the criterion concerned.
+    what : the kind of event:
+        `graded`: by the rubric alone;
+        `listed`: in a class list, with shared data and overrides;
+        `removed`: from the class list;
+        `override`: points given by hand; None if undone;
+        `comment`: by hand, while the points stay automatic;
+        `asked`, `answered`, `reopened`: a student's request to review a criterion.
+    points, out_of : of the submission or the criterion; an answer has points only if it changes
+        them.
     text : flags, reason or answer.
-    by : the person behind an override or request; "" for a student who stays anonymous.
+    by : the person who made the override or request; "" for a student who stays anonymous.
     """
 
     at: str
@@ -51,7 +55,12 @@ class Event:
 
 
 def read_events(connection: Connection, submission: int, *, named: bool = True) -> list[Event]:
-    """Return the events of one submission, oldest first; `named` gives its other names."""
+    """Return the events of one submission, oldest first.
+
+    Parameters
+    ----------
+    named : whether texts contain people and other names of the submission.
+    """
     found = [
         *_graded(connection, submission),
         *_overridden(connection, submission),
@@ -84,7 +93,7 @@ def _overridden(connection: Connection, submission: int) -> Iterator[Event]:
 
 
 def _requested(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
-    """Yield the requests for another look and their answers."""
+    """Yield the requests to review a criterion, and their answers."""
     mine = select(request_events).where(request_events.c.submission_id == submission)
     for row in connection.execute(mine.order_by(request_events.c.id)):
         asked = row.what == "asked"
@@ -99,7 +108,7 @@ def _requested(connection: Connection, submission: int, *, named: bool) -> Itera
 
 
 def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator[Event]:
-    """Yield the class lists with a change of the submission, and those without it."""
+    """Yield the class lists in which the submission appears, changes or disappears."""
     own = and_(entries.c.batch_id == batches.c.id, entries.c.submission_id == submission)
     of_batch = batches.c.id, batches.c.at, batches.c.rubric
     columns = *of_batch, entries.c.points, entries.c.out_of, entries.c.shared
@@ -134,7 +143,13 @@ def _listed(connection: Connection, submission: int, *, named: bool) -> Iterator
 def _other_name(
     connection: Connection, submission: int, *, of: int | None, among: int | None
 ) -> str:
-    """Return the name in another class list of a submission that only shares its authors."""
+    """Return the name under which the same authors continue in another class list, or "".
+
+    Parameters
+    ----------
+    of : number of the batch that lists the submission.
+    among : number of the batch in which to look for the other name.
+    """
 
     def listed(batch: int | None) -> dict[int, tuple[str, tuple[str, ...]]]:
         rows = select(submissions.c.id, submissions.c.name, gradings.c.authors)
@@ -149,7 +164,7 @@ def _other_name(
 
 
 def history_dict(submission: str, events: Sequence[Event]) -> dict[str, Any]:
-    """Return a history as plain data."""
+    """Return a history as a dictionary for JSON."""
     return {
         "schema": "cartlab-history/1",
         "submission": submission,
@@ -165,12 +180,12 @@ def history_text(submission: str, events: Sequence[Event]) -> str:
 
 
 def to_the_second(at: str) -> str:
-    """Return a time as people read it."""
+    """Return a time for people to read, without fractions of a second."""
     return datetime.fromisoformat(at).strftime("%Y-%m-%d %H:%M:%S UTC")
 
 
 def event_words(event: Event) -> str:
-    """Return an event in words, with points, person and reason."""
+    """Return an event as one line of text, with points, person and reason."""
     if event.what == "override":
         points = "automatic points again" if event.points is None else f"{event.points:g} by hand"
         return f"override  {event.criterion}: {points}, by {event.by}: {event.text}"
@@ -185,7 +200,7 @@ def event_words(event: Event) -> str:
 
 
 def _request_words(event: Event) -> str:
-    """Return a step of a request in words; typed text is put on one line."""
+    """Return an event of a request as text; typed text is put on one line."""
     by = f"by {event.by}" if event.by else "by the team"
     points = "" if event.points is None else f"{event.points:g} by hand, "
     said = " ".join(event.text.split())

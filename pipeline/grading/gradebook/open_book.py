@@ -1,4 +1,4 @@
-"""A gradebook that several people read and change at the same time."""
+"""A gradebook that several people can read and change at the same time."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -36,7 +36,10 @@ State = tuple[int, int, int]
 
 
 class Conflict(ConfigError):
-    """A change is based on an outdated state; `now` is what somebody else gave, if anything."""
+    """A change is refused, because somebody else changed the criterion first.
+
+    `now` holds the points that the other person gave, or None.
+    """
 
     def __init__(self, text: str, *, now: HandPoints | None) -> None:
         super().__init__(text)
@@ -49,12 +52,13 @@ class Listing:
 
     Attributes
     ----------
-    line : under a pseudonym if the page is anonymous.
+    line : the grade; its name is a pseudonym if the page is anonymous.
     submission : its name in the gradebook.
+    grading : number of the grading.
     seen : who marked the grading as reviewed, or "".
     shared : the flag for recordings that other submissions also contain.
     first_key : key of the first version submitted under this name.
-    made_of : the data from which the line was computed.
+    made_of : the data from which the line was computed, to tell whether it is still valid.
     """
 
     line: Line
@@ -80,7 +84,8 @@ class TeamNow:
 
     Attributes
     ----------
-    versions : the state behind the points of each criterion, sent along with a change.
+    versions : by criterion, the version of its points; a change must name the version it is based
+        on.
     changed : criteria that ever had points by hand.
     seen : who marked it as reviewed, or "".
     """
@@ -95,11 +100,11 @@ class TeamNow:
 
 @dataclass(frozen=True, kw_only=True)
 class Together:
-    """Points that a person gave to several submissions at once, with the same time.
+    """A set of points that a person gave to several submissions at once.
 
     Attributes
     ----------
-    at : ISO 8601, UTC, to the microsecond; identifies the set.
+    at : time of all its changes, in ISO 8601, UTC, to the microsecond; it identifies the set.
     criterion, why : of one of the changes.
     teams : number of submissions changed.
     """
@@ -113,7 +118,14 @@ class Together:
 
 @dataclass(frozen=True, kw_only=True)
 class Undone:
-    """The result of undoing a set; `kept` are submissions that somebody has changed since."""
+    """The result of undoing a set of changes.
+
+    Attributes
+    ----------
+    at : time of the set.
+    back : number of changes undone.
+    kept : submissions that somebody has changed since, and that stay as they are.
+    """
 
     at: str
     back: int
@@ -122,11 +134,11 @@ class Undone:
 
 @dataclass(frozen=True, kw_only=True)
 class Tried:
-    """A submission as points by hand would change it.
+    """A submission before and after points by hand that are only tried.
 
     Attributes
     ----------
-    version : of the criterion now; sent along with the change.
+    version : the current version of the criterion's points; a change must name it.
     """
 
     submission: str
@@ -136,17 +148,26 @@ class Tried:
 
 
 class OpenBook(Gradebook):
-    """A gradebook shared by several processes; each changes only a state that it has seen."""
+    """A gradebook that several processes share.
+
+    A change must name the version that the person saw. If the data are newer, the change is
+    refused.
+    """
 
     def state(self) -> State:
-        """Return numbers that change whenever the content changes."""
+        """Return numbers that change whenever the content of the gradebook changes."""
         with self._database.reading() as connection:
             last = self._last(connection).id
             newest = (connection.scalar(select(func.max(t.c.id))) or 0 for t in (overrides, looks))
             return (last, *newest)  # type: ignore[return-value]
 
     def class_now(self, before: ClassNow | None = None) -> ClassNow:
-        """Return the class; lines of the earlier one that are still valid are reused."""
+        """Return the class with current grades.
+
+        Parameters
+        ----------
+        before : an earlier result; its lines that are still valid are reused.
+        """
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
@@ -182,7 +203,7 @@ class OpenBook(Gradebook):
             return ClassNow(rubric=rubric, listings=tuple(listed[at] for at in rests_on))
 
     def team(self, name: str) -> TeamNow:
-        """Return all data of a submission.
+        """Return all data of one submission.
 
         Raises
         ------
@@ -215,15 +236,15 @@ class OpenBook(Gradebook):
     ) -> HandPoints:
         """Give points by hand like `override`, unless somebody else has changed them since.
 
-        If the criterion has these points already, `why` is only added as a comment.
+        If the criterion already has these points, `why` is only added as a comment.
 
         Parameters
         ----------
-        seen : the state that the person saw, from `TeamNow.versions`.
+        seen : the version that the person saw, from `TeamNow.versions`.
 
         Raises
         ------
-        Conflict : somebody else changed them, or the submission was graded again.
+        Conflict : somebody else changed the points, or the submission was graded again.
         """
         with self._database.changing() as connection:
             last, row = self._find(connection, team)
@@ -258,12 +279,13 @@ class OpenBook(Gradebook):
             return self._give(connection, row, asked, by=by, rubric=read_rubric(last))
 
     def change_all(self, wishes: Sequence[WantedPoints], *, by: str) -> Together:
-        """Give points by hand, either all of them or none.
+        """Give points by hand to several submissions: either all changes are made or none.
 
         Raises
         ------
-        ConfigError : points are not possible; with the line of the table, if there is one.
-        Conflict : one of them is based on an outdated state.
+        ConfigError : points are not possible; the message has the line of the table, if there is
+            one.
+        Conflict : a change is based on an outdated version.
         """
         new = 0
         with self._database.changing() as connection:
@@ -296,7 +318,7 @@ class OpenBook(Gradebook):
         return Together(at=at, by=by, teams=new)
 
     def try_all(self, wishes: Sequence[WantedPoints]) -> list[Tried]:
-        """Return submissions as points by hand would change them, without giving the points.
+        """Return each submission before and after the points of `wishes`, but change nothing.
 
         Submissions that are not in the class are left out.
         """
@@ -311,9 +333,13 @@ class OpenBook(Gradebook):
             ]
 
     def undo_all(self, at: str, *, by: str) -> Undone:
-        """Undo a set of changes made at once.
+        """Undo a set of changes that a person made at once.
 
-        Criteria that somebody has changed since stay as they are.
+        A criterion that somebody has changed since stays as it is.
+
+        Parameters
+        ----------
+        at : time of the set, from `Together.at`.
         """
         back, kept = 0, []
         with self._database.changing() as connection:
@@ -332,7 +358,12 @@ class OpenBook(Gradebook):
         return Undone(at=now, back=back, kept=tuple(kept))
 
     def changed_together(self, *, least: int = 2) -> list[Together]:
-        """Return the sets of changes to at least so many submissions at once, newest first."""
+        """Return the sets of changes made at once, newest first.
+
+        Parameters
+        ----------
+        least : smallest number of submissions that counts as a set.
+        """
         with self._database.reading() as connection:
             last = self._last(connection)
             columns = overrides.c.at, overrides.c.by
@@ -351,7 +382,7 @@ class OpenBook(Gradebook):
             connection.execute(insert(looks).values(values))
 
     def changes_since(self, number: int) -> list[tuple[str, HandPoints]]:
-        """Return the submission and content of each override after a given number."""
+        """Return the overrides whose number is larger than `number`, each with its submission."""
         with self._database.reading() as connection:
             mine = _overrides().where(
                 overrides.c.id > number,
@@ -380,7 +411,10 @@ class OpenBook(Gradebook):
 
 
 def _line(row: Row, given: Mapping[int, HandPoints] | None, *, rubric: Rubric) -> Line:
-    """Return a line with its current grade; only lines with points by hand need the whole grade."""
+    """Return a line of the class list with its current grade.
+
+    Only a line with points given by hand needs the whole grade; for others, `given` is None.
+    """
     shared = read_flag(row.shared)
     if given:
         return Line.of(as_it_counts(row, given.values(), shared=shared, rubric=rubric).grade)
@@ -403,7 +437,7 @@ def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints
 
 
 def _seen(connection: Connection, batch: Row) -> dict[int, str]:
-    """Return who marked each grading as reviewed, by its newest mark."""
+    """Return who marked each grading as reviewed, by number of grading; the newest mark counts."""
     of_list = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     mine = select(looks).where(looks.c.grading_id.in_(of_list)).order_by(looks.c.id)
     marks = {row.grading_id: row for row in connection.execute(mine)}
@@ -411,13 +445,13 @@ def _seen(connection: Connection, batch: Row) -> dict[int, str]:
 
 
 def _overrides() -> Select:
-    """Return the query for all points given by hand, in order."""
+    """Return the query for all overrides, oldest first."""
     columns = overrides.c.id, overrides.c.submission_id, submissions.c.name
     return select(*columns, *OVERRIDE).join(submissions).order_by(overrides.c.id)
 
 
 def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
-    """Return the points by hand that a criterion had before its last change."""
+    """Return a change that gives a criterion the points it had by hand before its last change."""
     last = earlier[-1] if earlier else None
     if last is None or (last.points is None and not last.comment):
         return WantedPoints(submission=team, criterion=criterion, points=None, why="taken back")
@@ -431,7 +465,7 @@ def _before(earlier: Sequence[Row], team: str, criterion: str) -> WantedPoints:
 
 
 def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
-    """Return whether a wish only repeats the last change."""
+    """Return whether a requested change only repeats the newest one."""
     if newest is None:
         return False
     given = newest.points, newest.comment, newest.why
@@ -439,7 +473,7 @@ def _is_same(asked: WantedPoints, newest: Row | None) -> bool:
 
 
 def points_of(grade: Grade, criterion: str) -> float | None:
-    """Return the points of a criterion, None if it was never judged."""
+    """Return the points of a criterion; None if it was never judged."""
     return next((own.points for own in grade.criteria if own.id == criterion), None)
 
 
@@ -449,7 +483,7 @@ def _changed_at(batch: Row, at: str) -> Select:
 
 
 def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric) -> Tried:
-    """Return a line of the class as points by hand would change it."""
+    """Return a submission before and after the points of a wish."""
     shared, own = read_flag(row.shared), overrides.c.submission_id == row.submission_id
     rows = connection.execute(_overrides().where(own)).all()
     ever = [_read_override(one) for one in rows]
@@ -466,7 +500,7 @@ def _try(connection: Connection, row: Row, wish: WantedPoints, *, rubric: Rubric
 
 
 def _read_override(row: Row) -> HandPoints:
-    """Read one row of that query."""
+    """Return the override in a row of the query `_overrides`."""
     return HandPoints(**{column.name: row._mapping[column.name] for column in OVERRIDE})
 
 

@@ -1,4 +1,4 @@
-"""Points given by hand, one or many at once, and their effect on the grade."""
+"""Points given by hand to one or many submissions, and their effect on the grade."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -17,14 +17,14 @@ _HEADS = ("submission", "criterion", "points", "why")  # columns of a table of p
 
 @dataclass(frozen=True, kw_only=True)
 class HandPoints:
-    """Points that a person gave one criterion of one submission.
+    """Points that a person gave to one criterion of one submission.
 
     Attributes
     ----------
-    points : None if the automatic points count, again or with a comment.
+    points : None if the automatic points count, because points were undone or only commented.
     at : ISO 8601, UTC.
-    authors : of the submission at that time. The override follows these people.
-    comment : whether `why` is only a comment for the team and the points stay automatic.
+    authors : of the submission at that time; the points stay with these people.
+    comment : whether `why` is only a comment for the team, while the points stay automatic.
     """
 
     criterion: str
@@ -36,16 +36,16 @@ class HandPoints:
     comment: bool = False
 
     def concerns(self, authors: tuple[str, ...]) -> bool:
-        """Return whether the submission still belongs to the same people."""
+        """Return whether the points apply to a submission of these authors."""
         return go_with(self.authors, authors)
 
 
 def read_points(text: str) -> float | None:
-    """Return typed points, None for "auto".
+    """Return the points that a person typed, or None for "auto".
 
     Raises
     ------
-    ConfigError : the text is neither.
+    ConfigError : the text is neither points nor "auto".
     """
     if text.strip().casefold() == "auto":
         return None
@@ -61,10 +61,10 @@ class WantedPoints:
 
     Attributes
     ----------
-    points : None for the automatic points, again or with a comment.
+    points : None for the automatic points.
     comment : whether `why` is only a comment for the team.
-    line : of the table that requests it; 0 without a table.
-    seen : the state that the person saw, from `TeamNow.versions`; "" for the current one.
+    line : of the table that requests the change; 0 without a table.
+    seen : the version that the person saw, from `TeamNow.versions`; "" to change any version.
     at : the time; "" for now. Points given together have the same time.
     """
 
@@ -78,9 +78,9 @@ class WantedPoints:
     at: str = ""
 
     def beside(self, earlier: Iterable[HandPoints]) -> "WantedPoints":
-        """Return the change that a comment makes, given all earlier ones.
+        """Return what this change means, given the earlier changes of the submission.
 
-        Points that are by hand already stay, and the comment becomes their reason.
+        A comment on points given by hand keeps those points, and becomes their reason.
         """
         newest = None
         for one in earlier:
@@ -91,11 +91,13 @@ class WantedPoints:
 
 
 def read_wishes(path: Path) -> list[WantedPoints]:
-    """Read a CSV with the columns submission, criterion, points (or auto) and why.
+    """Read requested changes from a CSV with the columns submission, criterion, points and why.
+
+    Points may be "auto" for the automatic points.
 
     Raises
     ------
-    ConfigError : it is not such a table; the message has the line.
+    ConfigError : the file is not such a table; the message has the line.
     """
     table = read_table(path)
     missing = [name for name in _HEADS if name not in table.columns]
@@ -124,7 +126,7 @@ def read_wishes(path: Path) -> list[WantedPoints]:
 
 
 def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
-    """Return the grade with a comment at the end of each criterion's message."""
+    """Return the grade with each comment added at the end of its criterion's message."""
     criteria = (
         _with_comment(own, comments[own.id].why) if own.id in comments else own
         for own in grade.criteria
@@ -135,7 +137,7 @@ def with_comments(grade: Grade, comments: Mapping[str, HandPoints]) -> Grade:
 def with_overrides(grade: Grade, overrides: Mapping[str, HandPoints], *, rubric: Rubric) -> Grade:
     """Return the grade with points given by hand and the deduction for lateness.
 
-    If the submission could not be graded, the criterion is added.
+    A submission that could not be graded has no criteria; those with points by hand are added.
     """
     given = {key: o.points for key, o in overrides.items() if o.points is not None}
     if not given:
@@ -175,7 +177,7 @@ def _with_comment(criterion: Criterion, why: str) -> Criterion:
 
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
-    points = min(points, criterion.out_of)  # the criterion may have had more points at that time
+    points = min(points, criterion.out_of)  # was perhaps more then
     if points == criterion.points:
         return _with_comment(criterion, why)
     changed = {

@@ -1,4 +1,4 @@
-"""A gradebook in which students ask for another look, once their feedback is released."""
+"""A gradebook in which students can ask for a review once their feedback is released."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -40,12 +40,12 @@ from pipeline.grading.gradebook.rows import (
 from pipeline.grading.gradebook.schema import entries, releases, request_events
 from pipeline.grading.rubric import Rubric
 
-_MOST_SHOWN = 50  # requests of a kind on one page
+_MOST_SHOWN = 50  # requests of each kind on one page
 
 
 @dataclass(frozen=True, kw_only=True)
 class OwnFeedback:
-    """The authors' view of a submission: grade, and requests by criterion."""
+    """A submission as its authors may see it: the grade, and the requests by criterion."""
 
     rubric: Rubric
     entry: Entry
@@ -54,7 +54,7 @@ class OwnFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class Queued:
-    """A request as TAs see it; `version` is sent along with an answer."""
+    """A request as TAs see it; an answer must name its `version`."""
 
     entry: Entry
     request: Request
@@ -63,11 +63,11 @@ class Queued:
 
 @dataclass(frozen=True, kw_only=True)
 class Queue:
-    """The requests of a class: waiting ones, oldest first, and the others, newest first.
+    """The requests of a class: waiting ones oldest first, settled ones newest first.
 
     Attributes
     ----------
-    n_waiting, n_settled : total numbers; at most one page of each is listed.
+    n_waiting, n_settled : all requests of each kind; only one page of each kind is listed.
     """
 
     rubric: Rubric
@@ -78,7 +78,7 @@ class Queue:
 
 
 class RequestBook(OpenBook):
-    """A gradebook whose students read feedback and ask for another look."""
+    """A gradebook whose students can read their feedback and ask for a review."""
 
     @property
     def released(self) -> bool:
@@ -100,7 +100,7 @@ class RequestBook(OpenBook):
             return 0 if last is None else len(find_requests(connection, last)[0])
 
     def queue(self, of: str = "") -> Queue:
-        """Return the requests of the class, or of one submission."""
+        """Return the requests of the class, or only those of the submission `of`."""
         with self._database.reading() as connection:
             last = self._last(connection)
             rubric = read_rubric(last)
@@ -119,7 +119,7 @@ class RequestBook(OpenBook):
             )
 
     def request_states(self, team: str) -> dict[str, str]:
-        """Return the states of the requests of a submission, by criterion."""
+        """Return the state of each request of a submission, by criterion."""
         with self._database.reading() as connection:
             _, row = self._find(connection, team)
             requests = read_requests(connection, row.submission_id, row.authors)
@@ -128,12 +128,12 @@ class RequestBook(OpenBook):
     # ----------------------------------------------------------------- for students
 
     def own_feedback(self, submission: str, *, assignment: str = "") -> OwnFeedback | None:
-        """Return what the authors of a submission may read; None while it is not released.
+        """Return what the authors of a submission may read; None until the feedback is released.
 
         Parameters
         ----------
         submission : its exact name, not that of an author.
-        assignment : the required assignment of the class list; "" accepts any.
+        assignment : the assignment that the class list must have; "" accepts any.
 
         Raises
         ------
@@ -153,7 +153,9 @@ class RequestBook(OpenBook):
     def ask(
         self, submission: str, criterion: str, *, why: str, by: str, assignment: str = ""
     ) -> None:
-        """Ask for another look at a criterion that lost points, once unless it was reopened.
+        """Ask for a review of a criterion that lost points.
+
+        This is possible once, and again if a TA reopens the request.
 
         Raises
         ------
@@ -190,13 +192,13 @@ class RequestBook(OpenBook):
         by: str,
         seen: str,
     ) -> None:
-        """Answer a request and change its points, if any are given, in one transaction.
+        """Answer a request and change the points if the answer gives others, in one transaction.
 
         Parameters
         ----------
         points : None, or the current points, to keep them.
-        text : what the students read; also the reason for the points.
-        seen : the state that the TA saw, from `Queued.version`.
+        text : for the students; also stored as the reason for the points.
+        seen : the version that the TA saw, from `Queued.version`.
 
         Raises
         ------
@@ -224,12 +226,12 @@ class RequestBook(OpenBook):
             self._add(connection, row, answered)
 
     def reopen(self, submission: str, criterion: str, *, by: str, seen: str) -> None:
-        """Let the students ask once more about a criterion.
+        """Let the students ask once more about a criterion that was answered.
 
         Raises
         ------
         Conflict : see `answer`.
-        RequestRefused : the request waits for an answer.
+        RequestRefused : the request still waits for an answer.
         """
         with self._database.changing() as connection:
             _, row, request = self._find_request(connection, submission, criterion, seen=seen)
@@ -243,21 +245,27 @@ class RequestBook(OpenBook):
     def _find_released(
         self, connection: Connection, submission: str, assignment: str
     ) -> tuple[Row, Row] | None:
-        """Return the class list and one of its lines, if students may read it."""
+        """Return the class list and a submission's line in it; None if students may not read it."""
         last = self._newest(connection)
         if last is None or assignment not in ("", last.assignment):
             return None
         if not is_released(connection, last.assignment):
             return None
         _, row = self._find(connection, submission)
-        if row.name != submission:  # found by an author's name
+        if row.name != submission:  # `row` was found by an author's name, which does not count here
             raise ConfigError(f"{submission}: is not the name of a submission")
         return last, row
 
     def _find_request(
         self, connection: Connection, submission: str, criterion: str, *, seen: str
     ) -> tuple[Row, Row, Request]:
-        """Return the class list, the line and the request, if it is unchanged since seen."""
+        """Return the class list, the submission's line and the request.
+
+        Raises
+        ------
+        ConfigError : nobody asked about this criterion.
+        Conflict : request or points are no longer in the version `seen`.
+        """
         last, row = self._find(connection, submission)
         request = read_requests(connection, row.submission_id, row.authors).get(criterion)
         if request is None:
@@ -268,7 +276,7 @@ class RequestBook(OpenBook):
         return last, row, request
 
     def _add(self, connection: Connection, row: Row, said: RequestEvent) -> None:
-        """Add an event to a request, with the current time and authors."""
+        """Store an event of a request, with the current time and authors."""
         if not said.by.strip():
             raise RequestRefused("enter your name: requests and answers are signed")
         authors = last_named(connection, row.submission_id)
@@ -277,7 +285,7 @@ class RequestBook(OpenBook):
 
 
 def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
-    """Return the criteria of the rubric without full points, judged or not."""
+    """Return the rubric's criteria that lost points, including those not judged."""
     points = {criterion.id: criterion.points for criterion in grade.criteria}
     return frozenset(c.id for c in rubric.criteria if points.get(c.id, 0.0) < c.points)
 

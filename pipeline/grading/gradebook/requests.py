@@ -1,4 +1,4 @@
-"""Requests for another look: events of a criterion, the newest of which sets the state."""
+"""Requests to review a criterion. Each is a series of events, and the newest sets its state."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -18,24 +18,25 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import go_with
 from pipeline.words.text import clean
 
-MOST_LETTERS = 1_000  # of a reason or an answer: one paragraph
-MOST_OPEN = 4  # waiting, per submission: with more doubts, a team should talk to a TA
+MOST_LETTERS = 1_000  # characters of a reason or an answer: about one paragraph
+MOST_OPEN = 4  # waiting requests per submission; a team with more doubts should talk to a TA
 
 
 class RequestRefused(ConfigError):
-    """A request or an answer is refused; the text tells its author why."""
+    """A request or an answer is refused; the message explains why to the person who wrote it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RequestEvent:
-    """One step of a request.
+    """One event of a request.
 
     Attributes
     ----------
+    what : `asked`, `answered` or `reopened`.
     text : the reason or the answer; "" for `reopened`.
     points : given with an answer; None if unchanged.
     at : ISO 8601, UTC.
-    authors : of the submission at that time; the request follows them.
+    authors : of the submission at that time; the request stays with these people.
     """
 
     criterion: str
@@ -52,11 +53,11 @@ EVENT = [request_events.c[f.name] for f in fields(RequestEvent)]
 
 @dataclass(frozen=True, kw_only=True)
 class Request:
-    """All questions and answers on one criterion of a submission, oldest first.
+    """All questions and answers about one criterion of a submission, oldest first.
 
     Attributes
     ----------
-    number : of the newest event in the gradebook, sent along with an answer.
+    number : of the newest event in the gradebook; an answer must name it.
     """
 
     criterion: str
@@ -65,7 +66,10 @@ class Request:
 
     @property
     def state(self) -> Literal["asked", "answered", "reopened"]:
-        """The last event: `asked` waits for an answer; after `reopened` the team may ask again."""
+        """Kind of the last event: `asked` waits for an answer.
+
+        After `reopened` the team may ask again.
+        """
         return self.events[-1].what
 
 
@@ -97,10 +101,10 @@ def read_all_requests(
 
 
 def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[Row]]:
-    """Return the newest event of each request of a class list, waiting requests first.
+    """Return the newest event of each request in a class: waiting requests, then settled ones.
 
     Each row has its number `id`, the `criterion`, and the `submission_id` and `position` of its
-    submission. Waiting requests come oldest first, the others newest first.
+    submission. Waiting requests come oldest first, settled ones newest first.
     """
     of = request_events.c.submission_id
     newest = select(func.max(request_events.c.id)).group_by(of, request_events.c.criterion)
@@ -113,7 +117,7 @@ def find_requests(connection: Connection, batch: Row) -> tuple[list[Row], list[R
 
 
 def _in_class(batch: Row) -> Select:
-    """Return the query for the request events of submissions on a class list."""
+    """Return the query for all request events of the submissions in a class list."""
     joined = (
         request_events.join(entries, entries.c.submission_id == request_events.c.submission_id)
         .join(gradings, gradings.c.id == entries.c.grading_id)
@@ -136,7 +140,7 @@ def _in_class(batch: Row) -> Select:
 
 
 def hide_people(text: str, people: Iterable[str]) -> str:
-    """Return a text without the known names of its authors."""
+    """Return a text with the names of these people replaced."""
     known = "|".join(re.escape(one) for one in people if one)
     return re.sub(rf"(?<!\w)(?:{known})(?!\w)", "…", text, flags=re.IGNORECASE) if known else text
 
@@ -148,11 +152,11 @@ def is_released(connection: Connection, assignment: str) -> bool:
 
 
 def read_words(text: str, *, wanted: str) -> str:
-    """Return a typed text without characters that cannot be shown.
+    """Return a typed text without characters that cannot be displayed.
 
     Raises
     ------
-    RequestRefused : the text is empty or too long.
+    RequestRefused : the text is too long, or it is empty: then `wanted` is the message.
     """
     text = clean(text).strip()
     if not text:

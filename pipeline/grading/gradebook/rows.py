@@ -25,8 +25,8 @@ from pipeline.grading.gradebook.schema import (
 from pipeline.grading.gradings import Grading, Member
 from pipeline.grading.rubric import Rubric
 
-_PAGE = 100  # rows read at a time, so that memory stays flat and writers wait briefly
-# Attributes of a grading that have columns of the same name.
+_PAGE = 100  # rows read at once: memory use stays flat, and writers wait only briefly
+# The attributes of a grading that are stored in a column of the same name.
 GRADING = [f.name for f in fields(Grading) if f.name in gradings.c]
 OVERRIDE = [overrides.c[f.name] for f in fields(HandPoints)]
 _OF_GRADING = select(submissions.c.name.label("submission"), *(gradings.c[x] for x in GRADING))
@@ -47,10 +47,11 @@ class Entry:
     ----------
     grade : with the flag for shared data, points given by hand, and the deduction for lateness.
     automatic : automatic points by criterion.
-    overrides, comments : current ones by criterion.
+    overrides : current points given by hand, by criterion.
+    comments : current comments, by criterion.
     owner : the account that submitted it, as the learning platform names it, or "".
-    key : hash of everything the grading depends on.
-    grading : its number in the gradebook.
+    key : hash of everything that affects the grade.
+    grading : number of its grading in the gradebook.
     first_key : key of the first version under this name, which strangers cannot guess.
     """
 
@@ -73,12 +74,15 @@ def add_row(connection: Connection, table: Table, values: dict) -> int:
 
 
 def pages(numbers: Sequence[int]) -> Iterator[Sequence[int]]:
-    """Split numbers of rows into pages."""
+    """Yield the row numbers in pages."""
     return (numbers[i : i + _PAGE] for i in range(0, len(numbers), _PAGE))
 
 
 def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
-    """Return the query for the newest grading of a key; assignments may share a rubric's text."""
+    """Return the query for the newest grading of a key in an assignment.
+
+    The assignment is checked too, because two assignments may have rubrics with the same text.
+    """
     mine = chosen.where(gradings.c.key == key, submissions.c.assignment == assignment)
     return mine.order_by(gradings.c.id.desc()).limit(1)
 
@@ -89,7 +93,10 @@ def _newest(chosen: Select, key: str, *, assignment: str) -> Select:
 def known_grading(
     connection: Connection, key: str, *, assignment: str, drawn: bool
 ) -> Grading | None:
-    """Return the newest grading of a key, with figures if asked, or None."""
+    """Return the newest grading with this key, or None.
+
+    `drawn` tells whether to read its figures.
+    """
     newest = _newest(_OF_GRADING.join(submissions), key, assignment=assignment)
     row = connection.execute(newest.add_columns(gradings.c.id)).mappings().one_or_none()
     if row is None:
@@ -99,13 +106,13 @@ def known_grading(
 
 
 def read_figures(connection: Connection, grading: int) -> tuple[tuple[str, str], ...]:
-    """Return the figures of a grading: file names and SVG."""
+    """Return the figures of a grading, as pairs of file name and SVG text."""
     mine = select(figures.c.name, figures.c.svg).where(figures.c.grading_id == grading)
     return tuple((name, svg) for name, svg in connection.execute(mine.order_by(figures.c.position)))
 
 
 def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]:
-    """Yield the gradings of these numbers as members of the class, without fingerprints."""
+    """Yield the gradings with these numbers as class members, without fingerprints."""
     lines = select(*_MEMBER).join(submissions).order_by(gradings.c.id)
     for page in pages(numbers):
         with database.reading() as connection:
@@ -116,7 +123,13 @@ def read_members(database: Database, numbers: Sequence[int]) -> Iterator[Member]
 def read_prints(
     database: Database, numbers: Sequence[int] | None = None, *, assignment: str
 ) -> Iterator[Member]:
-    """Yield the different fingerprints with their owners, of all or of these gradings."""
+    """Yield the different fingerprints of recordings, with the submissions that contain them.
+
+    Parameters
+    ----------
+    numbers : of the gradings to read; default: all gradings.
+    assignment : its submissions get `of_class` true.
+    """
     chosen = select(*_MEMBER, gradings.c.fingerprints, submissions.c.assignment)
     chosen = chosen.join(submissions).order_by(gradings.c.id)
     if numbers is None:
@@ -164,7 +177,12 @@ def newest_of(connection: Connection, key: str, *, assignment: str) -> Row:
 
 
 def class_list(batch: Row, *columns: ColumnElement) -> Select:
-    """Return the query for the lines of a class list, in order; default: with their grades."""
+    """Return the query for the lines of a class list, in order.
+
+    Parameters
+    ----------
+    columns : the columns to read; default: those of the line and its grading.
+    """
     joined = entries.join(gradings, entries.c.grading_id == gradings.c.id).join(
         submissions, entries.c.submission_id == submissions.c.id
     )
@@ -223,7 +241,12 @@ def as_it_counts(
     rubric: Rubric,
     first_key: str = "",
 ) -> Entry:
-    """Return a line with its current grade, given all overrides of its submission."""
+    """Return a line of the class list with its current grade.
+
+    Parameters
+    ----------
+    ever : all overrides of the submission, in the order they were made.
+    """
     newest = {override.criterion: override for override in ever if override.concerns(row.authors)}
     given = {key: override for key, override in newest.items() if override.points is not None}
     comments = {key: override for key, override in newest.items() if override.comment}
@@ -243,14 +266,14 @@ def as_it_counts(
 
 
 def lines_of(connection: Connection, batch: Row) -> list[dict]:
-    """Return a class list as stored."""
+    """Return the lines of a class list as dictionaries, ready for `add_list`."""
     columns = [column for column in entries.c if column.name != "batch_id"]
     mine = select(*columns).where(entries.c.batch_id == batch.id).order_by(entries.c.position)
     return [dict(row._mapping) for row in connection.execute(mine)]
 
 
 def points_of(connection: Connection, batch: Row) -> dict[str, float]:
-    """Return the points of a class list by submission."""
+    """Return the points of each submission in a class list."""
     rows = connection.execute(class_list(batch, submissions.c.name, entries.c.points))
     return {row.name: row.points for row in rows}
 
@@ -258,7 +281,7 @@ def points_of(connection: Connection, batch: Row) -> dict[str, float]:
 def add_list(
     connection: Connection, lines: list[dict], *, assignment: str, at: str, rubric: str
 ) -> None:
-    """Add a class list."""
+    """Store a class list."""
     values = {"assignment": assignment, "at": at, "rubric": rubric}
     number = add_row(connection, batches, values)
     if lines:
@@ -268,7 +291,7 @@ def add_list(
 def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
     """Return the submissions of a class list that were graded with a different rubric.
 
-    A grading belongs to the rubric of the first list that contains it.
+    A grading belongs to the rubric of the first class list that contains it.
     """
     mine = select(entries.c.grading_id).where(entries.c.batch_id == batch.id)
     first = (
@@ -292,12 +315,12 @@ def by_other_rubrics(connection: Connection, batch: Row) -> list[str]:
 
 
 def _asked(rubric: str) -> dict:
-    """Return the requirements of a stored rubric, without its presentation."""
+    """Return the parts of a stored rubric that affect a grade, not its title or anonymity."""
     return json.loads(rubric) | {"title": "", "anonymous": False}
 
 
 def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
-    """Return the last known authors of a submission, because a broken one names none."""
+    """Return the last known authors of a submission, because a broken version names none."""
     named = select(gradings.c.authors).where(
         gradings.c.submission_id == submission, gradings.c.authors != ()
     )
@@ -305,9 +328,9 @@ def last_named(connection: Connection, submission: int) -> tuple[str, ...]:
 
 
 def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: str) -> None:
-    """Copy points by hand and requests of a renamed submission to its new name.
+    """Copy overrides and requests of renamed submissions to their new names.
 
-    Only missing entries are copied, so that the name can also change back.
+    Only missing rows are copied, so nothing is doubled when a name changes back.
     """
     named = select(submissions.c.name, submissions.c.id).where(
         submissions.c.assignment == assignment,
@@ -327,7 +350,7 @@ def carry_over(connection: Connection, moved: Mapping[str, str], *, assignment: 
 
 
 def read_flag(text: str) -> Flag | None:
-    """Return the flag for shared data of a line of the class list, or None."""
+    """Return the flag for shared recordings that a class list stores for a submission, or None."""
     return Flag.model_validate_json(text) if text else None
 
 

@@ -48,13 +48,13 @@ from pipeline.output import OWNER_ONLY
 from pipeline.submission.complaints import quote
 
 FILE = "gradebook.sqlite"
-_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of database files; anything else is a folder
+_SUFFIXES = (".sqlite", ".sqlite3", ".db")  # of SQLite files; any other path is a folder
 _VERSION = "1"
-_TURN = 0x6361_7274  # a unique number for PostgreSQL's lock
-_PATIENCE = 60.0  # s, for a lock that another process holds; a commit takes milliseconds
+_TURN = 0x6361_7274  # number of PostgreSQL's advisory lock, chosen so that no other program uses it
+_PATIENCE = 60.0  # s to wait for a lock of another process; a commit takes milliseconds
 
 
-# Errors of SQLAlchemy and the drivers for a meaningless address.
+# Errors that SQLAlchemy and the drivers raise for an address that makes no sense.
 _SENSELESS = (ArgumentError, ValueError, TypeError)
 _NO_ADDRESS = (
     "the gradebook's address is not a database URL: write postgresql://NAME@HOST/DATABASE or "
@@ -63,12 +63,12 @@ _NO_ADDRESS = (
 
 
 class Words(TypeDecorator):
-    """Text that every database accepts: no NUL, no incomplete characters."""
+    """Text in a form that every database accepts: without NUL and unpaired surrogates."""
 
     impl, cache_ok = Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return the value to store."""
+        """Return the text to store."""
         return value.replace("\0", "�").encode("utf-8", "replace").decode() if value else value
 
 
@@ -78,11 +78,11 @@ class Names(TypeDecorator):
     impl, cache_ok = Text, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return the value to store."""
+        """Return the JSON to store."""
         return json.dumps(value)
 
     def process_result_value(self, value: Any, dialect: object) -> Any:
-        """Return the stored value."""
+        """Return the list of texts from the stored JSON."""
         return tuple(json.loads(value))
 
 
@@ -92,11 +92,11 @@ class Deflated(TypeDecorator):
     impl, cache_ok = LargeBinary, True
 
     def process_bind_param(self, value: Any, dialect: object) -> Any:
-        """Return the value to store."""
+        """Return the compressed text to store."""
         return zlib.compress(value.encode())
 
     def process_result_value(self, value: Any, dialect: object) -> Any:
-        """Return the stored value."""
+        """Return the text from its compressed form."""
         return zlib.decompress(value).decode()
 
 
@@ -114,11 +114,11 @@ submissions = Table(
     metadata,
     Column("id", Integer, primary_key=True),
     Column("assignment", String(255), nullable=False),
-    Column("name", String(510), nullable=False),  # two folder names at most
+    Column("name", String(510), nullable=False),  # long enough for two folder names
     UniqueConstraint("assignment", "name"),
 )
 
-# One row for each grading of a submission; `key` is a hash of everything the grade depends on.
+# One row for each grading of a submission; `key` is a hash of everything that affects the grade.
 gradings = Table(
     "gradings",
     metadata,
@@ -151,7 +151,7 @@ figures = Table(
     Column("svg", Deflated, nullable=False),
 )
 
-# Results of the checks of a grading; another rubric's points follow without grading again.
+# The results of a grading's checks. With them, points by a changed rubric need no new grading.
 findings = Table(
     "findings",
     metadata,
@@ -159,8 +159,8 @@ findings = Table(
     Column("found", Deflated, nullable=False),
 )
 
-# A complete batch and its class list: for each submission the grading that counts, the flag for
-# shared data, and its points at that time.
+# A complete batch and its class list. For each submission, the list has the grading that counts,
+# the flag for shared data, and the points at that time.
 batches = Table(
     "batches",
     metadata,
@@ -183,8 +183,8 @@ entries = Table(
     Index("entries_by_submission", "submission_id"),
 )
 
-# The newest row of a criterion counts. Without points the automatic ones count: with a comment, or,
-# if points were undone, without.
+# Points and comments given by hand; the newest row of a criterion counts. A row without points
+# means that the automatic points count: it is a comment, or it undoes earlier points.
 overrides = Table(
     "overrides",
     metadata,
@@ -200,7 +200,7 @@ overrides = Table(
     Index("overrides_by_submission", "submission_id"),
 )
 
-# Marks of reviewed gradings; the newest row counts, so that a mark can be undone.
+# Marks of gradings as reviewed or not; the newest row counts, so a mark can be undone.
 looks = Table(
     "looks",
     metadata,
@@ -212,8 +212,8 @@ looks = Table(
     Index("looks_by_grading", "grading_id"),
 )
 
-# Requests for another look at a criterion: `asked`, `answered`, `reopened`. The newest event sets
-# the state; an answer has points only if it changed them.
+# Requests to review a criterion, as events `asked`, `answered` and `reopened`. The newest event
+# sets the state; an answer has points only if it changed them.
 request_events = Table(
     "request_events",
     metadata,
@@ -252,7 +252,7 @@ event.listen(
 
 
 def _locks(table: Table) -> dict[str, tuple[str, ...]]:
-    """Return, for each kind of database, what makes a table one that is only added to."""
+    """Return, for each kind of database, the SQL that makes a table append-only."""
     name = table.name
     return {
         "sqlite": tuple(
@@ -274,7 +274,7 @@ for _table in metadata.sorted_tables:
 
 
 class Database:
-    """A database with the tables of a gradebook; every call is one transaction.
+    """A database with the tables of a gradebook; each context manager below is one transaction.
 
     Parameters
     ----------
@@ -298,15 +298,15 @@ class Database:
                     raise ConfigError(f"{self.name}: holds no gradebook")
                 _check_version(connection, name=self.name)
                 whole = _is_whole(connection)
-        except _SENSELESS as error:  # the driver reads the address only when it connects
+        except _SENSELESS as error:  # some drivers read the address only when they connect
             raise ConfigError(_NO_ADDRESS) from error
-        if not whole:  # written by a version with fewer tables or columns
+        if not whole:  # an older version wrote it, with fewer tables or columns
             with self.writing() as connection:
                 _create(connection)
 
     @property
     def name(self) -> str:
-        """The place, without any password."""
+        """The place as messages show it, without any password."""
         url = self._engine.url
         if url.get_backend_name() == "sqlite":
             return url.database or ""
@@ -314,26 +314,29 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """Read; keep it short, because writers wait for it."""
+        """Read in one transaction; keep it short, because writers wait for it."""
         with self._translated(), self._engine.begin() as connection:
             yield connection
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Write all or nothing; durable at the end."""
+        """Write all changes or none; at the end they are on disk."""
         with self._translated(), self._writer.begin() as connection:
             yield connection
 
     @contextmanager
     def changing(self) -> Iterator[Connection]:
-        """Write while nobody else can, so that everything read here stays valid until the end."""
+        """Write while nobody else can, so that what was read stays true until the end."""
         with self.writing() as connection:
             _take_turns(connection)
             yield connection
 
     @contextmanager
     def erasing(self) -> Iterator[Connection]:
-        """Delete and update, with nobody else who writes; then leave no trace in the file."""
+        """Delete and update while nobody else can write.
+
+        Then rewrite the database without old data.
+        """
         with self.changing() as connection:
             sqlite = connection.dialect.name == "sqlite"
             for table in metadata.sorted_tables:
@@ -364,9 +367,9 @@ class Database:
 
 
 def _create(connection: Connection) -> None:
-    """Create missing tables, safely also when two runs start at once."""
+    """Create missing tables; two processes may do this at the same time."""
     _take_turns(connection)
-    # Complete gradebooks are not touched: a user may have the right to read and add only.
+    # A complete gradebook is left alone, because the user may lack the right to create tables.
     if not _is_whole(connection):
         metadata.create_all(connection)
         if _lacks_comments(connection):
@@ -385,7 +388,7 @@ def _lacks_comments(connection: Connection) -> bool:
 
 
 def _take_turns(connection: Connection) -> None:
-    if connection.dialect.name == "postgresql":  # SQLite already holds its write lock
+    if connection.dialect.name == "postgresql":  # SQLite already holds its write lock here
         connection.execute(select(func.pg_advisory_xact_lock(_TURN)))
 
 
@@ -403,13 +406,14 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
     except _SENSELESS as error:
         raise ConfigError(_NO_ADDRESS) from error
     try:
-        if url.drivername == "postgresql":  # the default driver depends on SQLAlchemy's version
+        if url.drivername == "postgresql":  # SQLAlchemy versions differ in their default driver
             url = url.set(drivername="postgresql+psycopg")
         if url.get_backend_name() != "sqlite":
             return create_engine(url, pool_pre_ping=True)
         file = url.database or ""
         if not (create or file.startswith((":memory:", "file:")) or Path(file).is_file()):
-            raise ConfigError(f"{quote(file)}: there is no such gradebook")  # SQLite would make one
+            # Without this check, SQLite would create the file.
+            raise ConfigError(f"{quote(file)}: there is no such gradebook")
         if create and file and not file.startswith((":memory:", "file:")):
             _keep_private(Path(file))
         engine = create_engine(url, connect_args={"timeout": _PATIENCE})
@@ -424,11 +428,11 @@ def _engine(place: str | Path, *, create: bool) -> Engine:
 
 
 def _keep_private(file: Path) -> None:
-    """Make a gradebook's file readable for its owner only; SQLite's side files follow.
+    """Let only the owner read a new gradebook file; SQLite gives its side files the same rights.
 
     An existing file keeps the rights of its group and is closed to everybody else.
     """
-    with suppress(OSError):  # SQLite reports problems; the file may belong to another user
+    with suppress(OSError):  # the file may belong to another user
         os.close(os.open(file, os.O_RDWR | os.O_CREAT, OWNER_ONLY))
         mode = file.stat().st_mode
         if mode & stat.S_IRWXO:
@@ -436,14 +440,14 @@ def _keep_private(file: Path) -> None:
 
 
 def _prepare_sqlite(connection, _record) -> None:
-    connection.isolation_level = None  # we start transactions ourselves, including DDL
+    connection.isolation_level = None  # cartlab starts each transaction itself, also for DDL
     connection.execute("PRAGMA foreign_keys = ON")
-    connection.execute("PRAGMA secure_delete = ON")  # erased data are overwritten
+    connection.execute("PRAGMA secure_delete = ON")  # overwrites erased data
     connection.execute("PRAGMA synchronous = FULL")  # committed data survive a power cut
 
 
 def _begin_sqlite(connection: Connection) -> None:
-    """Take the write lock at once, so that two readers that then write cannot deadlock."""
+    """Take the write lock at once; two readers that later want to write would deadlock."""
     options = connection.get_execution_options()
     if options.get("isolation_level") == "AUTOCOMMIT":
         return

@@ -1,7 +1,7 @@
-"""Copy the files of a hand-in to a private folder and find the submission; follow no links.
+"""Copy the files of a hand-in to a private folder and find the submission in it.
 
-The copy is graded, on this machine or a cluster. It has regular files only, so that the same files
-are graded, hashed and sent.
+The copy is what this machine or a cluster grades. It has only regular files, not the targets of
+links, so that the same files are hashed, sent and graded.
 """
 
 import hashlib
@@ -27,20 +27,20 @@ from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 from pipeline.words.numbers import first_few
 
-_DEEPEST = 12  # folders below the hand-in's
+_DEEPEST = 12  # nested folders that are searched in a hand-in
 _ARCHIVES_IN_ARCHIVES = 3
 _CHUNK = 1 << 20
-_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # in our archives: same files, same bytes
+_FIXED_TIME = (1980, 1, 1, 0, 0, 0)  # so that the same files give the same archive
 
 
 class Changed(Exception):
-    """The files of a hand-in do not match its key."""
+    """The files of a hand-in changed after its key was computed."""
 
 
 def digest(sources: Sequence[Path], *, without: Collection[str] = ()) -> str:
-    """Return the SHA-256 of everything in a hand-in that could be graded.
+    """Return the SHA-256 of all files in a hand-in that could be graded.
 
-    Unreadable files are part of the hash as such, and the row of the hand-in reports them.
+    If a file cannot be read, the error is hashed instead; the outcome of the hand-in reports it.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def _line(name: str, path: Path) -> bytes:
 
 
 def packed(sources: Sequence[Path]) -> bytes:
-    """Return a hand-in as one archive, to send to another machine."""
+    """Return a hand-in as one zip archive, to send to another machine."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, path in _files(sources):
@@ -79,17 +79,19 @@ def unpacked(archive: bytes, into: Path) -> None:
 
 
 def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") -> Path:
-    """Copy or unpack a hand-in into a folder and return the folder of the submission in it.
+    """Copy or unpack a hand-in into a folder; return the folder with `submission.toml`.
 
-    Archives are opened if there is no `submission.toml` next to them.
+    Archives in the hand-in are opened if there is no `submission.toml` next to them.
 
     Parameters
     ----------
-    digest : the required digest of the copy; "" to accept any.
+    digest : what `digest` must return for the copy; "" to accept any files.
 
     Raises
     ------
-    SubmissionError : there is no submission, or several, or too many files, or a bad archive.
+    SubmissionError : there is no submission, there are several, there are too many files, or an
+        archive
+        is bad.
     OSError : this computer cannot read or copy a file.
     Changed : the copy has another digest.
     """
@@ -130,10 +132,12 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
 def _files(sources: Sequence[Path]) -> Iterator[tuple[str, Path]]:
     """Yield (name below the hand-in, path) of the files to grade, sorted by name, each once.
 
-    If the files are too large together, the smallest are kept: data files are small, films are not.
-    `submission.toml` comes first, because it explains the others. Of too many files, one more than
-    the limit is kept, so that they are refused on every machine. A recording above the size limit
-    is kept too, so that it is refused and not just missing. Invalid bytes in names are replaced.
+    If the files together are too large, the smallest are kept, because data files are small and
+    films are not. `submission.toml` is always kept if its size allows.
+
+    If there are too many files, one more than the limit is kept, so that every machine refuses the
+    hand-in. A recording above the size limit is kept too: it is then refused, not reported as
+    missing. Invalid bytes in names are replaced.
     """
     found: list[tuple[int, str, Path]] = []
     for source in sources:
@@ -168,13 +172,13 @@ def _walk(folder: Path, below: PurePosixPath) -> Iterator[tuple[int, str, Path]]
 
 
 def _less(limits: UnpackLimits, folder: Path) -> UnpackLimits:
-    """Return the limits, reduced by the files already in a folder."""
+    """Return the limits minus the files that are already in a folder."""
     sizes = [path.stat().st_size for path in _below(folder)]
     return replace(limits, members=limits.members - 1 - len(sizes), total=limits.total - sum(sizes))
 
 
 def _below(folder: Path) -> list[Path]:
-    """Return the files in a folder and below, sorted.
+    """Return all files in a folder and its subfolders, sorted.
 
     Raises
     ------
@@ -190,7 +194,7 @@ def _below(folder: Path) -> list[Path]:
 
 
 def _submissions(folder: Path) -> list[Path]:
-    """Return the submission files at the least depth, not counting a wrapping folder."""
+    """Return the `submission.toml` files at the least depth below a folder."""
     tomls = [path for path in _below(folder) if path.name == NAME]
     depth = min((len(path.parts) for path in tomls), default=0)
     return [path for path in tomls if len(path.parts) == depth]
@@ -211,7 +215,7 @@ def _the_one(tomls: Sequence[Path], into: Path) -> Path:
 def _gather_loose(folder: Path) -> None:
     """Copy the files next to `submission.toml` into `data/`, if there is no such folder.
 
-    A platform that takes files one by one does not keep their folders.
+    Some platforms take single files and lose their folders.
     """
     data = folder / "data"
     if not os.path.lexists(data):

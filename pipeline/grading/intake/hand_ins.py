@@ -1,4 +1,4 @@
-"""Find the hand-ins in folders, trees, zip files and platforms' downloads."""
+"""Find hand-ins in folders, trees, zip files and downloads from learning platforms."""
 
 import os
 import re
@@ -29,12 +29,12 @@ from pipeline.submission.complaints import quote
 from pipeline.submission.load import NAME
 from pipeline.words.progress import Progress, silent
 
-_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks lateness without its amount: counted as one day
-_LONGEST_ID, _MOST_BYTES = 100, 200  # letters and bytes of a folder name, on every system
+_DAYS_OF_A_LATE_MARK = 1.0  # Canvas marks a late file without saying how late; it counts as one day
+_LONGEST_ID, _MOST_BYTES = 100, 200  # characters and bytes that every system allows in a name
 _NOT_IN_NAMES = re.compile(r'[<>:"/\\|?*\x00-\x1f\x7f-\x9f]')
-_RESULTS = ("class.html", "feedback/.made.json")  # files of a grading's output folder
+_RESULTS = ("class.html", "feedback/.made.json")  # these mark the output folder of a grading
 _PARTS_OF_RESULTS = ("feedback", "gradescope")
-_DATA = "data"  # the folder of recordings, never the name of a hand-in
+_DATA = "data"  # folder of recordings; its name is never the id of a hand-in
 _RESERVED = re.compile(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?")
 
 
@@ -45,12 +45,12 @@ class HandIn:
     Attributes
     ----------
     id : unique in the batch, and valid as a folder name.
-    sources : one folder, or files, including archives still to unpack.
+    sources : one folder, or several files, which may be archives.
     owner : the account that submitted it, with the platform's name and number:
         "Jane Doe (moodle 1024)"; or "".
     handed_in : the time in ISO 8601, if the platform gives it; or "".
-    problem : why it cannot be opened, if already known.
-    parent : the folder around it, until its id is fixed.
+    problem : why it cannot be opened, if already known; or "".
+    parent : name of the folder around it; needed until its id is unique.
     """
 
     id: str
@@ -64,7 +64,7 @@ class HandIn:
 
 @dataclass(frozen=True, kw_only=True)
 class _Walk:
-    """The folders to skip during a search for hand-ins, and the function that reports them."""
+    """Settings of a search for hand-ins: the folders to skip, and a function that reports them."""
 
     skip: set[Path]
     say: Progress
@@ -78,14 +78,17 @@ def find_hand_ins(
     known: Iterable[str] = (),
     say: Progress = silent,
 ) -> tuple[HandIn, ...]:
-    """Return the hand-ins in folders, trees and archives, in the order of their ids.
+    """Return the hand-ins in folders, trees and archives, sorted by id.
 
     Parameters
     ----------
-    scratch : where archives of a whole class are unpacked.
+    scratch : folder where archives of a whole class are unpacked.
     skip : folders that are not hand-ins, such as the output folder.
-    known : ids of the current class, so that one of several "team-1" keeps its id.
-    say : reports every folder that is skipped as the results of a grading.
+    known : ids in the current class. A folder `team-1` with the longer id `a-team-1` there keeps
+        it,
+        even if this run has no other `team-1`.
+    say : called with a message for each folder that is skipped because it holds results of a
+        grading.
 
     Raises
     ------
@@ -128,7 +131,11 @@ def _at(path: Path, *, scratch: Path, walk: _Walk) -> list[HandIn]:
 def _with_refused(
     found: Sequence[HandIn], refused: Mapping[PurePosixPath, str], *, folder: Path
 ) -> list[HandIn]:
-    """Return the hand-ins of an archive with refused members, and those refused completely."""
+    """Return the hand-ins of an archive, including those with refused files.
+
+    A hand-in gets the reason as its problem if some of its files were refused. If all were refused,
+    it is added here.
+    """
     whose = {
         source.relative_to(folder).parts: i for i, one in enumerate(found) for source in one.sources
     }
@@ -148,7 +155,7 @@ def _with_refused(
 
 
 def _holds_a_class(archive: Path) -> bool:
-    """Return whether an archive is a download of many hand-ins, not one student's."""
+    """Return whether an archive contains many hand-ins, not only one student's."""
     whole = member_names(archive, limits=CLASS)
     names = whole or names_in_pieces(archive)
     tops = {part for path in names for part in path.parts[:2]}
@@ -204,8 +211,8 @@ def _looked_into(folder: Path, *, walk: _Walk, top: bool, depth: int) -> list[Ha
         else:
             without.append(_single(entry))
     if not found and any(entry.name.lower() == _DATA for entry in entries):
-        return [_single(folder)]  # a submission that lacks its file
-    # Next to a submission, a folder without one holds a student's own pictures or drafts.
+        return [_single(folder)]  # a submission that lacks its `submission.toml`
+    # Next to submissions, a folder without one holds a student's own pictures or drafts.
     return found + without if top or len(found) > 1 else found
 
 
@@ -215,7 +222,10 @@ def _is_submission(folder: Path) -> bool:
 
 
 def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
-    """Return whether to skip an entry: debris, results, or hidden without a submission."""
+    """Return whether to skip an entry: system files, results of a grading, or hidden folders.
+
+    A hidden folder that contains `submission.toml` is not skipped.
+    """
     if not entry.is_dir() or entry.name == "__MACOSX":
         return is_debris(PurePosixPath(entry.name)) or entry.name.startswith(".")
     if os.access(entry / NAME, os.F_OK):
@@ -225,7 +235,7 @@ def _is_passed_over(entry: Path, *, walk: _Walk) -> bool:
     results = entry.parent if entry.name in _PARTS_OF_RESULTS else entry
     if not all(os.access(results / name, os.F_OK) for name in _RESULTS):
         return False
-    if results not in walk.skip:  # a student's own folder may look like one
+    if results not in walk.skip:  # report it, because a student's own folder may look like results
         walk.say(
             f"{quote(f'{entry.parent.name}/{entry.name}')} is skipped: it looks like the results "
             f"of a grading; if it is a submission, remove {_RESULTS[0]} from it"
@@ -240,7 +250,7 @@ def _may_be_one(entry: Path) -> bool:
 
 
 def _single(entry: Path) -> HandIn:
-    """Return a folder or archive that is one hand-in."""
+    """Return a folder or an archive as one hand-in."""
     if entry.is_symlink():
         return HandIn(
             id=entry.stem,
@@ -258,10 +268,10 @@ def _archive(path: Path) -> HandIn:
 
 
 def _folder_inside(archive: Path) -> str:
-    """Return the name of the folder in an archive that is the submission.
+    """Return the name of the one folder in an archive that holds the submission.
 
-    "" for the top level, and if several are possible. If this computer cannot read the archive now,
-    its row reports that.
+    Returns "" if the submission is at the top level, or if several folders are possible, or if the
+    archive cannot be read now. The outcome of the hand-in then reports the read error.
     """
     try:
         tomls = [path for path in member_names(archive) if path.name == NAME]
@@ -276,12 +286,12 @@ def _folder_inside(archive: Path) -> str:
 
 
 def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> list[HandIn]:
-    """Return one hand-in per student, for any number of uploaded files."""
-    # Metadata further down may be a student's own.
+    """Return one hand-in per student, from any number of uploaded files."""
+    # Only metadata at the top level are the platform's; further down they may be a student's file.
     metadata = gradescope_metadata(folder) if top else {}
     by_student: dict[tuple[str, str, str], dict[Path, Upload]] = defaultdict(dict)
     for path, upload in uploads.items():
-        # Canvas makes no folders: such a folder is an archive that somebody has unpacked.
+        # Canvas makes no folders. If there is one, somebody has unpacked an archive.
         own = path.name if upload.platform == "canvas" and path.is_dir() else ""
         by_student[upload.owner, upload.user, own][path] = upload
     found = []
@@ -306,7 +316,7 @@ def _from_platform(folder: Path, uploads: dict[Path, Upload], *, top: bool) -> l
 
 
 def _name_inside(sources: Sequence[Path]) -> str:
-    """Return the name of the folder that the student packed or uploaded, "" without one."""
+    """Return the name of the folder that the student packed or uploaded; "" without a folder."""
     for source in sources:
         if source.is_dir():
             tomls = [path for path in sorted(source.rglob(NAME)) if path.parent != source]
@@ -324,7 +334,12 @@ def _name_inside(sources: Sequence[Path]) -> str:
 
 
 def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[HandIn]:
-    """Name every hand-in after its folder; if two names are equal, prefix the parent's."""
+    """Name every hand-in after its folder; if names are equal, add the parent folder as a prefix.
+
+    Parameters
+    ----------
+    known : ids in the current class; a hand-in that had its parent as a prefix there keeps it.
+    """
     names = [_fit(one.id) for one in found]
     longer = [_fit(f"{one.parent}-{one.id}") for one in found]
     often, before = Counter(name.casefold() for name in names), set(known)
@@ -345,7 +360,7 @@ def _with_ids(found: Sequence[HandIn], *, known: Iterable[str] = ()) -> list[Han
 
 
 def _fit(name: str) -> str:
-    """Return a name that is valid as a folder on every system and harmless on a terminal."""
+    """Return a name that every system accepts for a folder, and that is safe to print."""
     text = unicodedata.normalize("NFC", name)
     text = _NOT_IN_NAMES.sub("_", text.encode("utf-8", "replace").decode())
     text = "".join(c if c.isprintable() else "_" for c in text)[:_LONGEST_ID]

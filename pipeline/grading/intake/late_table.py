@@ -1,6 +1,7 @@
-"""Find how late each hand-in is, from the rubric's deadline or a table.
+"""Find how late each hand-in is, from the rubric's deadline or from a table.
 
-The table has the columns `submission` and `days_late`. An extension is also a line in it.
+The table has the columns `submission` and `days_late`. It replaces the computed lateness, so it can
+also grant extensions.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,15 +17,15 @@ from pipeline.submission.complaints import quote
 
 _DAY = 86_400.0  # s
 _HEADS = ["submission", "days_late"]
-_LONGEST = 3_650.0  # days: more must be a typing error
+_LONGEST = 3_650.0  # days; a larger number must be a typing error
 
 
 def read_late_table(path: Path) -> dict[str, float]:
-    """Return days late by submission name in lower case.
+    """Return the days late of each submission; names are in lower case.
 
     Raises
     ------
-    ConfigError : the table lacks a column, or a line in it cannot be understood.
+    ConfigError : the table lacks a column, or one of its rows is not valid.
     """
     table = read_table(path)
     if not {*_HEADS} <= {*table.columns}:
@@ -48,9 +49,9 @@ def read_late_table(path: Path) -> dict[str, float]:
 def settle_lateness(
     hand_ins: Iterable[HandIn], *, late: Late, table: Mapping[str, float]
 ) -> tuple[list[HandIn], list[str]]:
-    """Return the hand-ins with their lateness, and the unknown names of the table.
+    """Return the hand-ins with their lateness, and the names in the table that match no hand-in.
 
-    The table takes precedence over the deadline, and the deadline over a platform's mark.
+    The table takes precedence over the deadline, and the deadline over a platform's late mark.
     """
     settled, known = [], set()
     for hand_in in hand_ins:

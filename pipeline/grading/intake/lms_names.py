@@ -1,10 +1,12 @@
 """Read owner and lateness from the file names of learning platforms.
 
-Canvas (`lib/content_zipper.rb`): `doejane_LATE_1024_77001_lab3.zip`, graded without names
-`LATE_anon_x7Yb2_77001_lab3.zip`, a resubmitted file `lab3-1.zip`. Moodle
-(`mod/assign/classes/downloader.php`): a folder, or the beginning of a file's name,
-`Jane Doe_1024_assignsubmission_file_`, of a group its name and number. Gradescope:
-`submission_77001` beside `submission_metadata.yml`.
+Canvas (`lib/content_zipper.rb`): `doejane_LATE_1024_77001_lab3.zip`; with anonymous grading
+`LATE_anon_x7Yb2_77001_lab3.zip`; for a file that was submitted again `lab3-1.zip`.
+
+Moodle (`mod/assign/classes/downloader.php`): `Jane Doe_1024_assignsubmission_file_` as a folder or
+at the beginning of a file's name; for a group, its name and number.
+
+Gradescope: a folder `submission_77001` next to `submission_metadata.yml`.
 """
 
 import re
@@ -17,7 +19,8 @@ from typing import Literal
 
 Platform = Literal["canvas", "moodle", "gradescope"]
 
-# The rest is the file's name, including line ends. Matching everything avoids repeated searches.
+# The last group takes all remaining characters, including line ends. A pattern that always matches
+# to the end needs no backtracking.
 _CANVAS = re.compile(
     r"(?P<owner>.+?)(?P<late>_LATE)?_(?P<user>\d+)_(?P<upload>\d+)_(?P<file>.+)", re.DOTALL
 )
@@ -38,14 +41,17 @@ _OWNER = re.compile(
 )
 _TIME = re.compile(r"(\d{4}-\d\d-\d\d)[ T](\d\d:\d\d:\d\d)(?:\.\d*)? ?(Z|UTC|[+-]\d\d:?\d\d)")
 _METADATA = re.compile(r"(?:submission_)?metadata\.ya?ml")
-_MOST_METADATA = 10_000_000  # bytes
+_MOST_METADATA = 10_000_000  # bytes of the metadata file
 
 
 @dataclass(frozen=True, kw_only=True)
 class Upload:
-    """The content of a name: owner, lateness, and the student's own file name.
+    """The parts of a downloaded name: owner, lateness, and the student's own file name.
 
-    `number` is the platform's number of this upload, larger for a later one.
+    Attributes
+    ----------
+    user : the platform's number of the account.
+    number : the platform's number of this upload; later uploads have larger numbers.
     """
 
     platform: Platform
@@ -83,7 +89,7 @@ def parse_name(name: str) -> Upload | None:
 
 
 def current(uploads: Mapping[Path, Upload]) -> list[Path]:
-    """Return the files of one student without those that a later attempt replaces.
+    """Return one student's files without those that a later upload replaces.
 
     Canvas appends `-1`, `-2` to the name of a file that is submitted again.
     """
@@ -92,7 +98,7 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
     for path, upload in uploads.items():
         again = _ATTEMPT.fullmatch(upload.file)
         first = f"{again['stem']}{again['suffix']}" if again else upload.file
-        # `run-2.csv` is a second attempt only if `run.csv` exists too.
+        # `run-2.csv` is a second upload only if `run.csv` exists too.
         if again and first in names:
             attempts[first].append((int(again["attempt"]), upload.number, path))
         else:
@@ -101,15 +107,15 @@ def current(uploads: Mapping[Path, Upload]) -> list[Path]:
 
 
 def owner_text(name: str, platform: Platform, user: str) -> str:
-    """Return the owner as stored in the gradebook: "Jane Doe (moodle 1024)".
+    """Return the owner as the gradebook stores it: "Jane Doe (moodle 1024)".
 
-    The platform is part of it, because another platform may use the same number.
+    It includes the platform, because two platforms may use the same number.
     """
     return f"{name} ({platform} {user})" if user.isdigit() else name
 
 
 def read_owner(owner: str) -> tuple[str, str, str]:
-    """Read name, platform and number from an `owner_text`; missing ones are ""."""
+    """Return name, platform and number from a text that `owner_text` made; missing parts are ""."""
     found = _OWNER.fullmatch(owner)
     assert found is not None
     return found["name"], found["platform"] or "", found["number"] or ""
@@ -130,8 +136,8 @@ class Sent:
 
 
 def gradescope_metadata(folder: Path) -> dict[str, Sent]:
-    """Return the metadata by `submission_…`, if there is a metadata file."""
-    import yaml  # only a Gradescope download needs it
+    """Return the metadata by folder name (`submission_…`); empty without a metadata file."""
+    import yaml  # imported late: only a Gradescope download needs it
 
     sent: dict[str, Sent] = {}
     for path in sorted(folder.iterdir()):
@@ -160,7 +166,7 @@ def gradescope_metadata(folder: Path) -> dict[str, Sent]:
 
 
 def _time(text: str) -> str:
-    """Return a time written by Ruby in ISO 8601; "" if it is not a time."""
+    """Return a time that Ruby wrote as ISO 8601; "" if the text is not a time."""
     found = _TIME.fullmatch(text)
     if found is None:
         return ""
