@@ -1,4 +1,4 @@
-"""Unpack archives from strangers: never outside the folder, never above the limits."""
+"""Unpack archives from strangers: write only inside the target folder, within limits."""
 
 import io
 import lzma
@@ -21,14 +21,16 @@ from pipeline.errors import SubmissionError, lies_in_the_name
 from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
-_RATIO_FROM = 1_000_000  # bytes; smaller files may have any ratio
-_END_OF_ZIP = 66_000  # bytes; may contain a comment, and is read at once
-# The record at the end gives the place of the table of contents (4.3.16), or refers to another.
+_RATIO_FROM = 1_000_000  # bytes; the ratio of smaller files is not limited
+# Bytes at the end of a zip file that may hold its end record and a comment; read at once.
+_END_OF_ZIP = 66_000
+# The end record of a zip file gives the place of the table of contents at this offset (4.3.16). The
+# second number means that a 64-bit record gives it instead.
 _PLACE, _ELSEWHERE = 16, 0xFFFFFFFF
-DEEPEST = 40  # folders in folders; a submission needs three
+DEEPEST = 40  # nested folders; a submission needs three
 _AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
-# The header of each member up to its name (APPNOTE.TXT 4.3.7), with the length of the name.
+# The local header precedes each member (APPNOTE.TXT 4.3.7); the group is the length of its name.
 _HEAD = 30  # bytes
 _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
@@ -37,19 +39,21 @@ _NOT_ON_WINDOWS = re.compile(r'(?i)[<>:"|?*\x00-\x1f]|[. ]$|^(con|prn|aux|nul|co
 
 _DEBRIS_FOLDERS = ("__MACOSX",)
 _DEBRIS_FILES = (".ds_store", "thumbs.db", "desktop.ini")
-# Archives that cannot be opened here; the message asks for a zip file.
+# Archives that cartlab cannot open; the message asks for a zip file instead.
 STRANGE_ARCHIVES = (".7z", ".bz2", ".gz", ".rar", ".tar", ".tbz", ".tgz", ".xz", ".zst")
 
 
 @dataclass(frozen=True, kw_only=True)
 class UnpackLimits:
-    """Limits of an archive.
+    """Limits for unpacking one archive.
 
     Attributes
     ----------
-    ratio : unpacked to packed size of a file.
+    members : number of files.
+    total : bytes of all unpacked files.
+    ratio : unpacked size of a file divided by its packed size.
     directory : bytes of the table of contents, which is read at once.
-    whole : one bad member refuses the whole archive, not only itself.
+    whole : one bad file refuses the whole archive; otherwise only that file is refused.
     """
 
     members: int = 2_000
@@ -67,7 +71,7 @@ CLASS = UnpackLimits(
 
 @dataclass(kw_only=True)
 class _Budget:
-    """The remaining limits while an archive is read."""
+    """How many files and bytes may still be read from an archive."""
 
     limits: UnpackLimits
     members: int = field(init=False)
@@ -78,7 +82,7 @@ class _Budget:
 
 
 def is_debris(path: PurePosixPath) -> bool:
-    """Return whether a file is one that macOS or Windows leaves behind."""
+    """Return whether a file is one that macOS or Windows creates without being asked."""
     name = path.name.lower()
     return (
         any(part in _DEBRIS_FOLDERS for part in path.parts)
@@ -88,7 +92,7 @@ def is_debris(path: PurePosixPath) -> bool:
 
 
 def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosixPath, str]:
-    """Unpack a zip archive into a new folder; return refused members and reasons.
+    """Unpack a zip archive into a new folder; return the refused files and the reasons.
 
     Only regular files are written.
 
@@ -111,13 +115,15 @@ def unpack(archive: Path, into: Path, *, limits: UnpackLimits) -> dict[PurePosix
 
 
 def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PurePosixPath]:
-    """Return the files that may be unpacked, without debris; empty if it is not an archive.
+    """Return the files that may be unpacked; empty if it is not an archive.
+
+    Files that macOS or Windows created are left out.
 
     Raises
     ------
-    OSError : this computer cannot read it now.
+    OSError : this computer cannot read the archive now.
     """
-    if not archive.is_file():  # reading a pipe would wait
+    if not archive.is_file():  # a pipe would block when read
         return []
     try:
         with _opened(archive, limits=limits) as opened:
@@ -133,9 +139,10 @@ def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PureP
 
 
 def names_in_pieces(archive: Path) -> list[PurePosixPath]:
-    """Return member names from the headers of an archive without a table of contents.
+    """Return the names of files in an archive whose table of contents is missing.
 
-    Names in inner archives are included: enough to recognise the archive, not to unpack it.
+    They are found by searching for the headers of files. Files of archives inside the archive are
+    found too, so the names are good enough to recognise the archive, not to unpack it.
     """
     if not archive.is_file() or not archive.stat().st_size:
         return []
@@ -147,14 +154,14 @@ def names_in_pieces(archive: Path) -> list[PurePosixPath]:
 
 
 class _Refused(Exception):
-    """A member that must not be unpacked."""
+    """A file in an archive must not be unpacked."""
 
 
 class _TooLarge(_Refused):
-    """An archive beyond the limits."""
+    """An archive exceeds the limits."""
 
 
-# All errors that reading arbitrary bytes as an archive can raise.
+# All errors that can occur when arbitrary bytes are read as an archive.
 _TROUBLE = (
     _Refused,
     zipfile.BadZipFile,
@@ -169,29 +176,29 @@ _TROUBLE = (
 
 
 def _let_through(error: Exception) -> None:
-    """Raise errors that no archive can cause."""
+    """Raise the error again if this computer caused it, not the archive."""
     if isinstance(error, OSError) and not lies_in_the_name(error):
         raise error
 
 
 def _why(error: Exception) -> str:
-    """Return the problem of an archive, in one line."""
+    """Return what is wrong with an archive, in one line."""
     if isinstance(error, _Refused):
         return str(error)
     if isinstance(error, NotImplementedError):
         return "its compression is not supported"
-    if isinstance(error, OSError | RuntimeError):  # from the disk or a decoder
+    if isinstance(error, OSError | RuntimeError):  # from the disk or from a decoder
         said = getattr(error, "strerror", None) or _line(error)
         return f"cannot be unpacked ({said})"
     said = _line(error)
-    more = "" if said == "File is not a zip file" else f" ({said})"  # which only repeats it
+    more = "" if said == "File is not a zip file" else f" ({said})"  # the same in other words
     return f"not a complete zip archive{more}"
 
 
 class _Bounded(io.BufferedReader):
-    """A file that limits the bytes of a single read.
+    """A file that refuses to read too many bytes at once.
 
-    `zipfile` reads the table of contents at once, with a length from one of three records.
+    `zipfile` reads the whole table of contents at once, and the archive itself states its length.
     """
 
     def __init__(self, path: Path, *, most: int) -> None:
@@ -201,7 +208,7 @@ class _Bounded(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self._most:
             raise _TooLarge(f"a table of contents of {size:,} bytes")
-        return super().read(size)  # without a size: the end of the file, with its comment
+        return super().read(size)  # -1 reads the end of the file with its comment
 
 
 @contextmanager
@@ -217,9 +224,11 @@ def _opened(archive: Path, *, limits: UnpackLimits) -> Iterator[zipfile.ZipFile]
 
 
 def _is_cut(file: IO[bytes], contents: int) -> bool:
-    """Return whether the table of contents is an inner archive's, so that the file is cut.
+    """Return whether the end of the archive is cut off.
 
-    Its stated place is then wrong, as in a self-extracting archive, which starts with a program.
+    Then `zipfile` may find the complete table of contents of another archive inside this one. The
+    place that this table states is wrong. In a self-extracting archive the place is wrong too, but
+    such a file starts with a program.
     """
     file.seek(0)
     if not _MEMBER.match(file.read(_HEAD)):
@@ -243,7 +252,7 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
             refused.setdefault(_inside(info.filename), str(error))
             continue
         if not info.is_dir() and not is_debris(path):
-            members[path] = info  # of two with the same name, the later counts
+            members[path] = info  # if two files have the same name, the later one counts
     for path, info in members.items():
         target = into / path
         try:
@@ -254,14 +263,14 @@ def _extract(opened: zipfile.ZipFile, into: Path, *, budget: _Budget) -> dict[Pu
                 _copy(packed, file, info, budget=budget, shown=str(path))
         except _TooLarge:
             raise
-        except OSError as error:  # a file where a folder should be, a name that is too long
+        except OSError as error:  # for example, a name that is too long
             _let_through(error)
             reason = f"{quote(str(path))} cannot be written ({error.strerror or _line(error)})"
             refused.setdefault(path, reason)
         except _TROUBLE as error:
             if budget.limits.whole:
                 raise
-            target.unlink(missing_ok=True)  # it may be half written
+            target.unlink(missing_ok=True)  # it may be incomplete
             refused.setdefault(path, _why(error))
     return refused
 
@@ -274,7 +283,7 @@ def _copy(
     budget: _Budget,
     shown: str,
 ) -> None:
-    """Copy a member and count the bytes, because its header may be false."""
+    """Unpack one file and count its bytes, because the size in its header may be false."""
     size = 0
     while chunk := packed.read(_CHUNK):
         size += len(chunk)
@@ -289,7 +298,12 @@ def _copy(
 
 
 def _path(info: zipfile.ZipInfo) -> PurePosixPath:
-    """Return the path of a member below the target folder."""
+    """Return where to write a file, relative to the target folder.
+
+    Raises
+    ------
+    _Refused : the file is a link or a device, or its name is not safe.
+    """
     name = _decoded(info).replace("\\", "/")
     kind = stat.S_IFMT(info.external_attr >> 16)
     if kind == stat.S_IFLNK:
@@ -309,7 +323,7 @@ def _path(info: zipfile.ZipInfo) -> PurePosixPath:
 
 
 def _decoded(info: zipfile.ZipInfo) -> str:
-    """Return the name in the right encoding: macOS packs UTF-8 without declaring it."""
+    """Return the name of a file; macOS packs names in UTF-8 without declaring it."""
     name = info.filename
     if not info.flag_bits & _UTF8_NAME:
         try:
@@ -320,7 +334,7 @@ def _decoded(info: zipfile.ZipInfo) -> str:
 
 
 def _inside(name: str) -> PurePosixPath:
-    """Return the path of a refused member inside the archive, without ways out of it."""
+    """Return the name of a refused file as a path that stays inside the archive."""
     parts = [part for part in name.replace("\\", "/").split("/") if part not in ("", ".", "..")]
     return PurePosixPath(unicodedata.normalize("NFC", "/".join(parts) or "nameless"))
 

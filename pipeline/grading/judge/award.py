@@ -1,4 +1,4 @@
-"""From verdicts to points: required criteria, costs of remarks, rounding to the step."""
+"""Turn verdicts into points: required criteria, costs of flags, rounding to the rubric's step."""
 
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -18,7 +18,7 @@ def award(
     *,
     rubric: Rubric,
 ) -> tuple[Criterion, ...]:
-    """Return the points of the criteria of a rubric, given a verdict on each."""
+    """Return the result of each criterion of a rubric, given the verdicts and flags."""
     done: dict[str, Criterion] = {}
     for wanted in criteria:
         waits_for = (done[p] for p in wanted.requires if p in done)

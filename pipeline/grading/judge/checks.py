@@ -1,4 +1,4 @@
-"""The checks of a rubric: each returns a share of the points and a message."""
+"""The checks of a rubric: each one returns a share of the points and a message."""
 
 from collections.abc import Callable, Mapping
 from decimal import Decimal
@@ -25,11 +25,11 @@ from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.words.numbers import first_few
 
-_NAMED = 4  # at most so many names in a message
+_NAMED = 4  # most numbers or laws that one message names
 
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:
-    """Judge one criterion on its own; `requires` is handled in `award.py`."""
+    """Judge one criterion by itself; `award.py` handles `requires`."""
     return _JUDGES[criterion.check](criterion, work)
 
 
@@ -69,7 +69,10 @@ def _data(_: asked.DataQuality, work: Work) -> Verdict:
 
 
 def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
-    """Judge reported against recomputed parameters; a missing one earns nothing."""
+    """Judge the reported parameters against those from the recordings.
+
+    A missing one earns nothing.
+    """
     table: Mapping[str, Decimal] = getattr(work.reported, criterion.check)
     known: Mapping[str, Reference] = getattr(work.references, criterion.check)
     names = matching(criterion.parameters, work.rubric.names)
@@ -124,7 +127,10 @@ def _deviation(error: Fraction, name: str) -> Deviation:
 
 
 def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
-    """Judge the two tables against each other, within rounding; guessed dampings do not count."""
+    """Judge whether initial and final table agree within their rounding.
+
+    Dampings that the recordings do not give are left out, because students guess them.
+    """
     initial, final = work.reported.initial, work.reported.final
     names = matching(criterion.parameters, work.rubric.names)
     both = [
@@ -151,9 +157,9 @@ def _initial_final(criterion: asked.InitialFinal, work: Work) -> Verdict:
 
 
 def between(initial: Decimal, final: Decimal) -> Fraction:
-    """Return the difference of two typed numbers in percent, beyond the rounding of each.
+    """Return how far two typed numbers differ, in percent, beyond the rounding of each.
 
-    Two negative numbers can agree: a wrong sign is reported elsewhere.
+    Two negative numbers can agree, because another check reports a wrong sign.
     """
     if initial * final <= 0:
         return NO_CREDIT

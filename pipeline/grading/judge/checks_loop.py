@@ -22,7 +22,7 @@ Judged = Callable[[LoopNumbers], tuple[Deviation, ...]]
 
 
 def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
-    """Return the controller and its gains, or the reason why they cannot be judged."""
+    """Return the controller and its gains, or a verdict that says why they cannot be judged."""
     feedback = work.reported.feedback
     if feedback is None or not feedback.gains:
         return Verdict(share=NONE, message="No gains are reported.")
@@ -33,7 +33,12 @@ def _loop(work: Work) -> tuple[Controller, Array] | Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class _Best:
-    """The model on which the gains earn most: the share of the points and the response."""
+    """The response on the model for which the gains earn most, and that share of the points.
+
+    Attributes
+    ----------
+    models : errors of the response on every model.
+    """
 
     share: Fraction
     numbers: LoopNumbers
@@ -53,7 +58,10 @@ def _best(
 
 
 def judge_gains(criterion: asked.Gains, work: Work) -> Verdict:
-    """Judge the gains on the carts against the goal; the best of the models counts."""
+    """Judge the gains by simulation against the design goal.
+
+    The model with the best result counts.
+    """
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop
@@ -100,7 +108,7 @@ def _claimable(numbers: LoopNumbers) -> dict[str, float | None]:
 
 
 def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
-    """Judge the reported overshoot and settling time against a simulation with the gains."""
+    """Judge reported overshoot and settling time against a simulation with the reported gains."""
     loop = _loop(work)
     if isinstance(loop, Verdict):
         return loop
@@ -169,7 +177,10 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
 
 
 def judge_hardware(criterion: asked.Hardware, work: Work) -> Verdict:
-    """Judge the recorded closed loop against its simulation; the best of several runs counts."""
+    """Judge the recorded closed loop against its simulation.
+
+    The run with the best result counts.
+    """
     runs = {e.id for e in work.submission.experiments if e.kind == "closed_loop"}
     if not runs:
         return Verdict(share=NONE, message="No closed-loop run was submitted.")

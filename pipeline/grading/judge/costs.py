@@ -1,4 +1,4 @@
-"""The least cost of a remark: a share of its criterion, set by the rubric for each flag."""
+"""The least cost of a flag: a share of its criterion's points, set by the rubric."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,8 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.words import WORDS
 
-# The check that a remark concerns; for parameters the evidence names the table.
+# The check that each flag concerns. A flag of parameters concerns the check of its table, which its
+# evidence names.
 _ABOUT: Mapping[Code, str] = {
     "initial_final_disagree": "initial_final",
     "wrong_state_space": "state_space",
@@ -21,15 +22,15 @@ _ABOUT: Mapping[Code, str] = {
     "missing": "required",
     "data_problem": "data",
 }
-_REDUCED = "data"  # a table that the students reduced themselves is one of their recordings
+_REDUCED = "data"  # check of recordings; it includes a table that students reduced themselves
 
 
 def charge(
     verdict: Verdict, criterion: asked.Criterion, flags: Sequence[Flag], *, rubric: Rubric
 ) -> Verdict:
-    """Return a verdict reduced by the most expensive remark on its criterion.
+    """Return a verdict reduced by the most expensive flag on its criterion.
 
-    Several remarks on one criterion cost as much as the most expensive one, not their sum.
+    Several flags on one criterion cost as much as the most expensive one, not their sum.
     """
     mine = [flag for flag in flags if concerns(flag, criterion, names=rubric.names)]
     dearest = max(mine, key=lambda flag: rubric.flags.of(flag.code), default=None)
@@ -48,7 +49,12 @@ def charge(
 
 
 def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> bool:
-    """Return whether a remark concerns what a criterion judges."""
+    """Return whether a flag concerns what a criterion judges.
+
+    Parameters
+    ----------
+    names : all parameter names of the rubric's system.
+    """
     if flag.code in _ABOUT:
         return _ABOUT[flag.code] == criterion.check
     tables = {flag.evidence.get("table"), flag.evidence.get("also_in")} - {None}
@@ -60,10 +66,10 @@ def concerns(flag: Flag, criterion: asked.Criterion, *, names: list[str]) -> boo
 
 
 def find_remarks(grade: Grade, criterion: asked.Criterion, rubric: Rubric) -> list[Flag]:
-    """Return the remarks of a grade that concern a criterion."""
+    """Return the flags of a grade that concern a criterion."""
     return [flag for flag in grade.flags if is_about(flag, criterion, rubric)]
 
 
 def is_about(flag: Flag, criterion: asked.Criterion, rubric: Rubric) -> bool:
-    """Return whether a remark concerns a criterion; shared recordings concern no criterion."""
+    """Return whether a flag concerns a criterion; shared recordings concern no criterion."""
     return flag.code != "shared_data" and concerns(flag, criterion, names=rubric.names)

@@ -1,7 +1,7 @@
 """The points of a criterion: its tolerances applied to the errors of its numbers.
 
-Only this file reads tolerances. So stored errors can be weighed again under another rubric with the
-same result as grading again, see `reweigh.py`.
+Only this file reads tolerances. So `reweigh.py` can apply another rubric to stored errors, with the
+same result as grading again.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,8 @@ from pipeline.grading.references.tolerance import credit
 
 ALL, NONE = Fraction(1), Fraction(0)  # shares of the points
 Tolerance = Literal["number", "exact", "damping", "overshoot", "settling"]
-# Keys of a criterion: full points up to the first, none from the second on.
+# For each tolerance, two keys of a criterion: the largest error with full points, and the smallest
+# error without points.
 TOLERANCES: Mapping[Tolerance, tuple[str, str]] = {
     "number": ("full_percent", "none_percent"),
     "exact": ("full_percent", "none_percent"),
@@ -31,8 +32,9 @@ class Deviation:
     Attributes
     ----------
     error : in the unit of the tolerance (percent, or percentage points).
-    by : `exact` is a zero or a one of a state model. It does not count if it is right, and counts
-        like any other number if it is wrong.
+    by : name of the tolerance. `exact` is for a zero or a one of a state model: a right one does
+        not
+        count, because it is no achievement, and a wrong one counts like any other number.
     """
 
     error: Fraction
@@ -40,15 +42,15 @@ class Deviation:
 
 
 def earned_by(criterion: asked.Criterion, deviation: Deviation) -> Fraction:
-    """Return the share of its points that one number earns."""
+    """Return the share of the criterion's points that one number earns."""
     full, none = (getattr(criterion, key) for key in TOLERANCES[deviation.by])
     return credit(deviation.error, full=full, none=none)
 
 
 def earned(criterion: asked.Criterion, deviations: Sequence[Deviation]) -> Fraction:
-    """Return the share that numbers earn together; at least one.
+    """Return the share of the criterion's points that one or more numbers earn together.
 
-    Gains must meet the whole goal, so the worst number counts. Otherwise all count equally.
+    Gains must meet the whole goal, so the worst number counts. In other criteria all count equally.
     """
     shares = [earned_by(criterion, deviation) for deviation in deviations]
     if isinstance(criterion, asked.Gains):
@@ -63,5 +65,5 @@ def earned(criterion: asked.Criterion, deviations: Sequence[Deviation]) -> Fract
 
 
 def mean_share(shares: Sequence[Fraction]) -> Fraction:
-    """Return the mean of some shares; at least one."""
+    """Return the mean of shares; needs at least one."""
     return sum(shares, NONE) / len(shares)

@@ -1,8 +1,11 @@
-"""The laws that a final table obeys, judged over the box of its rounding.
+"""The laws that the parameters of a final table must satisfy, as far as rounding can tell.
 
-Two carts have eight transfer-function parameters for seven physical ones, three carts fifteen for
-ten, so the extra ones must agree. A law holds if the corners of the box lie on both sides of it, or
-one on its right side. All corners are evaluated at once.
+Two carts have eight transfer-function parameters but seven physical ones, three carts fifteen but
+ten. So the extra parameters must agree with the others.
+
+Rounding allows each number an interval, and so the table a box. A law is an equation or an
+inequality. It holds if it is true at one corner of the box, or if its two sides change order
+between corners. All corners are evaluated at once.
 """
 
 from collections.abc import Mapping
@@ -18,18 +21,19 @@ from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
 
-MOST_WIDENING = 4  # in tolerances; a law that still fails is broken
-_PER_TOLERANCE = 2  # steps for widening the box by one tolerance
-_REDUNDANT = (2, 3)  # numbers of carts with redundant parameters
+MOST_WIDENING = 4  # tolerances; a law that fails even in a box this wide is broken
+_PER_TOLERANCE = 2  # steps in which the box is widened by one tolerance
+_REDUNDANT = (2, 3)  # numbers of carts whose parameters are redundant
 
 
 @dataclass(frozen=True, kw_only=True)
 class Law:
-    """One law, and how far the box of the rounding must be widened for it to hold.
+    """One law, and how much the box of rounding must be widened for the law to hold.
 
     Attributes
     ----------
-    widening : 0: it holds within the rounding; 1: within the tolerances; 2: within twice those.
+    meaning : the law in words.
+    widening : in tolerances; 0 if the law holds within rounding.
     """
 
     name: str
@@ -40,7 +44,13 @@ class Law:
 def judge_laws(
     final: Mapping[str, Decimal], *, n: int, frequency_percent: float, damping_percent: float
 ) -> list[Law] | None:
-    """Judge every law of a final table; None if the table is incomplete."""
+    """Judge every law of a final table; None if the table is incomplete.
+
+    Parameters
+    ----------
+    n : number of carts.
+    frequency_percent, damping_percent : tolerances by which the box is widened.
+    """
     names = parameter_names(n)
     if any(name not in final for name in names):
         return None
@@ -73,7 +83,12 @@ def judge_laws(
 def _evaluate(
     final: Mapping[str, Decimal], half: Mapping[str, float], *, n: int
 ) -> dict[str, tuple[str, bool]]:
-    """Return (meaning, whether it holds) of every law, over the corners of a box."""
+    """Return, for each law, its meaning in words and whether it holds in a box.
+
+    Parameters
+    ----------
+    half : by parameter, half the width of the box.
+    """
     results: dict[str, tuple[str, bool]] = {}
     value = {name: float(typed) for name, typed in final.items()}
     for name in parameter_names(n):
@@ -96,7 +111,7 @@ def _evaluate(
             omega = np.sqrt(found.stiffness_terms[cart - 1])
             zeta = found.damping_terms[cart - 1] / (2 * omega)
             for name, numbers in ((f"omega_{cart}", omega), (f"zeta_{cart}", zeta)):
-                real = numbers[np.isfinite(numbers)]  # without those where omega² is negative
+                real = numbers[np.isfinite(numbers)]  # omega² may be negative at some corners
                 low = float(np.min(real, initial=np.inf))
                 high = float(np.max(real, initial=-np.inf))
                 holds = low <= value[name] + half[name] and high >= value[name] - half[name]
@@ -106,7 +121,7 @@ def _evaluate(
 
 
 def _corners(value: Mapping[str, float], half: Mapping[str, float], *, n: int) -> dict[str, Array]:
-    """Return the independent parameters at every corner of the box, each (2^p,)."""
+    """Return the independent parameters at every corner of the box, each with shape (2^p,)."""
     own = [f"{symbol}_{cart}" for symbol in ("omega", "zeta") for cart in range(1, n)]
     names = [name for name in parameter_names(n) if name not in own]
     bits = np.arange(2 ** len(names)) >> np.arange(len(names))[:, None] & 1

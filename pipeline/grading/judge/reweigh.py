@@ -1,8 +1,8 @@
-"""Compute points under another rubric from stored results, without reading recordings.
+"""Compute points under a changed rubric from stored errors, without reading recordings.
 
-A grading keeps the error of each number exactly, as a fraction. The grading code then applies the
-new points, tolerances, costs of remarks, lateness and step. A change of the errors themselves needs
-the recordings: see `needs_recordings`.
+The gradebook stores the error of each number exactly, as a fraction. The usual code then applies
+the new points, tolerances, costs of flags, lateness and step. If the errors themselves change,
+recordings must be graded again; `needs_recordings` finds such changes.
 """
 
 import json
@@ -17,13 +17,16 @@ from pipeline.grading.judge.work import Verdict
 from pipeline.grading.references.tolerance import late_deduction
 from pipeline.grading.rubric import Rubric
 
-# Keys that change what is compared; after such a change the recordings are needed.
+# Keys of a rubric that change the errors themselves. If one changes, the recordings are needed.
 _OF_RUBRIC = ("system", "design", "required", "examples")
 _OF_CRITERION = ("check", "parameters", "sigmas", "frequency_percent", "damping_percent")
 
 
 def findings_text(verdicts: Mapping[str, Verdict]) -> str:
-    """Return the results of the checks as text, by criterion; same results, same bytes."""
+    """Return verdicts by criterion as JSON, without messages.
+
+    The same verdicts give the same bytes.
+    """
     plain = {
         id_: {
             "share": None if verdict.share is None else str(verdict.share),
@@ -36,7 +39,7 @@ def findings_text(verdicts: Mapping[str, Verdict]) -> str:
 
 
 def read_findings(text: str) -> dict[str, Verdict]:
-    """Read results from a `findings_text`, without messages."""
+    """Return the verdicts from a text that `findings_text` made; they have no messages."""
     return {
         id_: Verdict(
             share=None if plain["share"] is None else Fraction(plain["share"]),
@@ -52,10 +55,10 @@ def read_findings(text: str) -> dict[str, Verdict]:
 
 
 def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) -> Grade:
-    """Return the points of a grade under another rubric, before points given by hand.
+    """Return a grade with its points under another rubric, without points given by hand.
 
-    Outcomes and points equal those of grading again; messages are empty. Criteria without stored
-    results are left out.
+    Outcomes and points equal those of grading again, but messages are empty. Criteria without
+    stored verdicts are left out.
     """
     if grade.status == "failed":
         nothing = {"out_of": rubric.out_of, "points": 0.0, "deducted": 0.0, "overrides": ()}
@@ -77,7 +80,7 @@ def reweigh(grade: Grade, findings: Mapping[str, Verdict], *, rubric: Rubric) ->
 
 
 def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
-    """Return a stored result with its share under the criterion's tolerances."""
+    """Return a stored verdict with the share that the criterion's tolerances now give."""
     if not finding.models:
         return Verdict(share=finding.share, message="")
     best = max(earned(wanted, model) for model in finding.models)
@@ -85,10 +88,10 @@ def _weighed(wanted: asked.Criterion, finding: Verdict) -> Verdict:
 
 
 def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
-    """Return the changed keys of a rubric that take effect only by grading again.
+    """Return the changed keys of a rubric that take effect only if recordings are graded again.
 
-    `criteria.ID` is a criterion that was never judged; `criteria.ID.KEY` is one judged by other
-    numbers.
+    `criteria.ID` means a criterion that was never judged. `criteria.ID.KEY` means a criterion for
+    which this key now asks for other errors.
     """
     found = [key for key in _OF_RUBRIC if getattr(before, key) != getattr(now, key)]
     if before.late.due != now.late.due:
@@ -100,7 +103,7 @@ def needs_recordings(before: Rubric, now: Rubric) -> list[str]:
             continue
         was = old[criterion.id]
         for key in _OF_CRITERION:
-            # Only the laws have `damping_percent` and `frequency_percent`.
+            # Only the check of laws has `damping_percent` and `frequency_percent`.
             if getattr(was, key, None) != getattr(criterion, key, None):
                 found.append(f"criteria.{criterion.id}.{key}")
     return found

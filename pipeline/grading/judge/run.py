@@ -1,4 +1,7 @@
-"""Grade one submission by a new analysis of its recordings; its own results are not trusted."""
+"""Grade one submission against a new analysis of its own recordings.
+
+The results that students computed are judged, never used.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -40,7 +43,9 @@ class Graded:
     Attributes
     ----------
     analysis : of the student's recordings; None if the grading failed.
-    verdicts : by criterion, even if a required one was not passed; empty if the grading failed.
+    verdicts : by criterion, including those that earn nothing because a required one was not
+        passed;
+        empty if the grading failed.
     """
 
     grade: Grade
@@ -56,10 +61,11 @@ def grade_submission(
     days_late: float = 0.0,
     progress: Progress = silent,
 ) -> Graded:
-    """Analyse a submission's recordings under the rubric's system and grade what it reports.
+    """Analyse the recordings of a submission and grade what it reports.
 
-    Recordings that cannot be read are flagged. If none can be read, or the number of carts differs
-    from the rubric's, the grade is `failed` with the reason.
+    The analysis uses the rubric's system. Recordings that cannot be read are flagged. If none can
+    be read, or the number of carts differs from the rubric's, the grade is `failed` with the
+    reason.
     """
 
     def failed(reason: str) -> Graded:
@@ -86,9 +92,12 @@ def grade_submission(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysed:
-    """An analysed submission under a rubric's system; `notes` list its replaced settings.
+    """A submission under a rubric's system, with its analysis.
 
-    `springs` : those that the recordings need and the rubric lacks.
+    Attributes
+    ----------
+    springs : those that the recordings need and the rubric lacks.
+    notes : the settings of the submission that the rubric replaced, one sentence each.
     """
 
     submission: Submission
@@ -104,7 +113,7 @@ def analyse_under(
 
     Raises
     ------
-    SubmissionError : no recording can be read, or the number of carts is not the rubric's.
+    SubmissionError : no recording can be read, or the submission has another number of carts.
     """
     count = submission.system.carts
     if count != rubric.system.carts:
@@ -126,11 +135,11 @@ def grade_analysis(
     name: str,
     days_late: float = 0.0,
 ) -> Graded:
-    """Grade a submission against the analysis of its own recordings: a pure function.
+    """Grade a submission against the analysis of its own recordings; neither read nor write files.
 
     Parameters
     ----------
-    submission : under the rubric's system, see `under_rubric`.
+    submission : with the rubric's system; see `under_rubric`.
     """
     work, flags, signed = prepare_work(submission, analysis, rubric=rubric)
     verdicts = {criterion.id: judge(criterion, work) for criterion in rubric.criteria}
@@ -156,7 +165,10 @@ def grade_analysis(
 def prepare_work(
     submission: Submission, analysis: Analysis, *, rubric: Rubric
 ) -> tuple[Work, tuple[Flag, ...], tuple[str, ...]]:
-    """Return the input of the checks, all flags in the order of their codes, and notes."""
+    """Return the input of the checks, all flags in the order of their codes, and notes.
+
+    The notes say where a reported sign was reversed, because the recordings have the opposite sign.
+    """
     reported, signed = turned_round(submission.reported or Reported(), analysis.records)
     submission = submission.model_copy(update={"reported": reported})
     work, told = _prepare(submission, analysis, rubric=rubric)
@@ -205,10 +217,11 @@ def _prepare(
 
 
 def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tuple[str, ...]]:
-    """Replace a submission's system by the rubric's; return it with notes.
+    """Return a submission with the rubric's system, and notes on what was replaced.
 
-    A sign or calibration that the rubric leaves open stays the submission's. A different unit of
-    length is kept, because the students' numbers use it, and the calibration is converted.
+    If the rubric leaves the sign or the calibration open, those of the submission stay. Another
+    unit of length also stays, because the students' numbers use it; the rubric's calibration is
+    converted.
     """
     own, set_ = submission.system, rubric.system
     notes = []
@@ -218,7 +231,8 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
         unit = own.position.unit
         per_count = None if per_count is None else per_count * factor
         notes.append(f"lengths are in {unit}, as submitted; the rubric has {set_.position.unit}")
-    if own.springs != set_.springs and set_.carts > 1:  # one cart has one stiffness
+    # On one cart only the sum of the springs matters.
+    if own.springs != set_.springs and set_.carts > 1:
         notes.append("the springs are the rubric's, not those of the submission")
     system = System(
         carts=set_.carts,
@@ -247,8 +261,8 @@ def under_rubric(submission: Submission, rubric: Rubric) -> tuple[Submission, tu
 def _under_calibration(experiment: Experiment, system: System) -> Experiment:
     """Return the experiment without its own input scale if the rubric states one.
 
-    Under feedback a bench may log another signal as its input, so such a run keeps its scale.
-    The data decide between its own sign and the rubric's, as everywhere.
+    A closed-loop run keeps its scale, because under feedback a bench may log another signal as its
+    input. The experiment's own sign stays too; the analysis checks it against the data.
     """
     own = experiment.input
     if own is None or experiment.kind == "closed_loop" or not system.input.per_count:
@@ -262,8 +276,8 @@ def _under_calibration(experiment: Experiment, system: System) -> Experiment:
 def _flags(work: Work) -> list[Flag]:
     """Return the flags that do not concern the parameter tables.
 
-    On a nonlinear bench no single chain fits the table, and results depend on the method. Then only
-    numbers that no chain can have are wrong.
+    On a nonlinear bench no single chain fits the table, and the results depend on the method. Then
+    only numbers that no chain can have are called wrong.
     """
     flags, space, linear = [], work.reported.state_space, is_linear(work.analysis)
     if space is not None and space.A:

@@ -1,4 +1,4 @@
-"""The input of the checks, and their verdicts."""
+"""The input of the checks, and their results (verdicts)."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,8 +24,10 @@ class Work:
 
     Attributes
     ----------
+    references : the parameters from the recordings, with bounds.
+    controller : the reported controller, with the models to simulate it on.
     state_models : acceptable values of [A B].
-    bad : runs with something wrong in them, each with its problem.
+    bad : recordings with a problem, and the problem of each.
     named : by table, the numbers that a known mistake explains.
     """
 
@@ -45,7 +47,7 @@ class Work:
 
     @cached_property
     def entries(self) -> list[MatrixEntry]:
-        """The entries of A and B with their acceptable values; empty without A and B."""
+        """The reported entries of A and B with their acceptable values; empty without A and B."""
         space = self.reported.state_space
         n = self.rubric.system.carts
         return compare_entries(space, models=self.state_models, n=n) if space and space.A else []
@@ -58,15 +60,18 @@ class Work:
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """The share of the points; None if nothing could be judged (`message` says why).
+    """The result of a check: a share of the points and a message.
 
     Attributes
     ----------
-    explained : a known mistake explains all lost points, and its flag replaces advice.
-    models : errors of the numbers on each acceptable model, of which the best counts; empty if no
-        tolerance decides.
-    most : the largest share that can be kept, whatever the tolerances.
-    agrees : for each number judged on its own, whether it loses no points.
+    share : None if nothing could be judged; then `message` says why.
+    explained : a known mistake explains all lost points, so that its flag replaces the rubric's
+        advice.
+    models : for each acceptable model, the errors of the numbers; the best model counts. Empty if
+        the
+        share does not depend on tolerances.
+    most : the largest possible share, whatever the tolerances.
+    agrees : for each number that is judged alone, whether it loses no points.
     """
 
     share: Fraction | None
@@ -81,26 +86,29 @@ class Verdict:
 
 # --------------------------------------------------------------------- required items
 
-# Acceptable substitutes: a step's ring-down for a decay, a reduced table for all dwells.
+# Kinds of recording that satisfy a requirement for single carts: a step rings down like a decay.
 _SERVES = {"decay": ("decay", "step"), "sine": ("sine",), "step": ("step",)}
 
 
 def asked_pieces(rubric: Rubric) -> list[str]:
-    """Return the names of all items that a rubric requires."""
+    """Return the names of all items that a rubric requires, such as recordings and parameters."""
     return list(_pieces(None, rubric))
 
 
 def missing_pieces(
     submission: Submission, rubric: Rubric, *, unreadable: Collection[str]
 ) -> list[str]:
-    """Return the names of the missing items; an unreadable experiment counts as missing."""
+    """Return the names of the required items that are missing.
+
+    An experiment whose file cannot be read counts as missing.
+    """
     left = tuple(e for e in submission.experiments if e.id not in unreadable)
     submission = submission.model_copy(update={"experiments": left})
     return [name for name, there in _pieces(submission, rubric).items() if not there]
 
 
 def missing_flag(missing: list[str]) -> Flag:
-    """Return the flag for what is missing."""
+    """Return the flag for missing items."""
     return Flag(
         code="missing",
         parameters=tuple(missing),
@@ -110,7 +118,7 @@ def missing_flag(missing: list[str]) -> Flag:
 
 
 def data_flag(bad: Mapping[str, str]) -> Flag:
-    """Return the flag for the runs with something wrong in them."""
+    """Return the flag for recordings with a problem."""
     first, problem = next(iter(bad.items()))
     others = len(bad) - 1
     have = "run has" if others == 1 else "runs have"

@@ -1,1 +1,1 @@
-"""Find the mistakes behind wrong numbers in tables, model, controller and recordings."""
+"""Find the mistakes that explain wrong numbers in tables, models, controllers and recordings."""

@@ -1,4 +1,4 @@
-"""The known mistakes, applied to the student's own data to predict every number."""
+"""The known mistakes: predict the numbers that each gives on the student's own recordings."""
 
 import itertools
 import math
@@ -27,21 +27,23 @@ Numbers = Mapping[str, Reference]
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """One or two mistakes, and the numbers of a table that they produce.
+    """One mistake or two at once, and the numbers of a table that they would give.
 
     Attributes
     ----------
-    said : the sentences of advice, by their keys in `words`.
-    predicted : by parameter name; the bounds of the mistaken number.
+    codes : of the flags.
+    said : keys of the sentences of advice, in `words`.
+    predicted : by parameter name, the bounds of the mistaken number.
     tolerance : relative, around those bounds.
-    periods : counted, and true.
-    whole : it is believed only if all reported numbers match its predictions.
-    least : it is believed only if it explains so many numbers.
-    table_wide : if believed, it also explains every other wrong number of the table.
+    periods : the number counted, and the true one.
+    whole : credible only if all reported numbers match its predictions.
+    least : credible only if it explains at least this many numbers.
+    table_wide : it also explains every other wrong number of the table.
     tries : number of variants tried; more variants match more easily by chance.
-    beside : numbers that must be right for this mistake.
-    from_time_records : it comes from reading a decay or a step, so a final table can have it only
-        if it was copied from the initial one.
+    beside : numbers that must be right for this mistake to be credible.
+    from_time_records : it comes from reading a decay or a step, so it is in a final table only if
+        that
+        was copied from the initial one.
     """
 
     codes: tuple[Code, ...]
@@ -57,23 +59,35 @@ class Mistake:
     from_time_records: bool = False
 
     def help(self, typed: Decimal, reference: Reference) -> str:
-        """Return the advice for one number."""
+        """Return the advice about one number.
+
+        Parameters
+        ----------
+        typed : the reported number.
+        reference : the number from the recordings.
+        """
         counted, there = self.periods
         recomputed = f"{reference.value:.4g}"
         values = {"reported": as_typed(typed), "recomputed": recomputed}
         return "".join(WORDS.text(key, counted=counted, there=there, **values) for key in self.said)
 
     def together_with(self, code: Code, said: str, predicted: dict[str, Reference]) -> "Mistake":
-        """Return this mistake with another one made on top of it."""
+        """Return both mistakes as one: this one, and another made on top of it.
+
+        Parameters
+        ----------
+        predicted : the numbers that both together give.
+        """
         codes, sentences = (*self.codes, code), (*self.said, said)
         return replace(self, codes=codes, said=sentences, predicted=predicted)
 
 
 def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
-    """Return whether a damping can show a log10 mistake; with friction only by the final value.
+    """Return whether a damping can show that log10 was taken instead of ln.
 
-    With friction the reference is so wide that any ratio occurs. A final value that agrees with the
-    initial one excludes a wrong logarithm of the decay.
+    Without friction it always can. With friction the bounds of the reference are so wide that any
+    ratio fits; then the final value decides. If it agrees with the initial one, the logarithm was
+    right.
     """
     if reference.high <= limits.BLURRED_DAMPING * reference.low:
         return True
@@ -82,7 +96,7 @@ def _may_be_log10(name: str, reference: Reference, reported: Reported) -> bool:
 
 
 def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) -> list[Mistake]:
-    """Return every mistake that can be tried on a table, single ones before combined ones."""
+    """Return all mistakes that can be tried on a table, single ones before combined ones."""
     of = _groups(references, reported)
     gains, omegas, zetas = of["gains"], of["own frequencies"], of["own dampings"]
     hertz = _by_factor(of, "frequencies", "all frequencies")
@@ -109,7 +123,7 @@ def known_mistakes(references: Numbers, analysis: Analysis, reported: Reported) 
 
 
 def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Reference]]:
-    """Return the numbers of a table in the groups in which mistakes are made."""
+    """Return the numbers of a table in groups; a typical mistake affects all numbers of a group."""
     read = {name: read_name(name) for name in references}
     sure = {n for n, r in references.items() if 0 < r.high <= limits.VAGUE * r.low}
     frequencies = {n: r for n, r in references.items() if read[n].is_frequency and r.low > 0}
@@ -130,17 +144,18 @@ def _groups(references: Numbers, reported: Reported) -> dict[str, dict[str, Refe
         "sharp gains": {n: r for n, r in gains.items() if r.within(limits.SHARP)},
         "all dampings": dampings,
         "own dampings": own,
-        "dampings": dampings if shows_log10 else {},  # including vague ones
+        "dampings": dampings if shows_log10 else {},  # including those with wide bounds
         "sharp dampings": {n: r for n, r in own.items() if r.within(limits.SHARP)},
     }
 
 
 def _by_factor(of: Mapping[str, Numbers], *groups: Of) -> list[Mistake]:
-    """Return the mistakes of the table of factors in some groups of numbers."""
+    """Return the mistakes of the table `FACTORS` that apply to some groups of numbers."""
     found = []
     for row in [row for row in FACTORS if row.of in groups]:
         numbers = of[row.of]
-        # A decrement belongs to one decay and can be wrong while its frequency is right.
+        # A decrement comes from one decay. It can be wrong while the frequency of that decay is
+        # right.
         alone = row.of == "sharp dampings"
         for some in [{n: r} for n, r in numbers.items()] if alone else [numbers]:
             beside = [n for n in of["own frequencies"] if alone and _damping(n) in some]
@@ -170,7 +185,11 @@ def _times(references: Numbers, factor: float) -> dict[str, Reference]:
 
 
 def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator[Mistake]:
-    """One period too many or too few: ω is wrong by their ratio, a decrement by its inverse."""
+    """Yield mistakes in counting periods: one too many or too few.
+
+    The frequency is then wrong by the ratio of counted to true periods, the decrement by the
+    inverse.
+    """
     for counted, there in _COUNTS:
         fast = _times(omegas, counted / there)
         damped = {n: _miscounted_damping(r, there / counted) for n, r in every_zeta.items()}
@@ -199,12 +218,18 @@ def _miscounts(omegas: Numbers, zetas: Numbers, every_zeta: Numbers) -> Iterator
 
 
 def _with_slack(zeta: Reference) -> Reference:
-    """Return a damping with its tolerance added to its bounds, for use with sharper numbers."""
+    """Return a damping with bounds widened by its tolerance.
+
+    It can then be combined with numbers that need a closer match.
+    """
     return zeta.widened(1 + limits.DAMPING)
 
 
 def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
-    """Return the bounds of a miscounted damping, up to the midpoint to the right one."""
+    """Return the bounds of a damping from miscounted periods.
+
+    They end halfway to the right damping, so that a right number does not match.
+    """
     mistaken, middle = _with_slack(zeta.times(factor)), zeta.times(math.sqrt(factor))
     if factor < 1:
         return replace(mistaken, high=middle.high)
@@ -212,7 +237,7 @@ def _miscounted_damping(zeta: Reference, factor: float) -> Reference:
 
 
 def _miscount_and(miscount: Mistake, omegas: Numbers, zetas: Numbers) -> Iterator[Mistake]:
-    """A miscount in Hz, or one whose decrement was taken with log10."""
+    """Yield a miscount combined with a second mistake: frequency in Hz or decrement with log10."""
     omega = {n: r for n, r in miscount.predicted.items() if n in omegas}
     zeta = {n: r for n, r in miscount.predicted.items() if n in zetas}
     if omega:
@@ -243,7 +268,10 @@ def _gain_mistakes(gains: Numbers, analysis: Analysis) -> Iterator[Mistake]:
 
 
 def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
-    """Yield the peaks of one edge or of all, for every cart, because a step moves all carts."""
+    """Yield peaks of steps that were read as settled levels: of one edge, or the mean of all edges.
+
+    A step moves all carts, so the mistake is predicted for every cart.
+    """
     edges = set.intersection(*({*t.by_edge} for t in turns.values())) if turns else set()
     peaks = [{n: t.peak(edge) for n, t in turns.items()} for edge in sorted(edges)]
     peaks.append({n: peak for n, t in turns.items() if (peak := t.mean_peak()) is not None})
@@ -260,7 +288,7 @@ def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
 
 
 def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistake]:
-    """Yield the next turning points of the carts after the peak of one edge."""
+    """Yield later turning points of steps that were read as settled levels."""
     edges = {edge for one in turns.values() for edge in one.by_edge}
     for edge, turn in itertools.product(sorted(edges), (1, 2)):
         later = {n: e for n, t in turns.items() if (e := t.turn(edge, turn)) is not None}
@@ -277,15 +305,15 @@ def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistak
 
 
 def _count(name: str, analysis: Analysis) -> float:
-    """Return the encoder step of the gain's cart in position units; 0 if it is not known."""
+    """Return the encoder step of a gain's cart in position units; 0 if it is not known."""
     cart = read_name(name).cart or 1
     steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
     step = float(np.median(steps)) if steps else 0.0
-    return 0.0 if step == 1.0 else step  # positions in counts
+    return 0.0 if step == 1.0 else step  # positions are in counts
 
 
 def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:
-    """Yield the other gain mistakes, read in counts."""
+    """Yield the mistakes in reading gains, combined with positions in counts."""
     counted = [m for m in mistakes if m.codes == ("counts_for_length",)]
     twice = next(m for m in mistakes if m.codes == ("peak_to_peak",))
     for mistake in mistakes if counted else ():
@@ -312,7 +340,12 @@ def _permutations(names: Sequence[str]) -> Iterator[dict[str, str]]:
 
 
 def _swaps(references: Numbers, dampings: Numbers | None = None) -> Iterator[Mistake]:
-    """Yield every wrong order of the carts; frequencies may be swapped with their dampings."""
+    """Yield every wrong order of the carts for a group of numbers.
+
+    Parameters
+    ----------
+    dampings : if given, each damping is swapped together with its frequency.
+    """
     for source in _permutations(list(references)):
         moved = {name: other for name, other in source.items() if name != other}
         predicted = {name: references[other] for name, other in moved.items()}
@@ -333,7 +366,7 @@ def _damping(omega: str) -> str:
 
 
 def _swapped(mistakes: Sequence[Mistake], references: Numbers) -> Iterator[Mistake]:
-    """Yield each mistake on swapped carts."""
+    """Yield each mistake combined with swapped carts."""
     for mistake in mistakes:
         if mistake.codes == ("transient_used",) or not set(references) <= set(mistake.predicted):
             continue

@@ -1,4 +1,7 @@
-"""Judge the reported controller: gains, claims and prefilter (1 / DC gain)."""
+"""Diagnose the reported controller: gains, claims and prefilter.
+
+A right prefilter is the reciprocal of the loop's static gain.
+"""
 
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,13 +35,15 @@ class Controller:
     Attributes
     ----------
     gains : (2n,) as reported; None if not reported.
-    ran : (2n,) gains stated for a closed-loop run, if any.
-    models : the reference chain and the student's own.
-    goal : to be met; if neither a reference design nor these gains do, what that design reaches.
-    blurred : friction makes the reference's gains uncertain.
-    doubt : relative error of the prefilter due to errors of the models.
-    reference : the chain from the recordings, the first of the models; None without one.
+    ran : (2n,) gains that a closed-loop run states; None if no run does.
+    models : the carts on which gains are simulated: the reference, and the student's own tables.
+    goal : of the design; if both the reference design and these gains miss it, the easier goal that
+        the
+        reference design reaches.
+    blurred : friction makes the gains of the reference uncertain.
     own : the student's table is complete, so that their own model is known.
+    reference : the carts from the recordings, first of the models; None if not identified.
+    doubt : relative error of the prefilter that errors of the models can cause.
     """
 
     gains: Array | None
@@ -54,12 +59,12 @@ class Controller:
     doubt: float = 0.0
 
     def numbers(self, gains: Array) -> list[LoopNumbers]:
-        """Return the loop that gains give on each of the models."""
+        """Return the simulated loop of some gains on each model."""
         found = [self._on(chain, gains) for chain in self.models]
         return [numbers for numbers in found if numbers is not None]
 
     def runaway(self, gains: Array) -> LoopNumbers | None:
-        """Return the loop on the recorded carts if it is clearly unstable.
+        """Return the loop on the carts from the recordings, if it is clearly unstable.
 
         Growth by less than a factor e within the required settling time may be a model error.
         """
@@ -91,7 +96,13 @@ class Controller:
         overshoot: float = limits.OVERSHOOT,
         settling: float = limits.SETTLING,
     ) -> bool:
-        """Return whether a loop is near enough to the goal, by default not to be called wrong."""
+        """Return whether a loop nearly meets the goal; by default, so well that it is not wrong.
+
+        Parameters
+        ----------
+        overshoot : allowed excess, in percentage points.
+        settling : allowed factor on the settling time.
+        """
         return (
             numbers.stable
             and numbers.overshoot <= self.goal.overshoot_percent + overshoot
@@ -100,7 +111,7 @@ class Controller:
         )
 
     def is_claimed(self, numbers: LoopNumbers) -> bool:
-        """Return whether a loop behaves about as reported."""
+        """Return whether a loop behaves about as the student claims."""
         if self.overshoot is not None and not (
             abs(numbers.overshoot - float(self.overshoot)) <= limits.CLAIM_OVERSHOOT
         ):
@@ -112,16 +123,22 @@ class Controller:
         return ratio is not None and 1 / limits.CLAIM_SETTLING <= ratio <= limits.CLAIM_SETTLING
 
     def is_of_other_gains(self, numbers: LoopNumbers) -> bool:
-        """Return whether the settling time differs so much that other gains are meant."""
+        """Return whether the claimed settling time must be that of other gains.
+
+        It then differs from the simulated one by more than a factor of 2.5.
+        """
         if self.settling is None or self.settling <= 0 or numbers.settling_time is None:
             return False
         ratio = numbers.settling_time / float(self.settling)
-        return max(ratio, 1 / ratio) > 2.5  # whatever the prefilter
+        return max(ratio, 1 / ratio) > 2.5  # settling time does not depend on the prefilter
 
     def prefilter_fits(self, numbers: LoopNumbers, *, sharp: bool = False) -> bool:
         """Return whether the reported prefilter is the reciprocal of this loop's static gain.
 
-        `sharp`: the student's own numbers are more precise than recordings with friction.
+        Parameters
+        ----------
+        sharp : use the close tolerance even with friction, because the student's own numbers are
+            precise.
         """
         if self.prefilter is None:
             return True
@@ -141,7 +158,7 @@ def reported_controller(
 
     Parameters
     ----------
-    chain : the reference, if there is one.
+    chain : the carts from the recordings, if they were identified.
     tables : the student's final table, as typed and with its known mistakes corrected.
     """
     feedback = submission.reported.feedback if submission.reported else None
@@ -174,9 +191,10 @@ def reported_controller(
 
 
 def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -> float:
-    """Return the relative error of a prefilter due to errors of the fitted or typed models.
+    """Return the relative error of a prefilter that errors of the models can cause.
 
-    Gains that cancel much of the plant's stiffness amplify these errors.
+    The models have errors of fitting or of typed digits. Gains that cancel much of the springs'
+    stiffness amplify these errors.
     """
     chain, gains, cart = controller.models[0], controller.gains, controller.goal.cart
     if gains is None or gains.size != 2 * chain.n:
@@ -192,14 +210,14 @@ def _doubt(controller: Controller, submission: Submission, analysis: Analysis) -
 
 
 def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> float:
-    """Return how far the rounding of a typed table moves the prefilter on its own carts."""
+    """Return the relative change of the prefilter that the rounding of a typed table can cause."""
     values = {name: float(value) for name, value in typed.items()}
 
     def level(table: Mapping[str, float]) -> float:
         chain = own_chain(table, n=gains.size // 2)
         try:
             return np.nan if chain is None else float(static_levels(chain, gains)[cart - 1])
-        except np.linalg.LinAlgError:  # the gains cancel all stiffness: there is no static level
+        except np.linalg.LinAlgError:  # the gains cancel all stiffness, so there is no static level
             return np.nan
 
     half = {name: float(rounding(value)) for name, value in typed.items()}
@@ -209,7 +227,7 @@ def _by_rounding(typed: Mapping[str, Decimal], gains: Array, *, cart: int) -> fl
 
 
 def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Design:
-    """Return the goal or, if the reference design misses it, what that design reaches."""
+    """Return the goal, or the easier one that the reference design reaches if it misses it."""
     try:
         design = reference_design(submission, analysis.fit)
     except DataError:
@@ -228,7 +246,10 @@ def _reachable(goal: Design, submission: Submission, analysis: Analysis) -> Desi
 
 
 def diagnose_controller(controller: Controller) -> list[Flag]:
-    """Return the flags of the gains and of the prefilter; a wrong gain excuses its prefilter."""
+    """Return the flags of the gains and of the prefilter.
+
+    A prefilter is not flagged if it fits the gains that the student probably meant.
+    """
     if controller.gains is None:
         return []
     numbers = controller.numbers(controller.gains)
@@ -238,11 +259,11 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
     fits = any(controller.prefilter_fits(one) for one in numbers)
     meets = any(controller.meets(one) for one in numbers)
     claimed = any(controller.is_claimed(one) for one in numbers)
-    # Gains that reach the goal and match the claims are the intended ones.
+    # Gains that meet the goal and match the claims are those that the student meant.
     told = controller.overshoot is not None or controller.settling is not None
     slip, intended = ("", None) if meets and told and claimed else _slip(controller)
     ran = controller.ran
-    # The gains of the run show which reported number does not fit the others.
+    # If other gains ran on the bench, they show which reported number does not fit the others.
     other_ran = ran is not None and not same_gains(ran, controller.gains)
     sharply = any(controller.prefilter_fits(one, sharp=True) for one in numbers)
     wrong = not meets or (slip and not (fits and claimed)) or (not claimed and not sharply)
@@ -260,14 +281,17 @@ def diagnose_controller(controller: Controller) -> list[Flag]:
         fits = fits or not known or any(controller.prefilter_fits(one) for one in known)
     if not fits and controller.prefilter is not None:
         slip = _prefilter_slip(controller, numbers[0].prefilter)
-        # Gains that are right on the student's own carts may be wrong on the reference's.
+        # Without the student's own carts, a misfit may only be a difference between models.
         if controller.own or slip:
             flags.append(_prefilter_flag(controller, numbers[0], slip=slip))
     return flags
 
 
 def same_gains(a: Array, b: Array) -> bool:
-    """Return whether two sets of gains are equal, apart from the number of typed digits."""
+    """Return whether two sets of gains are equal within 2 % of the largest gain of their kind.
+
+    The two kinds are gains of positions and gains of velocities.
+    """
     if a.shape != b.shape:
         return False
     scale = np.empty_like(a)
@@ -277,7 +301,10 @@ def same_gains(a: Array, b: Array) -> bool:
 
 
 def _slip(controller: Controller) -> tuple[str, Array | None]:
-    """Return the known mistake whose correction makes the gains right, and those gains; or ""."""
+    """Return the known mistake whose correction makes the gains right, and the corrected gains.
+
+    Returns ("", None) if there is no such mistake.
+    """
     gains = controller.gains
     assert gains is not None
     for text, meant in _undone(gains):
@@ -298,7 +325,10 @@ def _slip(controller: Controller) -> tuple[str, Array | None]:
 
 
 def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
-    """Yield (mistake in words, corrected gains), only if that changes the gains."""
+    """Yield each known mistake in words, with the gains that correct it.
+
+    Mistakes whose correction changes nothing are left out.
+    """
     n = gains.size // 2
     pairs = gains.reshape(n, 2)
     found = [(WORDS.text("all_signs"), -gains)]
@@ -317,7 +347,7 @@ def _undone(gains: Array) -> Iterator[tuple[str, Array]]:
 
 
 def does(numbers: LoopNumbers) -> str:
-    """Return the response of a loop, in words."""
+    """Return the response of a loop in words: unstable, or its overshoot and settling time."""
     if not numbers.stable:
         return WORDS.text("unstable")
     seconds = numbers.settling_time
@@ -360,7 +390,7 @@ def _gains_flag(
 
 
 def _prefilter_slip(controller: Controller, right: float) -> str:
-    """Return the known mistake that gives the reported prefilter, or ""."""
+    """Return the known mistake that gives the reported prefilter, in words, or ""."""
     typed = controller.prefilter
     assert typed is not None
     for text, value in _prefilter_slips(controller, right):

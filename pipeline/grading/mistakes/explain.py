@@ -1,4 +1,4 @@
-"""Find the most likely mistakes behind the numbers of a table, if they are likely enough."""
+"""Find the mistakes that most likely explain the numbers of a table, if they are likely enough."""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -14,8 +14,8 @@ from pipeline.grading.references.tolerance import Typed
 from pipeline.names import read_name
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
-# With little damping a step peaks at twice its level, the same as a peak-to-peak mistake. For a
-# first estimate the statement that the step peaks there is then true in any case.
+# With little damping a step peaks at twice its level, so this mistake and peak-to-peak give the
+# same number. For a first estimate, the sentence about the peak of the step is true in both cases.
 _TRUE_ANYWAY: Code = "peak_for_steady_state"
 
 Table = Mapping[str, Decimal]
@@ -24,7 +24,12 @@ Label = Literal["initial", "final"]
 
 @dataclass(frozen=True, kw_only=True)
 class ExplainedNumbers:
-    """Numbers of one table that a mistake explains; `rival` explains them equally well."""
+    """Numbers of one table that a mistake explains.
+
+    Attributes
+    ----------
+    rival : another mistake that explains them equally well, or None.
+    """
 
     mistake: Mistake
     table: Label
@@ -34,7 +39,12 @@ class ExplainedNumbers:
 
 @dataclass(frozen=True, kw_only=True)
 class Explanation:
-    """The mistakes found, and the numbers that no single mistake explains."""
+    """The mistakes found in a table.
+
+    Attributes
+    ----------
+    left : wrong numbers that no mistake explains.
+    """
 
     explained: tuple[ExplainedNumbers, ...]
     left: tuple[str, ...]
@@ -54,9 +64,16 @@ def explain(
     label: Label,
     believed: frozenset[Code] = frozenset(),
 ) -> Explanation:
-    """Find the mistakes that make the whole table most likely; `believed` ones cost nothing.
+    """Find the mistakes that make the whole table most likely.
 
     If other mistakes make it about as likely, no mistake is named.
+
+    Parameters
+    ----------
+    known : by parameter, the number from the recordings.
+    off : parameters with a wrong number.
+    mistakes : those to try.
+    believed : codes of mistakes that cost no likelihood, because the other table has them.
     """
     typed = {name: Typed.of(number) for name, number in table.items()}
     ways = _by_way([_Tried.on(m, typed, label) for m in mistakes if not m.beside.intersection(off)])
@@ -76,7 +93,8 @@ def explain(
             for c in covers
             if not best.codes <= c.codes
             and best.explained & c.explained
-            and score[id(c)] > score[id(best)] - 2  # e-folds; a less likely one is out
+            # E-folds; a mistake less likely than this is no rival.
+            and score[id(c)] > score[id(best)] - 2
         ]
         rival = None
         shared = frozenset.intersection(best.codes, *(c.codes for c in rivals))
@@ -84,7 +102,7 @@ def explain(
         less = [c for c in rivals if c.codes <= shared]
         if rivals and len(supported) == 1:
             best, rivals = supported[0], []
-        elif less:  # certain of one mistake, but not of the other
+        elif less:  # one mistake is certain, the other is not
             best, rivals = less[0], []
         if rivals and label == "initial":
             true = [c for c in (best, *rivals) if _TRUE_ANYWAY in c.codes]
@@ -108,7 +126,12 @@ def explain(
 
 @dataclass(frozen=True, kw_only=True)
 class _Cover:
-    """The numbers that some codes explain, each by one mistake."""
+    """The numbers that one mistake or combination of mistakes explains.
+
+    Attributes
+    ----------
+    fits : variants of the mistake, each with the numbers that it explains.
+    """
 
     codes: frozenset[Code]
     fits: tuple[tuple[Mistake, list[str]], ...]
@@ -121,7 +144,12 @@ class _Cover:
 
 @dataclass(frozen=True, kw_only=True)
 class _Tried:
-    """A mistake compared with a table: the error of each number against its prediction, percent."""
+    """A mistake compared with a table.
+
+    Attributes
+    ----------
+    errors : by parameter, the difference between table and prediction, in percent.
+    """
 
     mistake: Mistake
     label: Label
@@ -137,9 +165,10 @@ class _Tried:
         return cls(mistake=mistake, label=label, errors=errors)
 
     def explains(self, remaining: Sequence[str]) -> list[str]:
-        """Return the remaining numbers that it reproduces, if it can be believed.
+        """Return the remaining wrong numbers that the mistake gives, if it is credible.
 
-        Half of them must match; the others may differ as much as honest numbers do.
+        At least half of the numbers near its predictions must match. The others may differ as much
+        as honest numbers do.
         """
         mistake = self.mistake
         met = [name for name in self.errors if self.off_by(name) <= 1]
@@ -149,22 +178,23 @@ class _Tried:
         if mistake.whole and len(near) < len(self.errors):
             return []
         wrong = [name for name in remaining if name in near]
-        # If carts are swapped, both numbers are wrong, not only close to the other's.
+        # If carts are swapped, both numbers are wrong. One number that is near the other cart's is
+        # no swap.
         return [] if "carts_swapped" in mistake.codes and len(wrong) < mistake.least else wrong
 
     def off_by(self, name: str) -> float:
-        """Return the error of a number relative to its tolerance."""
+        """Return the error of a number as a multiple of its tolerance."""
         return self.errors[name] / (100 * self.mistake.tolerance)
 
     def _is_near(self, name: str) -> bool:
-        """Return whether the error of a number is within that of honest numbers."""
+        """Return whether a number differs from its prediction no more than honest numbers do."""
         by_eye = self.label == "initial" and read_name(name).is_by_eye
         limit = limits.NEAR_BY_EYE if by_eye else limits.NEAR
         return not read_name(name).is_damping and self.errors[name] <= 100 * limit
 
 
 def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
-    """Group mistakes of the same kind that concern different numbers."""
+    """Group variants of the same mistake, which concern different numbers."""
     ways: dict[tuple, list[_Tried]] = {}
     for one in tried:
         ways.setdefault((one.mistake.said, one.mistake.periods), []).append(one)
@@ -172,7 +202,10 @@ def _by_way(tried: Sequence[_Tried]) -> list[list[_Tried]]:
 
 
 def _cover(way: Sequence[_Tried], remaining: Sequence[str]) -> _Cover:
-    """Explain numbers by one kind of mistake, trying those first that explain the most."""
+    """Explain as many numbers as possible by one mistake.
+
+    The variant that explains most comes first.
+    """
     fits: list[tuple[Mistake, list[str]]] = []
     open_ = list(remaining)
     while tried := [(one, names) for one in way if (names := one.explains(open_))]:
@@ -194,12 +227,19 @@ def _score(
     off: Collection[str],
     free: Collection[Code],
 ) -> float:
-    """Return the log likelihood of some mistakes together with the table that they give."""
+    """Return the log likelihood of the table and of the mistakes that explain it.
+
+    Parameters
+    ----------
+    off : parameters with a wrong number.
+    free : codes of mistakes that cost no likelihood.
+    """
     predicted: dict[str, Reference] = dict(known)
     for mistake, names in reversed(cover.fits):
         touched = [n for n in mistake.predicted if n in table] if mistake.whole else names
         predicted |= {n: mistake.predicted[n] for n in touched}
-    # A wrong number is not an honest one; a mistake of the whole table can produce any number.
+    # A wrong number without explanation is unlikely, unless a mistake of the whole table explains
+    # it.
     wide = any(m.table_wide for m, _ in cover.fits)
     unexplained = -math.log(limits.ANYWHERE) - (0.0 if wide else _SLIP)
     told = sum(
@@ -214,10 +254,11 @@ def _score(
 
 
 def _log_density(typed: Typed, reference: Reference, name: str) -> float:
-    """Return the log density of ln(number), at least that of a number anywhere.
+    """Return the log density of the logarithm of a number, given what is known about it.
 
-    The density is uniform between the bounds, widened by rounding, with Cauchy tails outside,
-    because some numbers are read far worse than most.
+    The density is uniform between the bounds, widened by rounding. Outside it has Cauchy tails,
+    because some numbers are read far worse than most. It is never lower than for an unexplained
+    wrong number.
     """
     half, value = typed.hidden, typed.value
     low, high = reference.low, reference.high
@@ -231,7 +272,7 @@ def _log_density(typed: Typed, reference: Reference, name: str) -> float:
         usual = limits.USUAL_DAMPING
     elif read.is_by_eye:
         usual = limits.USUAL_BY_EYE
-    # The number in the mistake had as many digits.
+    # The student's intermediate results probably had the same number of digits.
     digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)
     outside = max(math.log(low / value), math.log(value / high)) - half

@@ -1,6 +1,7 @@
-"""A table of mistakes that multiply a number by one factor; a new mistake is a row here.
+"""A table of mistakes that multiply a number by a factor. Add a row for a new mistake.
 
-Its code is in `pipeline/grading/grade.py`, its sentences are in `templates/words/grading.toml`.
+The code of the mistake is in `pipeline/grading/grade.py`, its sentences are in
+`templates/words/grading.toml`.
 """
 
 import math
@@ -12,17 +13,18 @@ from pipeline.grading.grade import Code
 
 TURN = 2 * math.pi
 LOG10 = math.log10(math.e)
-MISREAD_RATIO = 0.06  # tolerance for a ratio of a reduced table with one mistake
+# Relative tolerance for numbers of a table that the students reduced themselves.
+MISREAD_RATIO = 0.06
 Of = Literal[
-    "frequencies",  # … known well from the recordings
-    "all frequencies",  # … including vaguely known ones
+    "frequencies",  # all that the recordings give with close bounds
+    "all frequencies",  # including those with wide bounds
     "gains",
-    "sharp gains",  # … without the uncertainty of friction
-    "dampings",  # of decays
-    "sharp dampings",  # … each separately
-    "frequencies of rows",  # of a reduced table, with dwells to compare
+    "sharp gains",  # those not made uncertain by friction
+    "dampings",  # of all decays together
+    "sharp dampings",  # one at a time, without friction
+    "frequencies of rows",  # of a table that the students reduced themselves, compared with dwells
     "ratios of rows",
-    "fitted gains",  # … fitted, with steps and decays to compare
+    "fitted gains",  # from a fit to such a table, compared with steps and decays
     "fitted frequencies",
 ]
 
@@ -33,9 +35,10 @@ class Factor:
 
     Attributes
     ----------
-    code : of the flag; `said` is the key of its advice in the words of grading.
-    of : the numbers that can have it.
-    tolerance : relative, around the recordings' own number times the factor.
+    code : of the flag.
+    said : key of its advice in the words of grading.
+    of : the group of numbers that the mistake can affect.
+    tolerance : relative, around the number from the recordings times the factor.
     whole, least, tries, from_time_records : see `Mistake`.
     """
 
@@ -81,9 +84,11 @@ def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
 
 FACTORS = (
     _frequency("hertz", 1 / TURN),
-    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),  # together with a sharper one
+    # Needs a second number, which may be precise.
+    _frequency("hertz", 1 / TURN, of="all frequencies", least=2),
     _frequency("hertz_twice", TURN),
-    # A team reads peak to peak for every cart; for a single cart only a sharp reference proves it.
+    # A team that reads peak to peak does so for every cart. For one cart alone, only a precise
+    # reference proves it.
     _peaks("peak_to_peak", 2.0, of="gains", whole=True),
     _peaks("input_peak_to_peak", 0.5, of="gains", whole=True),
     _peaks("peak_to_peak", 2.0, of="sharp gains"),
@@ -97,10 +102,10 @@ FACTORS = (
         whole=True,
         from_time_records=True,
     ),
-    # The decrement alone, without friction: over half a period, or over two.
+    # Only the decrement is wrong, and there is no friction: taken over half a period, or over two.
     _decrement("half_decrement", 0.5),
     _decrement("twice_decrement", 2.0),
-    # A column headed Hz that holds rad/s, or vice versa.
+    # A column with the heading Hz contains rad/s, or vice versa.
     _reduced("hz_for_rad_s", "reduced_radians", 1 / TURN, of="frequencies of rows"),
     _reduced("hz_for_rad_s", "reduced_hertz", TURN, of="frequencies of rows"),
     _reduced("peak_to_peak", "reduced_twice", 2.0, of="ratios of rows"),

@@ -1,4 +1,4 @@
-"""Find numbers that no real chain of carts can have, by their signs and order."""
+"""Find numbers that no real carts can have, by their signs and order."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from pipeline.plant.linear.laws import orders
 
 @dataclass(frozen=True, kw_only=True)
 class BrokenOrder:
-    """The law `lesser ≤ greater`, broken by two numbers of a table."""
+    """Two numbers of a table that break the law `lesser ≤ greater`."""
 
     lesser: str
     greater: str
@@ -22,24 +22,25 @@ class BrokenOrder:
 
     @property
     def names(self) -> tuple[str, str]:
-        """Both parameters."""
+        """Both parameter names."""
         return self.lesser, self.greater
 
     @property
     def is_of_gains(self) -> bool:
-        """Return whether it concerns static gains."""
+        """Return whether the two numbers are static gains."""
         return read_name(self.lesser).is_gain
 
     @property
     def is_plain(self) -> bool:
-        """Return whether it is obvious, as for gains or resonances, not nulls or single carts.
+        """Return whether the law is obvious to students: for gains and resonances.
 
-        For those, the recordings' own value of the wrong number helps more.
+        For nulls and for frequencies of single carts it is not; then the number from the recordings
+        helps more.
         """
         return self.is_of_gains or all(read_name(name).is_mode for name in self.names)
 
     def flag(self, table: Mapping[str, Decimal], label: str) -> Flag:
-        """Return the flag for it."""
+        """Return the flag for the two numbers."""
         low, high = table[self.lesser], table[self.greater]
         return Flag(
             code="physically_impossible",
@@ -67,8 +68,13 @@ def not_positive(table: Mapping[str, Decimal]) -> list[str]:
 
 
 def broken_orders(table: Mapping[str, Decimal], *, initial: bool) -> list[BrokenOrder]:
-    """Return the orders that a table breaks by more than rounding and honest error."""
-    # Fitted numbers are good to a few percent; first estimates are read off a plot.
+    """Return the laws of order that a table breaks by more than rounding and usual errors.
+
+    Parameters
+    ----------
+    initial : whether it is the initial table, whose numbers are read off plots.
+    """
+    # Numbers from a fit are right within a few percent; first estimates are less precise.
     slack = 1.2 if initial else 1.1
     heavy = any(v > HEAVY_DAMPING for n, v in table.items() if read_name(n).is_ratio)
     broken = []

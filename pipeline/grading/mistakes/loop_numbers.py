@@ -1,4 +1,4 @@
-"""Simulate reported gains on a chain: stability, overshoot, settling time, static gain."""
+"""Simulate reported gains on a chain of carts: stability, overshoot, settling time, static gain."""
 
 import math
 from dataclasses import dataclass
@@ -10,21 +10,22 @@ from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
 
-_SAMPLE_TIME = 0.00884  # s, of the ECP controller, the default
-_HORIZON = 6.0  # times the required settling time
+_SAMPLE_TIME = 0.00884  # s; default: that of the ECP controller
+_HORIZON = 6.0  # simulated time, as a multiple of the required settling time
 _MOST_SAMPLES = 60_000
-_BLOWN_UP = 1e6  # times the reference
+_BLOWN_UP = 1e6  # a response this many times the reference counts as diverged
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoopNumbers:
-    """The sampled loop with its one-sample delay predicted.
+    """The simulated closed loop, sampled, with its delay of one sample predicted.
 
     Attributes
     ----------
-    poles : continuous equivalents, rad/s.
-    overshoot : percent; settling_time : s, None if it does not settle in view.
-    prefilter : reciprocal of the loop's static gain, which makes the steady state right.
+    poles : as continuous equivalents, in rad/s.
+    overshoot : in percent.
+    settling_time : in s; None if the loop does not settle in the simulated time.
+    prefilter : reciprocal of the loop's static gain; it makes the steady state right.
     """
 
     stable: bool
@@ -37,7 +38,7 @@ class LoopNumbers:
 def loop_numbers(
     chain: Chain, gains: Array, *, cart: int, settling: float, sample_time: float | None
 ) -> LoopNumbers | None:
-    """Return the loop that gains (2n,) give on a chain; None on numerical overflow."""
+    """Return the closed loop of gains (2n,) on a chain; None on numerical overflow."""
     T = sample_time or _SAMPLE_TIME
     row, size = 2 * (cart - 1), 2 * chain.n
     with np.errstate(all="ignore"):
@@ -56,7 +57,7 @@ def loop_numbers(
         poles = np.asarray(np.log(z) / T, dtype=np.complex128)
         stable = bool(np.abs(z).max() < 1)
         samples = int(_HORIZON * settling / T) + 2
-        stride = math.ceil(samples / _MOST_SAMPLES)  # for fast controllers
+        stride = math.ceil(samples / _MOST_SAMPLES)  # fast controllers: only every so many samples
         count = math.ceil(samples / stride)
         y = _step(*_together(loop, gamma / static[row], stride), row=row, count=count)
     overshoot, settles = np.inf, np.nan
@@ -75,7 +76,7 @@ def loop_numbers(
 
 
 def _together(loop: Array, drive: Array, stride: int) -> tuple[Array, Array]:
-    """Return x_{k+1} = L x_k + d over so many samples at once."""
+    """Return L^k and the matching d of x_{i+1} = L x_i + d for `stride` = k samples at once."""
     size = drive.size
     one = np.eye(size + 1)
     one[:size, :size], one[:size, size] = loop, drive
@@ -84,10 +85,10 @@ def _together(loop: Array, drive: Array, stride: int) -> tuple[Array, Array]:
 
 
 def _step(loop: Array, drive: Array, *, row: int, count: int) -> Array:
-    """Return the unit step's response (count,); the first sample is the delay."""
+    """Return the response to a unit step, shape (count,); the first sample is the delay."""
     states = np.zeros((drive.size, 1))
     power, offset = loop, drive[:, None]
-    # x_{k+1} = L x_k + d: each pass doubles the samples known.
+    # x_{k+1} = L x_k + d. Each pass doubles the number of known samples.
     while states.shape[1] < count:
         states = np.hstack([states, power @ states + offset])
         offset, power = offset + power @ offset, power @ power

@@ -1,4 +1,4 @@
-"""Find final estimates that were copied from the initial ones."""
+"""Find final estimates that were copied from the initial ones instead of fitted."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -12,15 +12,15 @@ from pipeline.submission import Reported
 
 
 def copied_final(reported: Reported, *, references: References) -> list[str]:
-    """Return the final estimates equal to the initial ones, if this is not a coincidence.
+    """Return the final estimates that equal the initial ones, if this is no coincidence.
 
-    Numbers of a single cart may honestly be kept, so the copied ones must include numbers that only
-    a fit can give. A copy of the usual guess of a damping is the strongest evidence. Tables with
-    single digits agree anyway.
+    Students may honestly keep the numbers of single carts. So the equal numbers must include those
+    that only a fit can give. The strongest evidence is an equal damping that was first guessed.
+    Tables typed with single digits are ignored, because they agree by rounding.
     """
     both = [name for name in reported.final if name in reported.initial]
     same = [n for n in both if _same(reported, n)]
-    most = 0.75  # of the numbers in both tables
+    most = 0.75  # share of the numbers that are in both tables
     if not both or len(same) < most * len(both):
         return []
     if 2 * sum(is_vague(reported.final[name]) for name in same) > len(same):
@@ -31,22 +31,23 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < 3e-3 else []  # a fit rarely agrees by chance
+    return same if chance < 3e-3 else []  # a fit reproduces so many numbers only rarely
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
-    """Return the probability that a fit reproduces a number digit for digit.
+    """Return the probability that a fit gives the same digits as the first estimate.
 
-    It is high if the first estimate was right to its last digit, and if few digits were typed.
+    It is high if the first estimate was right to its last digit, or if few digits were typed.
     """
     if not typed:
         return 1.0
     damping = read_name(name).is_damping
     half = half_digit(typed) / abs(Fraction(typed))
-    # Usual difference between the two estimates of a number, smaller for certain ones.
+    # Usual relative difference between first and final estimate; smaller where the data are
+    # precise.
     apart, surprise = 0.15 if damping else 0.01, 0.0
     if reference is not None and reference.low > 0:
-        # Rounding to a single digit is more than grading excuses.
+        # A number with a single digit is rounded more than grading allows for.
         hidden = half - rounding(typed) / abs(Fraction(typed))
         off = max(float(percent_off(typed, reference, sigmas=limits.SIGMAS) / 100 - hidden), 0.0)
         if reference.within(1.05 if damping else 1.01):
@@ -54,10 +55,10 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
             if off == 0:
                 return 1.0
         measured = not damping and not read_name(name).is_by_eye
-        # A larger error is a mistake, perhaps in both tables; some students fit badly.
+        # A larger error shows a mistake, which may be in both tables. A poor fit has a smaller one.
         if not measured or off <= 0.2:
             surprise = min(0.5 * (off / apart) ** 2, 3.0)
-    # A normal difference has the density 1/√(4π) at zero.
+    # A difference of two normal errors has the density 1/√(4π) at zero.
     again = 1.0 if is_vague(typed) else min(1.0, 2 * float(half) / (apart * 3.5))
     return again * exp(-surprise)
 

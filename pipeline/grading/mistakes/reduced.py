@@ -1,7 +1,7 @@
-"""Compare amplitude ratios that students reduced themselves with their own dwells.
+"""Check a table of amplitude ratios that students reduced themselves from their dwells.
 
-A table replaces dwells, so a mistake in it enters every number fitted to it. The dwells reveal it
-if they are submitted too; otherwise steps and decays do, by comparison with the fit.
+A mistake in this table affects every number fitted to it. If the dwells are submitted too, they
+show the mistake. Otherwise steps and decays do, because they disagree with the fit.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,13 @@ from pipeline.results import Analysis, SinePoint
 
 @dataclass(frozen=True, kw_only=True)
 class _Rows:
-    """Rows of the table with a matching dwell, and the dwell's values; each (n,)."""
+    """The rows of the table that have a matching dwell; each array has shape (n,).
+
+    Attributes
+    ----------
+    reported : amplitude ratios of the table.
+    measured : amplitude ratios of the dwells.
+    """
 
     cart: Array
     reported: Array
@@ -44,12 +50,17 @@ def diagnose_reduced(analysis: Analysis) -> list[Flag]:
     if rows is None:
         return []
     ratio = float(np.median(np.abs(np.log(rows.reported / rows.measured))))
-    off = ratio > np.log(1.3)  # wrong by an unknown mistake
+    off = ratio > np.log(1.3)  # wrong, but by no known mistake
     return [_flag("data_problem", "reduced_off", rows)] if off else []
 
 
 def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
-    """Match rows with dwells after scaling the frequencies; None if few match."""
+    """Match rows of the table with dwells; None if fewer than four match.
+
+    Parameters
+    ----------
+    stretch : factor on the frequencies of the table before they are compared.
+    """
     matched: list[tuple[int, float, SinePoint]] = []
     for table in analysis.tables:
         points = [
@@ -60,7 +71,7 @@ def _rows(analysis: Analysis, *, stretch: float) -> _Rows | None:
             if near:
                 best = min(near, key=lambda p: abs(p.omega - omega))
                 matched.append((table.cart, float(ratio), best))
-    if len(matched) < 4:  # fewer rows cannot identify a mistake
+    if len(matched) < 4:  # fewer rows cannot show which mistake it is
         return None
     return _Rows(
         cart=np.array([cart for cart, _, _ in matched]),
@@ -82,7 +93,7 @@ def _share(reported: Array, predicted: Array) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Slip:
-    """A mistake, its sentence, and the rows that it predicts."""
+    """A known mistake, the key of its sentence, and the ratios that it predicts for rows."""
 
     code: Code
     said: str
@@ -91,7 +102,7 @@ class _Slip:
 
 
 def _slips(analysis: Analysis, rows: _Rows | None) -> Iterator[_Slip]:
-    """Yield all known mistakes that affect the whole table."""
+    """Yield the known mistakes that affect the whole table."""
     for row in [row for row in FACTORS if row.of == "frequencies of rows"]:
         moved = _rows(analysis, stretch=row.factor)
         if moved is not None:
@@ -131,7 +142,7 @@ def _flag(code: Code, said: str, rows: _Rows) -> Flag:
 
 
 def _against_time_records(analysis: Analysis) -> list[Flag]:
-    """Return flags from comparing the fit to the table with steps and decays."""
+    """Return a flag if the fit differs from steps and decays by the factor of a known mistake."""
     if not is_explained(analysis):
         return []
     ratios: dict[str, list[float]] = {"fitted gains": [], "fitted frequencies": []}

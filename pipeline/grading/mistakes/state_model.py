@@ -1,4 +1,4 @@
-"""The reported A and B: every entry against the student's own table or the reference."""
+"""Judge the reported A and B: each entry against the student's own table or the recordings."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -22,14 +22,20 @@ from pipeline.submission import ReportedStateSpace
 
 Kind = Literal["exact", "stiffness", "damping"]
 
-_NAMED = 3  # up to this many carts the named parameters determine the chain
+_NAMED = 3  # largest number of carts whose named parameters determine the chain
 _MODES = ("omega_a", "omega_b", "omega_c")
 _NULLS = ("omega_x", "omega_y")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateMatrices:
-    """Acceptable [A B], (2n, 2n + 1), NaN for unknown entries, with their uncertainty."""
+    """One acceptable [A B], shape (2n, 2n + 1).
+
+    Attributes
+    ----------
+    right : the entries; NaN if unknown.
+    slack : their uncertainty.
+    """
 
     right: Array
     slack: Array
@@ -37,9 +43,14 @@ class StateMatrices:
 
 @dataclass(frozen=True, kw_only=True)
 class MatrixEntry:
-    """One entry of A or B: as typed, acceptable values, and error (percent).
+    """One reported entry of A or B.
 
-    `error` is the error beyond the uncertainty of the models, `bare` the error without it.
+    Attributes
+    ----------
+    typed : as the student typed it.
+    right : the acceptable values, one per model.
+    error : difference beyond the uncertainty of the models, in percent.
+    bare : difference without that allowance, in percent.
     """
 
     name: str
@@ -51,21 +62,21 @@ class MatrixEntry:
 
     @property
     def wrong(self) -> bool:
-        """Whether it is wrong rather than imprecise."""
+        """Whether the entry is wrong, not just imprecise."""
         return self.error > limits.WRONG[self.kind]
 
     @property
     def suspect(self) -> bool:
-        """Whether it would be wrong if the models were exact."""
+        """Whether the entry would be wrong if the models were exact."""
         return self.bare > limits.WRONG[self.kind]
 
 
 def compare_entries(
     space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int
 ) -> list[MatrixEntry]:
-    """Compare every entry with the acceptable A and B.
+    """Compare every reported entry with the acceptable [A B].
 
-    An entry counts by its best match: an A that follows from a wrong table is right.
+    The nearest acceptable value counts. So an A that follows from a wrong table is right.
     """
     kinds, entries = _kinds(n), []
     for (i, j), number in _matrix(space, n).items():
@@ -98,16 +109,19 @@ def state_models(
     chain: Chain | None,
     n: int,
 ) -> list[StateMatrices]:
-    """Return [A B] of the reference and of the student's tables.
+    """Return the acceptable [A B]: from the recordings and from the student's tables.
 
     A table gives a cart's own terms directly, but its couplings only as differences of large
-    numbers, so the errors of the table are propagated. The reference gets the same uncertainty,
-    because a student's entries come from a similar table.
+    numbers. So the errors of the table are propagated. The model from the recordings gets the same
+    uncertainty, because students compute their entries from a similar table.
 
     Parameters
     ----------
+    tables : the student's final table, as typed and with known mistakes corrected.
     rounding : by parameter, the relative error that rounding may have caused.
-    known : the references of the final table, which know more about dampings than the chain.
+    known : final parameters from the recordings; their bounds of dampings are better than the
+        chain's.
+    chain : the carts from the recordings, if they were identified.
     """
     models = []
     reference = chain.parameters() if chain is not None and chain.is_tied and n <= _NAMED else None
@@ -129,7 +143,12 @@ def state_models(
 def _put_dampings(
     right: Array, slack: Array, values: Mapping[str, float], *, known: Mapping[str, Reference]
 ) -> None:
-    """Insert the measured range of each cart's own damping; NaN without a measurement."""
+    """Set each cart's own damping term to its measured range; NaN without a measurement.
+
+    Parameters
+    ----------
+    right, slack : changed in place.
+    """
     n = right.shape[0] // 2
     for i in range(n):
         omega, zeta = _own_names(i, n)
@@ -149,7 +168,10 @@ def _own_names(i: int, n: int) -> tuple[str, str]:
 
 
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
-    """Return the [A B] implied by a table's transfer functions; None if they imply no chain."""
+    """Return the [A B] of the chain that a table's transfer functions imply.
+
+    None if they imply none.
+    """
     chain = own_chain(values, n=n)
     return None if chain is None else _matrices(chain)
 
@@ -160,7 +182,7 @@ def _matrices(chain: Chain) -> Array:
 
 
 def _direct(values: Mapping[str, float], n: int) -> Array:
-    """Return the terms of each cart alone, from its own frequency and damping."""
+    """Return the [A B] terms that a single cart's frequency and damping give; NaN elsewhere."""
     direct = np.full((2 * n, 2 * n + 1), np.nan)
     for i in range(n):
         omega, zeta = _own_names(i, n)
@@ -172,10 +194,11 @@ def _direct(values: Mapping[str, float], n: int) -> Array:
 
 
 def _by_own_frequencies(values: Mapping[str, float], n: int) -> Array | None:
-    """Return the [A B] of two or three carts from each cart's own reported frequency.
+    """Return the [A B] of two or three carts, with each cart's own frequency as reported.
 
-    The transfer functions alone also give these frequencies, but different couplings.
-    With T_i the square of all frequencies of carts i to n alone, T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
+    The transfer functions determine these frequencies too; if they disagree with the reported ones,
+    the couplings differ. Let T_i be the product of the squared frequencies of carts i to n without
+    the carts before i. Then T_i = ω_i² T_i+1 − κ_i+1 T_i+2.
     """
     if n not in (2, 3) or not {*parameter_names(n)} <= values.keys():
         return None
@@ -200,7 +223,13 @@ def _spread(
     rounding: Mapping[str, float],
     n: int,
 ) -> Array:
-    """Return the uncertainty of [A B] due to errors of a table's numbers."""
+    """Return the uncertainty of [A B] that errors in the numbers of a table cause.
+
+    Parameters
+    ----------
+    make : computes [A B] from a table.
+    right : [A B] of the table as it is.
+    """
     variance = np.zeros_like(right)
     for name, value in values.items():
         error = np.hypot(
@@ -214,9 +243,10 @@ def _spread(
 
 
 def own_chain(values: Mapping[str, float], *, n: int) -> Chain | None:
-    """Return the chain of n carts implied by a student's final table, or None.
+    """Return the chain of n carts that a student's final table implies, or None.
 
-    Without one of its gains, a table of three carts looks like one of two.
+    The number of carts is given, because a table of three carts that lacks a gain looks like one of
+    two.
     """
     try:
         with np.errstate(all="ignore"):
@@ -274,11 +304,11 @@ def model_harm(
     n: int,
     tied: bool,
 ) -> Harm | None:
-    """Return the impossible behaviour that wrong entries of a model predict, if any.
+    """Return how wrong entries would make the model behave in an impossible way, or None.
 
-    The motion grows without limit, or a positive input drives a cart to the negative side.
-    Imprecise entries count as right, because in a stiff chain honest errors could have the same
-    effect. A different order of the states is harmless.
+    `unstable`: the motion grows without limit. `wrong_way`: a positive input drives a cart to the
+    negative side. Imprecise entries are replaced by right ones first, because honest errors in a
+    stiff chain could have the same effect. A different order of the states is harmless.
 
     Parameters
     ----------
@@ -302,15 +332,15 @@ def model_harm(
 
 def _grows(A: Array) -> bool:
     found = np.linalg.eigvals(A)
-    # Smaller eigenvalues of a free body are rounding.
+    # Smaller eigenvalues are rounding errors: those of a free body are zero.
     return bool(found.real.max() > 1e-6 * float(np.abs(found).max()))
 
 
 def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
-    """Return whether a positive input drives or holds a cart on the negative side."""
+    """Return `wrong_way` if a positive input drives or holds a cart on the negative side."""
     orders = [np.arange(2 * n), *(np.argsort(order) for _, order in _reordered(n))]
     meant = [A[np.ix_(o, o)] for o in orders]
-    # In the required order each position is followed by its velocity.
+    # Only in the right order of the states is each position followed by its velocity.
     kinematic = np.eye(2 * n)[1::2]
     known = [i for i, one in enumerate(meant) if np.allclose(one[0::2], kinematic)] or [0]
     ways = [_drives_back(meant[i], b, tied=tied) for i in known for b in (B[orders[i]], B)]
@@ -336,10 +366,10 @@ def diagnose_state_space(
     models: Sequence[StateMatrices],
     n: int,
 ) -> list[Flag]:
-    """Return a flag if entries are wrong, with the mistake that explains all of them, if any.
+    """Return a flag if entries are wrong; it names the mistake that explains all, if there is one.
 
-    A known mistake that explains all of A and B is evidence even if the table is too vague to judge
-    single entries.
+    A known mistake that gives all of A and B is evidence even if the table is too uncertain to
+    judge single entries.
     """
     suspects = [entry for entry in entries if entry.suspect]
     slip = _slip(space, models=models, n=n) if suspects else ""
@@ -366,7 +396,7 @@ def diagnose_state_space(
 
 
 def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int) -> str:
-    """Return the first known mistake that turns the right [A B] into the reported one, or ""."""
+    """Return the first mistake, in words, that makes the right [A B] the reported one, or ""."""
     typed, kinds = _matrix(space, n), _kinds(n)
     A = {at: number for at, number in typed.items() if at[1] < 2 * n}
     B = {at: number for at, number in typed.items() if at[1] == 2 * n}
@@ -375,7 +405,7 @@ def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int)
             columns = [*order, 2 * n]
             slipped = model[np.ix_(order, columns)]
             of_states: list[list[Kind]] = [[kinds[i][j] for j in columns] for i in order]
-            # A student may have reordered the states in A but not in B.
+            # A student may have changed the order of the states in A but not in B.
             if _met(typed, slipped, of_states) or (
                 _met(A, slipped, of_states) and _met(B, model, kinds)
             ):
@@ -389,7 +419,13 @@ def _slip(space: ReportedStateSpace, *, models: Sequence[StateMatrices], n: int)
 def _met(
     typed: Mapping[tuple[int, int], Decimal], slipped: Array, kinds: Sequence[Sequence[Kind]]
 ) -> bool:
-    """Return whether all typed entries match an [A B] with a mistake."""
+    """Return whether all typed entries match the [A B] that a mistake gives.
+
+    Parameters
+    ----------
+    typed : by row and column.
+    slipped : the [A B] that the mistake gives.
+    """
     return all(
         _entry_error(number, float(slipped[i, j]), kinds[i][j]) <= limits.EXPLAINED[kinds[i][j]]
         for (i, j), number in typed.items()
@@ -397,7 +433,7 @@ def _met(
 
 
 def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
-    """Yield (words, order of the states)."""
+    """Yield each wrong order of the states, in words and as a permutation."""
     if n > 1:
         yield WORDS.text("positions_first"), [*range(0, 2 * n, 2), *range(1, 2 * n, 2)]
         back = [2 * i + part for i in reversed(range(n)) for part in (0, 1)]
@@ -405,7 +441,7 @@ def _reordered(n: int) -> Iterator[tuple[str, list[int]]]:
 
 
 def _changed(model: Array, n: int) -> Iterator[tuple[str, Array]]:
-    """Yield (words, the resulting [A B])."""
+    """Yield each known mistake in the entries, in words and as the [A B] that it gives."""
     own = [(2 * i + 1, 2 * i) for i in range(n)]
     dampings = [(2 * i + 1, 2 * i + 1) for i in range(n)]
     pairs = [((2 * i + 1, 2 * i + 2), (2 * i + 3, 2 * i)) for i in range(n - 1)]

@@ -1,4 +1,4 @@
-"""Turning points of a cart after a step, which may be mistaken for its settled level."""
+"""Turning points of a cart after a step, which a student may mistake for its settled level."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -10,20 +10,22 @@ from pipeline.grading.references.reference import Reference
 from pipeline.names import read_name
 from pipeline.results import Analysis, Record, StepGain
 
-_TURNS = 3  # the peak, the trough after it, the second peak
-_DIGITS = 2  # digits to which edges of the same size agree
+_TURNS = 3  # the peak, the trough after it, and the second peak
+_DIGITS = 2  # significant digits to which edges of the same size must agree
 
-Edge = tuple[int, float]  # number in the recording, and size
+Edge = tuple[int, float]  # number of the edge in its recording, and its size
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StepTurns:
-    """The turning points of one cart, per unit of input.
+    """The turning points of one cart, as displacement per unit of input.
 
     Attributes
     ----------
-    by_edge : for every kind of edge and repeat, the first three turning points.
-    furthest : the largest displacement; if two motions beat, it is not the first turning point.
+    by_edge : for each edge, and each recording that repeats it, the first three turning points.
+    furthest : for each edge, the largest displacements; when two motions beat, this is not the
+        first
+        turning point.
     """
 
     by_edge: dict[Edge, list[list[float]]]
@@ -35,19 +37,22 @@ class StepTurns:
         return _spread([float(np.mean(peaks))]) if peaks else None
 
     def turn(self, edge: Edge, number: int) -> Reference | None:
-        """Return a turning point after one kind of edge; None if any up to it is not real."""
+        """Return the turning point with this number after an edge, as the range over the repeats.
+
+        Returns None if a turning point up to this number is missing or not positive.
+        """
         repeats = [one for one in self.by_edge.get(edge, ()) if len(one) > number]
         if not repeats or min(min(one[: number + 1]) for one in repeats) <= 0:
             return None
         return _spread([one[number] for one in repeats])
 
     def peak(self, edge: Edge) -> Reference:
-        """Return the first or the largest peak after one kind of edge."""
+        """Return the peak after an edge: a range that covers the first and the largest peak."""
         return _spread([*(repeat[0] for repeat in self.by_edge[edge]), *self.furthest[edge]])
 
 
 def step_turns(name: str, analysis: Analysis) -> StepTurns:
-    """Return the turning points in the steps of the cart of a gain (`K` or `K_i`)."""
+    """Return the turning points in the steps of a gain's cart (`K` or `K_i`)."""
     cart = read_name(name).cart or 1
     records = {record.id: record for record in analysis.records}
     found: dict[Edge, list[list[float]]] = {}
@@ -68,7 +73,7 @@ def _spread(values: Sequence[float]) -> Reference:
 
 
 def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[float]]]:
-    """Yield every edge with the cart's displacement per unit of input and its turning points."""
+    """Yield each edge, the cart's displacement per unit of input, and its turning points."""
     y = record.position(step.cart)
     for number, edge in enumerate(step.edges):
         change = edge.u_after - edge.u_before
@@ -77,7 +82,7 @@ def _turns(step: StepGain, record: Record) -> Iterator[tuple[Edge, Array, list[f
         level = (edge.level_after - edge.level_before) / change
         turns, side, rest = [], 1.0, moved
         while rest.size and len(turns) < _TURNS:
-            # Until it crosses its level again, its furthest point is the turning point.
+            # A turning point is the farthest point before the cart crosses its settled level again.
             beyond = side * (rest - level) > 0
             first = int(np.argmax(beyond)) if beyond.any() else rest.size
             back = np.flatnonzero(~beyond[first:])

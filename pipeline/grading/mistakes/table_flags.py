@@ -1,4 +1,4 @@
-"""The remarks on the parameter tables, each with its most telling number."""
+"""The flags of the parameter tables; each shows the number that makes the mistake clearest."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -19,7 +19,10 @@ OTHER: dict[Label, Label] = {"initial": "final", "final": "initial"}
 def specific_flags(
     explained: Sequence[ExplainedNumbers], tables: Mapping[Label, Table], references: References
 ) -> list[Flag]:
-    """Return one flag per code for both tables; the text shows the first number."""
+    """Return one flag for each code of a known mistake, for both tables together.
+
+    The text of the flag shows the first number that the mistake explains.
+    """
     flags = []
     for code in CODES:
         mine = [one for one in explained if code in one.mistake.codes]
@@ -45,7 +48,8 @@ def specific_flags(
             evidence["or_else"] = [c for c in first.rival.codes if c not in first.mistake.codes]
             message += WORDS.text("or_else", help=first.rival.help(typed, reference))
         other = OTHER[first.table]
-        if any(one.table == other for one in mine):  # else a student might fix only one table
+        # Without this, a student might correct only one table.
+        if any(one.table == other for one in mine):
             evidence["also_in"] = other
             message += WORDS.text(f"also_{other}")
         flags.append(Flag(code=code, parameters=tuple(names), message=message, evidence=evidence))
@@ -55,7 +59,7 @@ def specific_flags(
 def off_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: str
 ) -> Flag:
-    """Return the flag of unexplained wrong numbers, showing the largest error."""
+    """Return the flag for wrong numbers without an explanation; it shows the largest error."""
 
     def error(name: str) -> float:
         return float(percent_off(table[name], known[name], sigmas=limits.SIGMAS)) / limit(
@@ -87,7 +91,7 @@ def off_flag(
 def impossible_flag(
     table: Table, names: Sequence[str], known: Mapping[str, Reference], label: Label
 ) -> Flag:
-    """Return the flag of numbers that are zero or negative."""
+    """Return the flag for numbers that are zero or negative."""
     name = names[0]
     return Flag(
         code="physically_impossible",
@@ -104,7 +108,7 @@ def impossible_flag(
 
 
 def copied_flag(reported: Reported, copied: Sequence[str], references: References) -> Flag:
-    """Return the flag of copied final numbers, showing the largest error."""
+    """Return the flag for copied final numbers; it shows the largest error."""
 
     def error(name: str) -> float:
         known = references.final.get(name)
@@ -120,7 +124,12 @@ def copied_flag(reported: Reported, copied: Sequence[str], references: Reference
 
 
 def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) -> Flag:
-    """Return the flag of numbers (difference, name) that differ between the two tables."""
+    """Return the flag for numbers that differ between the two tables.
+
+    Parameters
+    ----------
+    apart : difference and parameter name, the largest difference first.
+    """
     _, worst = apart[0]
     initial, final = reported.initial[worst], reported.final[worst]
     return Flag(
@@ -139,7 +148,7 @@ def disagreement_flag(reported: Reported, apart: Sequence[tuple[float, str]]) ->
 
 
 def limit(name: str, table: str) -> float:
-    """Return the error, in percent, above which a reported number gets a remark."""
+    """Return the error, in percent, above which a reported number gets a flag."""
     if read_name(name).is_damping:
         return limits.OFF_DAMPING
     if table == "final":

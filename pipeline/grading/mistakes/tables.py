@@ -1,4 +1,4 @@
-"""Name the mistake behind a wrong number, if only one reproduces it."""
+"""Name the mistake that gives a wrong number, if only one mistake does."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,10 +28,12 @@ from pipeline.submission import Reported
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """The flags of the tables, and the final table with known mistakes corrected.
+    """The flags of the two tables, and the final table with known mistakes corrected.
 
-    `named`: by table, the numbers that a known mistake explains. `possible`: the corrected final
-    table may belong to real carts.
+    Attributes
+    ----------
+    named : by table, the numbers that a known mistake explains.
+    possible : whether the corrected final table can belong to real carts.
     """
 
     flags: tuple[Flag, ...]
@@ -43,7 +45,7 @@ class Diagnosis:
 def diagnose_tables(
     reported: Reported, *, references: References, analysis: Analysis, copied: Sequence[str]
 ) -> Diagnosis:
-    """Return the flags of the two tables of parameters.
+    """Return the flags of the two tables, and the corrected final table.
 
     Parameters
     ----------
@@ -78,9 +80,10 @@ def diagnose_tables(
         if names
     ]
     named = {name for flag in flags for name in flag.parameters}
-    # A mistake in one table makes them differ, also for numbers that the recordings do not give.
+    # A mistake in one table makes the tables differ, even in numbers that the recordings do not
+    # give.
     symbols = {read_name(name).symbol for one in explained for name in one.names}
-    # On a nonlinear bench, estimates from large and small motions differ.
+    # On a nonlinear bench, estimates from large and small motions may differ.
     apart = [
         (size, name)
         for size, name in _disagreements(reported, references, blurred=True)
@@ -99,7 +102,7 @@ def diagnose_tables(
 
 
 def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]:
-    """Return the mistakes of each table; one table may decide doubts of the other."""
+    """Explain both tables; a mistake found in one table is then tried in the other at no cost."""
     alone = {label: one.explain() for label, one in judged.items()}
     return {
         label: one.explain(believed=alone[OTHER[label]].codes)
@@ -111,13 +114,16 @@ def _explain_both(judged: Mapping[Label, "_Judged"]) -> dict[Label, Explanation]
 
 @dataclass(frozen=True, kw_only=True)
 class _Judged:
-    """A table against its references.
+    """A table compared with the recordings.
 
     Attributes
     ----------
-    errors : percent, of every number with a reference and without a flag.
+    known : the numbers from the recordings, by parameter.
+    errors : in percent, of every number that the recordings give and that has no flag yet.
     suspect : wrong or doubtful enough to look for a known mistake.
-    unordered : gains that may each be right, but are out of order.
+    unordered : gains that may each be right, but whose order is impossible.
+    mistakes : those to try.
+    laws : laws of order that the table breaks.
     flags : problems that do not depend on the recordings.
     """
 
@@ -132,7 +138,12 @@ class _Judged:
     flags: list[Flag]
 
     def broken_laws(self, off: set[str]) -> list[BrokenOrder]:
-        """Return the laws that it breaks by unexplained wrong numbers."""
+        """Return the broken laws of order that numbers in `off` explain.
+
+        Parameters
+        ----------
+        off : wrong numbers that no known mistake explains.
+        """
         return [
             law
             for law in self.laws
@@ -171,9 +182,9 @@ def _judge(
         if name in known and name not in taken
     }
     suspect = [n for n, e in errors.items() if e > min(limit(n, label), limits.SUSPECT_DAMPING)]
-    if (
-        label == "initial"
-    ):  # friction may leave room for what the student's own, right, fit does not
+    if label == "initial":
+        # With friction the bounds are wide, but the student's own final number is right and
+        # contradicts the initial one.
         apart = _disagreements(reported, references, blurred=False)
         apart = [name for _, name in apart if read_name(name).is_gain]
         suspect += [n for n in apart if n in errors and _agrees(reported.final[n], references, n)]
@@ -187,7 +198,7 @@ def _judge(
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
-    if any(law.is_of_gains for law in laws):  # an obvious fact comes before a guess
+    if any(law.is_of_gains for law in laws):  # an obvious contradiction comes before a guess
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
         label=label,
@@ -205,7 +216,7 @@ def _judge(
 def _unordered(
     laws: Sequence[BrokenOrder], label: Label, reported: Reported, *, suspect: Sequence[str]
 ) -> frozenset[str]:
-    """Return the gains that are out of order and differ from the other table."""
+    """Return the gains whose order is impossible, unless the other table confirms one of them."""
     other: Table = getattr(reported, OTHER[label])
     table: Table = getattr(reported, label)
     gains = [law for law in laws if law.is_of_gains and not set(law.names).isdisjoint(suspect)]
@@ -232,7 +243,11 @@ def _near(a: Decimal, b: Decimal) -> bool:
 
 
 def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
-    """Return whether a final table can have a mistake; for decays and steps only if copied."""
+    """Return whether a final table can have a mistake.
+
+    Mistakes in reading decays and steps affect only copied numbers, because a fit does not use such
+    readings.
+    """
     if not mistake.from_time_records:
         return True
     both = [n for n in mistake.predicted if n in reported.final and n in reported.initial]
@@ -242,7 +257,7 @@ def _may_be_final(mistake: Mistake, reported: Reported) -> bool:
 def _corrected(
     final: Table, explained: Sequence[ExplainedNumbers], known: Mapping[str, Reference]
 ) -> dict[str, float]:
-    """Return the final table without the mistakes found in it."""
+    """Return the final table with the known mistakes corrected."""
     corrected = {name: float(typed) for name, typed in final.items() if typed > 0}
     for one in explained:
         inside = [n for n in one.names if n in one.mistake.predicted]
@@ -254,9 +269,11 @@ def _corrected(
 def _disagreements(
     reported: Reported, references: References, *, blurred: bool
 ) -> list[tuple[float, str]]:
-    """Return (difference, name) of contradictions between the tables, the worst first.
+    """Return difference and name of numbers that contradict between the tables, worst first.
 
-    With `blurred`, two numbers may differ as much as the readings of the recordings.
+    Parameters
+    ----------
+    blurred : allow as much difference as between readings of the recordings.
     """
     apart: list[tuple[float, str]] = []
     for name, final in reported.final.items():
@@ -268,7 +285,8 @@ def _disagreements(
         if name in references.initial and name in references.final:
             if references.final[name].low <= 0:
                 continue
-            # The two estimates from the data may differ as much.
+            # The recordings' own initial and final estimates may differ; the table may differ by as
+            # much.
             ratio = references.initial[name].value / references.final[name].value
             bounds.append(float(final) * ratio)
             if blurred:

@@ -1,4 +1,4 @@
-"""Amplitudes read before the steady state, and the table fitted to them."""
+"""The mistake of reading amplitudes before the steady state, and of fitting a table to them."""
 
 from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal
@@ -20,7 +20,7 @@ Reading = Callable[[Record, Array], float]
 def transient_fits(
     analysis: Analysis, table: Mapping[str, Decimal], known: Mapping[str, Reference]
 ) -> list[Mistake]:
-    """Return fits to amplitudes of the transient, one for each way to read them."""
+    """Return variants of this mistake, one for each way of reading an amplitude too early."""
     runs = {r.id: r for r in analysis.records if r.kind == "sine" and r.u is not None}
     if analysis.fit is None or not runs or len(runs) < len(analysis.sine_points) / analysis.bench.n:
         return []
@@ -38,9 +38,10 @@ def transient_fits(
                 Mistake(
                     codes=("transient_used",),
                     predicted=moved,
-                    tolerance=0.06,  # a student's fit may weigh the points differently
+                    tolerance=0.06,  # relative; a student's fit may weigh the points differently
                     said=("early",),
-                    # A wrong response has no exact fit, so not every number matches.
+                    # No parameters fit such amplitudes exactly, so not every number of the table
+                    # matches.
                     least=max(2, round(0.65 * len(asked))),
                     table_wide=True,
                     from_time_records=True,
@@ -50,19 +51,19 @@ def transient_fits(
 
 
 def _is_new(name: str, ratio: float) -> bool:
-    # A smaller change would also match the right number.
+    # After a smaller change, the right number would match too.
     return abs(np.log(ratio)) > np.log1p(0.5 if read_name(name).is_damping else 0.12)
 
 
 def early_readings() -> Iterator[Reading]:
-    """Yield ways to read an amplitude too early."""
+    """Yield functions that read an amplitude too early from a dwell."""
     yield lambda record, y: float(np.max(np.abs(y - np.median(y))))
     for cycles in (1.0, 2.0, 3.0, 5.0):
         yield lambda record, y, cycles=cycles: _half_swing(record, y, cycles=cycles)
 
 
 def _half_swing(record: Record, y: Array, *, cycles: float) -> float:
-    """Return half the distance from peak to peak over the first cycles."""
+    """Return half the distance from the lowest to the highest point in the first cycles."""
     end = record.t[0] + cycles * 2 * np.pi / (record.omega or np.inf)
     first = y[record.t <= end]
     return float(np.ptp(first)) / 2
@@ -71,7 +72,7 @@ def _half_swing(record: Record, y: Array, *, cycles: float) -> float:
 def _refit(
     analysis: Analysis, runs: Mapping[str, Record], reading: Reading
 ) -> dict[str, Reference]:
-    """Return the parameters fitted to such amplitudes; empty if the fit fails."""
+    """Return the parameters fitted to amplitudes that `reading` gives; empty if the fit fails."""
     responses = []
     for response in analysis.frequency_responses:
         points = [
