@@ -21,7 +21,12 @@ Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
 class RequiredRuns(TomlTable):
-    """A minimum number of experiments of a kind; `carts` are the free carts, default: all."""
+    """A minimum number of experiments of one kind.
+
+    Attributes
+    ----------
+    carts : those free to move; default: all.
+    """
 
     kind: Kind
     carts: tuple[int, ...] = ()
@@ -29,7 +34,10 @@ class RequiredRuns(TomlTable):
 
 
 class Required(TomlTable):
-    """The required items: runs, parameters (`K_*` is a pattern) and further tables."""
+    """The items that a submission must have: recordings, parameters and further tables.
+
+    In the names of parameters, `K_*` is a pattern.
+    """
 
     experiments: tuple[RequiredRuns, ...] = ()
     initial: tuple[str, ...] = ()
@@ -39,9 +47,13 @@ class Required(TomlTable):
 
 
 class Late(TomlTable):
-    """Deduction for late work: `percent_per_day` of the points earned, after the days of grace.
+    """The deduction for late work.
 
-    `due` is the deadline, used if the platform gives submission times.
+    Attributes
+    ----------
+    due : the deadline; it counts if the platform gives submission times.
+    percent_per_day : of the points earned, for each day begun after the days of grace.
+    most_percent : the largest deduction.
     """
 
     due: AwareDatetime | None = None
@@ -61,33 +73,40 @@ class FlagCosts(
         ),
     )
 ):
-    """By code, the least share of its criterion's points that a remark costs.
+    """The least cost of each flag, as a share of its criterion's points.
 
-    The tolerances already weigh each wrong number. But a single wrong entry of A or B makes the
-    whole model wrong, which its share of the entries does not reflect. Only a person decides
-    whether `shared_data` is a copy, and sets those points by hand.
+    By default most flags cost nothing, because the tolerances already judge each wrong number. But
+    one wrong entry of A or B makes the whole model wrong, although it is a small share of the
+    entries.
+
+    `shared_data` has no cost: only a person decides whether it is a copy, and sets points by hand.
     """
 
     def of(self, code: Code) -> float:
-        """Return what the remark of a code costs."""
+        """Return the cost of the flag with a code."""
         return getattr(self, code, 0.0)
 
 
 class _Criterion(TomlTable):
-    """The fields of every criterion; `requires` lists criteria that must not have failed."""
+    """The keys of every criterion.
+
+    Attributes
+    ----------
+    requires : criteria that must not have failed.
+    """
 
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,59}$")]
     points: Points
     title: str = ""
     requires: tuple[str, ...] = ()
-    message: str = ""  # shown if points were lost
+    message: str = ""  # shown if points are lost
 
 
 class _Graded(_Criterion):
-    """Full credit up to an error of `full_percent`, none from `none_percent`, linear in between.
+    """A criterion with full points up to `full_percent` of error and none from `none_percent` on.
 
-    Half a unit of the last typed digit and `sigmas` standard errors of the reference are first
-    subtracted from the error. Dampings have their own limits.
+    In between, points fall linearly. Half a unit of the last typed digit, and `sigmas` standard
+    errors of the reference, are subtracted from the error first. Dampings have limits of their own.
     """
 
     full_percent: Percent = 5.0
@@ -97,19 +116,19 @@ class _Graded(_Criterion):
 
 
 class RequiredPieces(_Criterion):
-    """Is everything in `[required]` present? Credit is the share that is."""
+    """Check that everything in `[required]` is present; points are given by the share that is."""
 
     check: Literal["required"]
 
 
 class DataQuality(_Criterion):
-    """Are the recordings sound? Credit is the share of good runs."""
+    """Check the recordings; points are given by the share without problems."""
 
     check: Literal["data"]
 
 
 class Parameters(_Graded):
-    """Reported parameters against those recomputed from the student's own recordings."""
+    """Compare reported parameters with those computed from the student's own recordings."""
 
     check: Literal["initial", "final"]
     parameters: tuple[str, ...] = ("*",)
@@ -117,7 +136,7 @@ class Parameters(_Graded):
 
 
 class InitialFinal(_Graded):
-    """The student's initial estimates against the final ones; guesses are not judged."""
+    """Compare the student's initial estimates with the final ones; guesses are not judged."""
 
     check: Literal["initial_final"]
     parameters: tuple[str, ...] = ("*",)
@@ -128,11 +147,11 @@ class InitialFinal(_Graded):
 
 
 class Laws(_Criterion):
-    """Redundancies and inequalities that the final table of a real chain obeys.
+    """Check the redundancies and inequalities that the final table of real carts satisfies.
 
-    A law holds if some table within half a unit of the last typed digits obeys it. Otherwise the
-    worst law counts: a quarter of the points is lost if it only holds within these percentages,
-    half within twice as much, and all from four times as much.
+    A law holds if some table within the rounding of the typed one satisfies it. If laws fail, the
+    worst one counts: a quarter of the points is lost if it holds only within the percentages below,
+    half if it holds only within twice as much, and all from four times as much.
     """
 
     check: Literal["laws"]
@@ -141,15 +160,15 @@ class Laws(_Criterion):
 
 
 class StateModel(_Graded):
-    """A and B against the student's own final table, or the reference: entry by entry."""
+    """Compare each entry of A and B with the student's own final table, or with the reference."""
 
     check: Literal["state_space"]
 
 
 class Gains(_Criterion):
-    """The gains on the carts: stable, and overshoot and settling time within the goal.
+    """Simulate the gains on the carts: stable, with overshoot and settling time within the goal.
 
-    Overshoot counts in percentage points above the goal, settling time in percent above it.
+    Errors are percentage points of overshoot, and percent of settling time, above the goal.
     """
 
     check: Literal["gains"]
@@ -160,7 +179,7 @@ class Gains(_Criterion):
 
 
 class Claims(_Criterion):
-    """Reported overshoot (percentage points) and settling time (percent) against simulation."""
+    """Compare reported overshoot (in points) and settling time (in percent) with a simulation."""
 
     check: Literal["claims"]
     overshoot_full: Percent = 5.0
@@ -170,7 +189,7 @@ class Claims(_Criterion):
 
 
 class Prefilter(_Criterion):
-    """The prefilter against the reciprocal of the loop's static gain."""
+    """Compare the prefilter with the reciprocal of the loop's static gain."""
 
     check: Literal["prefilter"]
     full_percent: Percent = 5.0
@@ -178,7 +197,7 @@ class Prefilter(_Criterion):
 
 
 class Hardware(_Criterion):
-    """A closed-loop run with a stated controller: its difference from the model (NRMSE, percent).
+    """Compare a closed-loop run with a simulation of its stated controller (NRMSE, in percent).
 
     If the run did not use the reported gains, the message says so.
     """
@@ -208,12 +227,14 @@ class Rubric(TomlTable):
 
     Attributes
     ----------
-    system, design : replace the submission's own; without `design` the submission's is used.
+    system : replaces the submission's own.
+    design : replaces the submission's own, if given.
     step : points are rounded to it.
     anonymous : names are left out of all files unless requested.
     examples : submission folders given out with the assignment, relative to the rubric's folder;
-        any submission may contain their recordings.
-    students : what students see at the desk of a lab server whose user list names the rubric.
+        any
+        submission may contain their recordings.
+    students : what students see at the desk of a lab server whose list of users names the rubric.
     """
 
     version: Literal[1]
@@ -231,7 +252,7 @@ class Rubric(TomlTable):
 
     @property
     def names(self) -> list[str]:
-        """The parameters of the system, in the order of the paper's tables."""
+        """The parameter names of the system, in the order of the paper's tables."""
         return parameter_names(self.system.carts, rigid=self.system.bench.rigid)
 
     @property
@@ -241,5 +262,5 @@ class Rubric(TomlTable):
 
 
 def matching(patterns: tuple[str, ...], names: list[str]) -> list[str]:
-    """Return the names that match one of the patterns, in their order."""
+    """Return the names that match at least one pattern, in their order."""
     return [n for n in names if any(fnmatchcase(n, pattern) for pattern in patterns)]

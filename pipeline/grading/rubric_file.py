@@ -1,4 +1,4 @@
-"""Read a rubric; every mistake is one line with file, line, key and a suggestion."""
+"""Read a rubric; each mistake in it is reported in one line with file, line, key and suggestion."""
 
 import re
 from collections.abc import Collection, Iterator, Sequence
@@ -35,8 +35,8 @@ _CHECKS: dict[str, type[BaseModel]] = {
     for model in get_args(get_args(rubric.Criterion)[0])
     for check in get_args(model.model_fields["check"].annotation)
 }
-_OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # the keys that every check has
-# Harmless values, used in place of wrong or missing ones.
+_OF_CRITERIA = tuple(rubric.DataQuality.model_fields)  # keys that every criterion has
+# Valid values that replace wrong or missing ones, so that the other mistakes can be found.
 _HARMLESS: dict[str | int, Any] = {"version": 1, "points": 1.0, "id": "criterion", "kind": "step"}
 _HEADER = re.compile(r"\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _ID = re.compile(r"^\s*id\s*=\s*[\"']([^\"']*)", re.MULTILINE)
@@ -44,22 +44,23 @@ _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
 
 
 def load_rubric(path: Path) -> Rubric:
-    """Read and check a rubric: a file or a shipped name.
+    """Return the rubric in a file, or a shipped one by its name.
 
     Raises
     ------
-    ConfigError : one line for every mistake, with file, line, key and what was expected.
+    ConfigError : the rubric has mistakes: one line for each, with file, line, key and what was
+        expected.
     """
     path = find_rubric(path)
     return parse_rubric(rubric_source(path), where=path.name)
 
 
 def find_rubric(path: Path) -> Path:
-    """Return the file of a rubric, given a file or a shipped name.
+    """Return the path of a rubric, given a path or the name of a shipped rubric.
 
     Raises
     ------
-    ConfigError : no rubric has this name.
+    ConfigError : there is no such rubric.
     """
     path = Path(path)
     if not path.exists() and path.suffix == "" and (RUBRICS / f"{path.name}.toml").is_file():
@@ -87,11 +88,11 @@ def rubric_source(path: Path) -> str:
 
 
 class InvalidRubric(ConfigError):
-    """A rubric with mistakes in it.
+    """A rubric has mistakes.
 
     Attributes
     ----------
-    problems : (line, problem) in the order of the file; line 0 stands for the whole file.
+    problems : line and problem, in the order of the file; line 0 means the whole file.
     """
 
     def __init__(self, where: str, problems: Sequence[tuple[int, str]]) -> None:
@@ -100,7 +101,11 @@ class InvalidRubric(ConfigError):
 
 
 def parse_rubric(text: str, *, where: str) -> Rubric:
-    """Check the text of a rubric; messages call the file `where`.
+    """Return the rubric in a text.
+
+    Parameters
+    ----------
+    where : name of the file in messages.
 
     Raises
     ------
@@ -123,7 +128,12 @@ def parse_rubric(text: str, *, where: str) -> Rubric:
 
 @dataclass(frozen=True, kw_only=True)
 class _Complaint:
-    """A problem at a place of the document; `missing`: nothing is there."""
+    """A problem and the place of the document where it is.
+
+    Attributes
+    ----------
+    missing : the place is empty, because a key is missing.
+    """
 
     at: Location
     what: str
@@ -137,18 +147,18 @@ class _Validated:
 
 
 def _is_of_slip(complaint: _Complaint, line: int, read: Toml) -> bool:
-    """Return whether a missing key may be in a line that is not valid TOML."""
+    """Return whether a key seems missing only because its line is not valid TOML."""
     if not complaint.missing:
         return False
     lines = read.text.split("\n")
     headings = [n for n, typed in enumerate(lines, start=1) if typed.lstrip().startswith("[")]
     end = next((n for n in headings if n > line), len(lines) + 1)
-    # If the mistake is in a heading, the whole table is missing.
+    # If the invalid line is a heading, the whole table seems missing.
     return any(len(complaint.at) == 1 or line <= slip < end for slip, _ in read.slips)
 
 
 def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
-    """Check a document and report all problems, also when one value would hide another's.
+    """Check a document and report all problems, even those that an earlier one would hide.
 
     Parameters
     ----------
@@ -181,8 +191,13 @@ def _try(document: dict) -> tuple[Rubric | None, list[ErrorDetails]]:
 
 
 def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) -> Any:
-    """Return a criterion with a known check, so that its other keys can be checked too."""
-    if not isinstance(own, dict) or own.get("check") in list(_CHECKS):  # also {}
+    """Return a criterion with a valid check, so that its other keys can be checked too.
+
+    If its check is unknown or missing, a problem is added to `complaints`, and the nearest valid
+    check is used.
+    """
+    # A list, because the value may be unhashable.
+    if not isinstance(own, dict) or own.get("check") in list(_CHECKS):
         return own
     at: Location = ("criteria", i, "check")
     meant = get_close_matches("check", [key for key in own if key not in _OF_CRITERIA], n=1)
@@ -198,13 +213,13 @@ def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) 
     complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}", missing=missing))
     left = {key: value for key, value in own.items() if key not in meant}
     close = get_close_matches(str(typed), list(_CHECKS), n=1)
-    if not close:  # its check is unknown, so only the common keys are checked
+    if not close:  # no check is similar: only the common keys can be checked
         left = {key: value for key, value in left.items() if key in _OF_CRITERIA}
     return {**left, "check": close[0] if close else "data"}
 
 
 def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
-    """Return the place of a pydantic error, as keys of the file, and its message."""
+    """Return an error of pydantic as a problem, with the keys of the file."""
     return _Complaint(
         at=without_tag(error["loc"], document),
         what=explain(error, document, root=Rubric),
@@ -213,7 +228,7 @@ def _complaint(error: ErrorDetails, document: dict) -> _Complaint:
 
 
 def _without(document: dict, wrong: Sequence[ErrorDetails]) -> dict:
-    """Return a document in which wrong values are replaced by harmless ones or removed."""
+    """Return a document in which wrong values are replaced by valid ones or removed."""
     left = deepcopy(document)
     for error in wrong:
         *way, key = without_tag(error["loc"], document)
@@ -242,7 +257,13 @@ def _tuples(value: Any) -> Any:
 def _contradictions(
     found: Rubric, ids: Sequence[object], *, lost: Collection[str]
 ) -> Iterator[tuple[Location, str]]:
-    """Yield (location, problem); `ids` are the ids of the criteria as typed."""
+    """Yield place and problem of each contradiction between tables.
+
+    Parameters
+    ----------
+    ids : the ids of the criteria as typed.
+    lost : ids of criteria that may be in lines that are not valid TOML.
+    """
     n, names = found.system.carts, found.names
     if not found.criteria:
         yield ("criteria",), "missing; add a [[criteria]] table for each criterion"
@@ -299,13 +320,13 @@ def _contradictions(
 
 
 def _nearest(pattern: str, names: Sequence[str]) -> str:
-    """Suggest a pattern if one was typed, else a parameter."""
+    """Return a suggestion for a name that matches no parameter: a pattern, if one was typed."""
     patterns = [f"{read.symbol}_*" for read in map(read_name, names) if read.suffix]
     return nearest(pattern, list(dict.fromkeys(patterns)) if "*" in pattern else names)
 
 
 def _line_of(text: str, at: Location) -> int:
-    """Return the line of a key, or that of the nearest table around it."""
+    """Return the line of a key, or the line of the nearest table that contains it."""
     best, line = 0, 1
     for number, path in key_lines(text):
         depth = 0
@@ -317,7 +338,7 @@ def _line_of(text: str, at: Location) -> int:
 
 
 def key_lines(text: str) -> Iterator[tuple[int, tuple[int | str, ...]]]:
-    """Yield (line, path) of every table heading and every key that begins a line."""
+    """Yield line and path of every table heading, and of every key at the beginning of a line."""
     table: tuple[int | str, ...] = ()
     counts: dict[str, int] = {}
     for number, line in enumerate(text.splitlines(), start=1):

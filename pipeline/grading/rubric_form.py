@@ -1,7 +1,7 @@
-"""Show the values of a rubric as a form, and write them back into its text.
+"""Show the values of a rubric as a form, and write changed values back into its text.
 
-The text is the source. Only a changed value is replaced, or a line is added.
-Comments, order and everything else stay byte for byte.
+Only a changed value is replaced in the text, or a line with it is added. Comments, order and
+everything else stay byte for byte.
 """
 
 import re
@@ -21,7 +21,7 @@ from pipeline.submission import Students
 from pipeline.submission.complaints import quote
 
 Unit = Literal["points", "percent", "share", "days", "percentage points", "choice"]
-Key = tuple[str | int, ...]  # ("criteria", 3, "points")
+Key = tuple[str | int, ...]  # path of a value: ("criteria", 3, "points")
 Value = Decimal | str
 
 _UNITS: Mapping[str, Unit] = {
@@ -41,12 +41,13 @@ _VALUE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class RubricField:
-    """A number of a rubric, or one of several words.
+    """A field of the form: a number, or a choice among words.
 
     Attributes
     ----------
-    name : name of the input; it contains the id of the criterion.
-    value : as shown; shares are shown in percent.
+    name : of the HTML input; it contains the id of the criterion.
+    key : path of the value in the rubric.
+    value : as shown; a share is shown in percent.
     choices : the possible words; empty for a number.
     """
 
@@ -59,7 +60,12 @@ class RubricField:
 
 @dataclass(frozen=True, kw_only=True)
 class CriterionFields:
-    """The numbers of a criterion; `tolerances` by their keys, in the order of the rubric."""
+    """The fields of one criterion.
+
+    Attributes
+    ----------
+    tolerances : by their keys, in the order of the rubric.
+    """
 
     id: str
     title: str
@@ -70,7 +76,15 @@ class CriterionFields:
 
 @dataclass(frozen=True, kw_only=True)
 class RubricForm:
-    """What a form can change of a rubric; `costs` by the code of the remark."""
+    """All values of a rubric that the form can change.
+
+    Attributes
+    ----------
+    late : fields of the late policy, by key.
+    costs : cost of each flag, by code.
+    step : rounding of points.
+    see : what students see.
+    """
 
     criteria: tuple[CriterionFields, ...]
     late: Mapping[str, RubricField]
@@ -80,7 +94,7 @@ class RubricForm:
 
     @property
     def charged(self) -> list[str]:
-        """The codes of the remarks that cost points."""
+        """The codes of the flags that cost points."""
         return [code for code, field in self.costs.items() if field.value != "0"]
 
     def fields(self) -> Iterator[RubricField]:
@@ -95,7 +109,12 @@ class RubricForm:
 
 
 class WrongFields(ConfigError):
-    """Fields with wrong values; `problems` by the name of the field."""
+    """Fields of the form have wrong values.
+
+    Attributes
+    ----------
+    problems : by the name of the field.
+    """
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         self.problems = dict(problems)
@@ -103,7 +122,7 @@ class WrongFields(ConfigError):
 
 
 def rubric_form(rubric: Rubric) -> RubricForm:
-    """Return the values of a rubric as fields; defaults are filled in."""
+    """Return the values of a rubric as a form; missing values are filled in with their defaults."""
     return RubricForm(
         criteria=tuple(_criterion(i, own, rubric.names) for i, own in enumerate(rubric.criteria)),
         late={key: _field(("late", key), getattr(rubric.late, key)) for key in _LATE},
@@ -137,7 +156,7 @@ def _criterion(index: int, own: asked.Criterion, names: list[str]) -> CriterionF
 
 
 def _tolerances(own: asked.Criterion, names: list[str]) -> Iterator[str]:
-    """Yield the keys of the tolerances that judge the numbers of a criterion."""
+    """Yield the keys of the tolerances that apply to the numbers of a criterion."""
     judged = matching(getattr(own, "parameters", ("*",)), names)
     dampings = [read_name(name).is_damping for name in judged]
     for key in type(own).model_fields:
@@ -171,9 +190,11 @@ def _digits(number: Decimal) -> str:
 
 
 def changed_fields(form: RubricForm, typed: Mapping[str, str]) -> dict[Key, Value]:
-    """Return the values changed in a form, in the form of the file.
+    """Return the values that a person changed in a form, as the rubric stores them.
 
-    Fields that are not in `typed` stay unchanged.
+    Parameters
+    ----------
+    typed : by the name of the field; missing fields are unchanged.
 
     Raises
     ------
@@ -210,7 +231,7 @@ def with_values(text: str, values: Mapping[Key, Value]) -> str:
 
     Raises
     ------
-    ConfigError : a value shares its line; a person must change it in the text.
+    ConfigError : a value shares its line with others; a person must change it in the text.
     """
     for key, value in values.items():
         text = _with_value(text, key, _toml(value))
@@ -234,7 +255,7 @@ def _with_value(text: str, key: Key, value: str) -> str:
 
 
 def _set(document: dict[str, Any], key: Key, value: str) -> dict[str, Any]:
-    """Return a document with one value replaced, given as TOML."""
+    """Return a document with one value replaced; the new value is given as TOML."""
     document = deepcopy(document)
     here: Any = document
     for part in key[:-1]:
@@ -244,9 +265,10 @@ def _set(document: dict[str, Any], key: Key, value: str) -> dict[str, Any]:
 
 
 def _candidates(text: str, key: Key, value: str) -> Iterator[str]:
-    """Yield candidates for the text with a new value, in its line or a new one, best first.
+    """Yield texts that may have the new value in the right place, the most likely first.
 
-    Text that looks like a key may be inside a longer value, so the caller parses each candidate.
+    A line that looks like the key may be part of a longer value. So the caller parses each text to
+    see whether it is right.
     """
     lines, places = text.split("\n"), list(key_lines(text))
     for number, path in places:
@@ -265,7 +287,7 @@ def _candidates(text: str, key: Key, value: str) -> Iterator[str]:
 
 
 def _above(lines: Sequence[str], at: int) -> int:
-    """Return the start of the comments above a line."""
+    """Return the first line of the comments directly above a line."""
     while at and lines[at - 1].lstrip().startswith("#"):
         at -= 1
     return at

@@ -1,4 +1,4 @@
-"""A rubric as data and in words (`templates/rubric.txt.j2`)."""
+"""Print a rubric, as data or as a page of text (`templates/rubric.txt.j2`)."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ from pipeline.submission.load import spring_names
 
 
 def rubric_dict(rubric: Rubric) -> dict[str, Any]:
-    """Return the rubric as plain data, with defaults filled in and patterns expanded."""
+    """Return the rubric as a dictionary for JSON; defaults are filled in and patterns expanded."""
     plain = rubric.model_dump(mode="json")
     plain["out_of"] = rubric.out_of
     for criterion, entry in zip(rubric.criteria, plain["criteria"], strict=True):

@@ -1,4 +1,4 @@
-"""The grading in words: `templates/words/grading.toml`, and how points are shown."""
+"""Texts of grading (`templates/words/grading.toml`), and points as text."""
 
 from pipeline.words.phrases import phrases
 
@@ -6,7 +6,7 @@ WORDS = phrases("grading")
 
 
 def on_one_line(reason: str) -> str:
-    """Join reasons, one per line, into a single line."""
+    """Return several reasons, given one per line, as a single line."""
     return "; ".join(line.rstrip(".") for line in reason.split("\n"))
 
 

@@ -27,16 +27,15 @@ FAILED = "could not be graded: "  # precedes the reason in the text of an event
 class Event:
     """One event in the history of a submission.
 
+    `graded` is a grading by the rubric alone. `listed` is an entry of a class list, with shared
+    data and overrides. `removed` is the removal from the class list. `override` has points given
+    by hand, or None if they were undone. `comment` leaves the points automatic. `asked`,
+    `answered` and `reopened` belong to a student's request to review a criterion.
+
     Attributes
     ----------
     at : ISO 8601, UTC.
-    what : the kind of event:
-        `graded`: by the rubric alone;
-        `listed`: in a class list, with shared data and overrides;
-        `removed`: from the class list;
-        `override`: points given by hand; None if undone;
-        `comment`: by hand, while the points stay automatic;
-        `asked`, `answered`, `reopened`: a student's request to review a criterion.
+    what : the kind of event.
     points, out_of : of the submission or the criterion; an answer has points only if it changes
         them.
     text : flags, reason or answer.

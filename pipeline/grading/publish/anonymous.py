@@ -1,4 +1,4 @@
-"""Results without names, the key that reveals them, and commands that accept pseudonyms."""
+"""Publish results without names; write the key to the names; accept pseudonyms in commands."""
 
 import hashlib
 import re
@@ -16,7 +16,7 @@ from pipeline.output import csv_text
 
 KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
-_SHORTEST = 6  # letters: a thousand submissions rarely need more
+_SHORTEST = 6  # characters: rarely too few, even for a thousand submissions
 STRANGER = "another submission"
 _ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
 
@@ -26,8 +26,9 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
 
     Parameters
     ----------
-    first_keys : by submission, the hash of the first version. A stranger cannot compute the
-        pseudonym from it, and later versions do not change it.
+    first_keys : by submission, the hash of its first version. Later versions keep it, and a
+        stranger
+        who knows the name cannot compute it.
     """
     hashes = {
         name: b32encode(hashlib.sha256(f"anonymous {key}".encode()).digest()).decode().lower()
@@ -50,11 +51,12 @@ def is_pseudonym(name: str) -> bool:
 
 
 def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
-    """Return the grade without authors and names of submissions.
+    """Return the grade without the names of submissions and authors.
 
-    Names occur in the flag for shared data, and before file names in the reason why a submission
-    could not be graded; platforms put the student's name into the name of an archive. The students'
-    own names of runs and files stay.
+    Besides its own fields, these names occur in two places: in the flag for shared data, and in the
+    reason why a submission could not be graded. There they precede file names, because platforms
+    put the student's name into the name of an archive. The students' own names of runs and files
+    stay.
     """
     hidden = _hidden_names(grade, names) | {
         "flags": tuple(
@@ -65,7 +67,7 @@ def anonymise(grade: Grade, names: Mapping[str, str]) -> Grade:
 
 
 def anonymous_line(line: Line, names: Mapping[str, str]) -> Line:
-    """Return the line of an anonymised grade."""
+    """Return the line of a submission under its pseudonym, without authors."""
     return line.model_copy(update=_hidden_names(line, names))
 
 
@@ -76,7 +78,7 @@ def _hidden_names(grade: Grade | Line, names: Mapping[str, str]) -> dict[str, ob
 
 
 def hidden_reason(reason: str, submission: str, own: str) -> str:
-    """Return the reason why a submission could not be graded, with `own` as its name."""
+    """Return the reason why a submission could not be graded, with `own` in place of its name."""
     if not reason:
         return ""
     name = re.escape(submission)
@@ -85,7 +87,7 @@ def hidden_reason(reason: str, submission: str, own: str) -> str:
 
 
 def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
-    """Return a flag for shared data with pseudonyms."""
+    """Return a flag for shared data with pseudonyms instead of names."""
     others = list(dict.fromkeys(names.get(o, STRANGER) for o in flag.evidence["submissions"]))
     recordings = [
         {**recording, "submission": names.get(recording["submission"], STRANGER)}
@@ -100,24 +102,26 @@ def _hidden(flag: Flag, names: Mapping[str, str]) -> Flag:
 
 
 def key_text(names: Mapping[str, str], authors: Mapping[str, tuple[str, ...]]) -> str:
-    """Return the key as CSV: the owner of each pseudonym."""
+    """Return the key as CSV: submission and authors of each pseudonym."""
     rows = sorted((names[name], name, " ".join(authors[name])) for name in names)
     return csv_text(("anonymous", "submission", "authors"), rows)
 
 
 def meant(book: Gradebook, team: str) -> str:
-    """Return the submission of a pseudonym; any other name is returned unchanged."""
+    """Return the submission that a pseudonym stands for; any other name is returned unchanged."""
     if not is_pseudonym(team):
         return team
     return {shown: name for name, shown in pseudonyms_in(book).items()}.get(team, team)
 
 
 def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
-    """Return a team's name as it was asked for, and its history under that name.
+    """Return the history of a team, under the name that was asked for.
+
+    If this is a pseudonym, the events have no other names.
 
     Raises
     ------
-    ConfigError : there is no such submission, or several.
+    ConfigError : there is no such submission, or there are several.
     """
     name = meant(book, team)
     submission, events = book.history(name, named=not is_pseudonym(team))
@@ -125,7 +129,7 @@ def history_of(book: Gradebook, team: str) -> tuple[str, list[Event]]:
 
 
 def renamed_events(events: Sequence[Event], name: str, shown: str) -> list[Event]:
-    """Return a history with another name for the submission."""
+    """Return events in which the name of the submission is replaced by `shown`."""
     return [replace(event, text=_renamed(event.text, name, shown)) for event in events]
 
 

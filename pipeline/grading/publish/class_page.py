@@ -1,4 +1,4 @@
-"""The class at a glance: distribution, difficulty, the most common mistakes, everybody's grade."""
+"""The page of a class: distribution, difficulty, most common mistakes, and all grades."""
 
 import math
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _OUTCOMES = ("pass", "partial", "fail", "skip")
-_NAMED = 8  # submissions named per mistake
+_NAMED = 8  # submissions or recordings named in one row
 
 
 def class_page(
@@ -49,7 +49,7 @@ def class_page(
     doubles: Sequence[Double] = (),
     clusters: Sequence[Cluster] = (),
 ) -> str:
-    """Return `class.html`; same class, same bytes."""
+    """Return `class.html`; the same class gives the same bytes."""
     frame = class_frame(lines, rubric=rubric)
     graded = frame.loc[frame["status"] == "graded"]
     points = graded.drop_duplicates("submission").loc[:, "total"]
@@ -101,7 +101,7 @@ def _board(lines: Sequence[Line], points: "pd.Series", rubric: Rubric) -> list[B
 
 
 def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]:
-    """Return the questions for the instructor: springs, failures, authors in several teams."""
+    """Return what the instructor should look at: springs, failures, authors in several teams."""
     failed = [line for line in lines if line.status == "failed"]
     blocks: list[Block] = []
     if asked := wrong_springs(line.springs for line in lines if line.status == "graded"):
@@ -111,7 +111,7 @@ def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]
             spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _hand(line))
             for line in failed
         )
-        if len(failed) > 8:  # folded
+        if len(failed) > 8:  # fold a long list
             blocks.append(Details(WORDS.spans("many_failed", n=str(len(failed))), (reasons,)))
         else:
             blocks += [paragraph(WORDS.text("some_failed")), reasons]
@@ -169,7 +169,7 @@ def _criteria(page: PageBuilder, graded: "pd.DataFrame", rubric: Rubric) -> list
 
 
 def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
-    """Return the flags, the most common first."""
+    """Return the table of flags, the most common first."""
     import pandas as pd
 
     codes = pd.Series(
@@ -195,7 +195,7 @@ def _mistakes(page: PageBuilder, lines: Sequence[Line]) -> list[Block]:
 
 
 def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster]) -> list[Block]:
-    """Return the shared recordings, cluster by cluster."""
+    """Return the table of shared recordings, grouped by clusters of submissions."""
     if not clusters:
         return []
     here = {line.submission for line in lines}
@@ -209,7 +209,7 @@ def _shared(page: PageBuilder, lines: Sequence[Line], clusters: Sequence[Cluster
 
 
 def _listed(links: Sequence[Span]) -> list[str | Span]:
-    """Return links separated by commas; beyond the first few, only their number."""
+    """Return links separated by commas; of a long list, the first few and the number of others."""
     text: list[str | Span] = [part for link in links[:_NAMED] for part in (link, ", ")][:-1]
     more = len(links) - _NAMED
     return [*text, f" and {more} more"] if more > 0 else text
@@ -229,7 +229,7 @@ def _row(line: Line) -> list[Cell | str | Spans]:
         (_link(line.submission),),
         clean(listing(line.authors)) or NOTHING,
         points_text(line.points),
-        f"{math.floor(share)}",  # 100 is for all points alone
+        f"{math.floor(share)}",  # rounded down, so that only full points give 100
         f"{line.days_late:.3g}" if line.days_late else "0",
         cell("not graded", "bad") if failed else ", ".join(line.codes),
         ", ".join(line.by_hand),
@@ -237,7 +237,7 @@ def _row(line: Line) -> list[Cell | str | Spans]:
 
 
 def feedback_link(name: str) -> str:
-    """Return the address of a submission's feedback, beside `class.html`."""
+    """Return the address of a submission's feedback, relative to `class.html`."""
     return f"feedback/{quote(name, safe='')}/feedback.html"
 
 

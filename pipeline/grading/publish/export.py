@@ -1,14 +1,16 @@
 """Export class grades in the formats of Canvas, Moodle and Gradescope.
 
 Each format is a table with a row for every student. If the platform's own exported table (a roster)
-is given, its rows and columns stay as they are and the grades are filled in.
+is given, its rows and columns stay and only the grades are filled in.
 
-- Canvas: the gradebook's CSV, read by `lib/gradebook_importer.rb`: the student is found by `ID`,
-  `SIS User ID` or `SIS Login ID`, the assignment by its title, or its id in brackets behind it.
-- Moodle: the offline grading worksheet of one assignment (`mod/assign/feedback/offline`), where
-  participant numbers are known; else the table of the gradebook's *Import CSV*.
-- Gradescope: the table of its *Download Grades*, and for each submission the `results.json` by
-  which an autograder gives scores.
+- Canvas: the CSV of its gradebook, read by `lib/gradebook_importer.rb`. It finds students by `ID`,
+  `SIS User ID` or `SIS Login ID`, and the assignment by its title, which may be followed by its id
+  in
+  brackets.
+- Moodle: the offline grading worksheet of one assignment (`mod/assign/feedback/offline`), if the
+  participant numbers are known; otherwise the table for *Import CSV* of its gradebook.
+- Gradescope: the table of its *Download Grades*, and a `results.json` for each submission, as an
+  autograder writes it.
 """
 
 import html
@@ -51,13 +53,14 @@ def export(
     Parameters
     ----------
     out : a folder, existing or new; or a .csv file, to write only the table.
-    title : of the assignment as the platform has it; default: the rubric's.
+    title : of the assignment on the platform; default: the rubric's title.
     roster : the table that the platform exports.
 
     Raises
     ------
-    ConfigError : the roster is not such a table, or has another maximum grade, or `out` is another
-        kind of file.
+    ConfigError : the roster is not the platform's table, or has another maximum grade; or `out` has
+        the
+        name of another kind of file.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)
@@ -94,7 +97,7 @@ def export(
 def _fill_own(
     roster: Roster, platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> tuple[str, list[Remark]]:
-    """Return a platform's own table with the grades, and remarks on mismatches."""
+    """Return the platform's own table with grades filled in, and remarks on mismatches."""
     form = WORKSHEET if _has_numbers(platform, "Identifier" in roster.table) else FORMS[platform]
     there = {name: text for name, text in form.if_there.items() if name in roster.table}
     columns = {
@@ -112,7 +115,7 @@ def _fill_own(
 def _make_table(
     platform: Platform, students: Sequence[Student], rubric: Rubric, *, title: str
 ) -> str:
-    """Return a new table that the platform can import, without its own table."""
+    """Return a new table that the platform can import, if its own table was not given."""
     numbered = bool(students) and all(student.number for student in students)
     form = WORKSHEET if _has_numbers(platform, numbered) else FORMS[platform]
     head = [name.format(title=title) for name in form.new]
@@ -123,7 +126,7 @@ def _make_table(
     if platform == "canvas":
         possible = [f"    {POINTS_POSSIBLE}", *[""] * (len(head) - 2), points_text(rubric.out_of)]
         rows.insert(0, possible)
-    if platform == "gradescope":  # a column a criterion
+    if platform == "gradescope":  # one column for each criterion
         for i, c in enumerate(rubric.criteria, start=1):
             head.append(f"{i}: {c.title or c.id} ({c.points} pts)")
             for row, student in zip(rows, students, strict=True):
@@ -133,12 +136,12 @@ def _make_table(
 
 
 def _has_numbers(platform: Platform, numbered: bool) -> bool:
-    """Return whether it is Moodle's table of participants."""
+    """Return whether the table is Moodle's worksheet, which has participant numbers."""
     return platform == "moodle" and numbered
 
 
 def values_of(student: Student, rubric: Rubric) -> dict[str, str]:
-    """Return all values of a student for columns, by name."""
+    """Return the values of a student by the names that `platforms.Form` uses for them."""
     first, _, last = student.name.partition(" ")
     return {
         "name": student.name,
@@ -167,7 +170,10 @@ def _comment(student: Student) -> str:
 
 
 def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
-    """Return points lost or given by hand, and remarks, one line each."""
+    """Return a line for each criterion that lost points or has points by hand, and for each flag.
+
+    The deduction for lateness comes last.
+    """
     if grade.status == "failed" and not grade.criteria:
         return [f"Could not be graded: {on_one_line(grade.reason)}"]
     lost = [
@@ -197,7 +203,7 @@ def _write_results(entries: Iterable[Entry], folder: Path, *, rubric: Rubric) ->
 
 
 def remove_exports(folder: Path) -> list[Path]:
-    """Remove what earlier exports wrote into the folder of a class, and return these files."""
+    """Remove the files that earlier exports wrote into a class's folder; return their paths."""
     tables = [folder / f"{platform}.csv" for platform in FORMS]
     results = (folder / "gradescope").glob("*/results.json")
     there = [file for file in (*tables, *results) if file.is_file()]

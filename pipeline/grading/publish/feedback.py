@@ -1,4 +1,4 @@
-"""Feedback for one submission: their numbers next to ours, reasons, and where to look."""
+"""Feedback for one submission: reported and recomputed numbers, reasons, and where to look."""
 
 import re
 from collections.abc import Sequence
@@ -41,8 +41,8 @@ _TITLE = re.compile(r"<title>(.*?)</title>", re.DOTALL)
 _NAME = re.compile(r"(omega|zeta|K)(_\w)?")
 TONES: dict[Outcome, Tone] = {"pass": "good", "partial": "", "fail": "bad", "skip": "quiet"}
 _ENTRY = re.compile(r"([AB])\((\d+)(?:, (\d+))?\)")
-_SHARE = "_percent"  # ends the name of a number that is a percentage itself
-_FINEST = 2  # decimals of such a number
+_SHARE = "_percent"  # end of the key of a number that is already a percentage
+_FINEST = 2  # decimals of such a percentage
 
 
 def feedback_page(
@@ -52,11 +52,11 @@ def feedback_page(
     figures: Sequence[tuple[str, str]],
     name: str,
 ) -> str:
-    """Return `feedback.html`; same grade, same bytes.
+    """Return `feedback.html`; the same grade gives the same bytes.
 
     Parameters
     ----------
-    figures : file names and SVG.
+    figures : pairs of file name and SVG text.
     name : the name of the submission on the page.
     """
     numbers = count(1)
@@ -121,17 +121,17 @@ def _summary(grade: Grade) -> list[Block]:
 
 
 def counted_days(days: float) -> str:
-    """Return "1 day", "1.5 days"."""
+    """Return a number of days in words: "1 day", "1.5 days"."""
     return f"{days:.3g} day{'' if days == 1 else 's'}"
 
 
 def counted_criteria(n: int) -> str:
-    """Return "1 criterion", "2 criteria"."""
+    """Return a number of criteria in words: "1 criterion", "2 criteria"."""
     return f"{n} {'criterion' if n == 1 else 'criteria'}"
 
 
 def _lost(grade: Grade) -> list[Block]:
-    """Return the lost points, largest loss first."""
+    """Return the table of lost points, the largest loss first."""
     lost = [c for c in grade.criteria if c.points < c.out_of]
     if not lost:
         return [paragraph(WORDS.text("earned_all_but_look" if grade.flags else "earned_all"))]
@@ -155,7 +155,7 @@ def _notes(grade: Grade) -> list[Block]:
 
 
 def sentence(text: str) -> str:
-    """Return a message as a sentence: a capital where it starts with a word, and a full stop."""
+    """Return a message with a full stop, and with a capital if it starts with a word."""
     text = clean(text).strip()
     word = text.split(" ", 1)[0]
     if word.isascii() and word.isalpha() and word.islower():
@@ -185,7 +185,7 @@ def _capital(text: str) -> str:
 
 
 def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
-    """Return every criterion with its numbers; those passed are folded."""
+    """Return each criterion with its numbers; those with full points are folded."""
     checks = {criterion.id: criterion.check for criterion in rubric.criteria}
     rows = [
         [
@@ -213,7 +213,7 @@ def _criteria(grade: Grade, rubric: Rubric, numbers: count) -> list[Block]:
 def numbers_table(
     criterion: Criterion, *, check: str, units: Units | None, numbers: count
 ) -> Table | None:
-    """Return the numbers of a criterion side by side; None if it has no numbers."""
+    """Return reported and recomputed numbers of a criterion side by side; None without numbers."""
     names = [
         name
         for name in dict.fromkeys((*criterion.expected, *criterion.found))
@@ -235,7 +235,7 @@ def numbers_table(
 
 
 def evidence_table(flag: Flag, *, units: Units | None, numbers: count) -> Table | None:
-    """Return the numbers and texts behind a remark, or None."""
+    """Return the numbers and texts that support a flag; None without any."""
     of = flag.evidence.get("parameter")
     found = {
         name: value
@@ -257,22 +257,25 @@ def _is_shown(value: Any) -> bool:
 
 
 def _label(name: str, units: Units | None) -> str | tuple[Span, ...]:
-    """Return a quantity with its unit, parameters of the carts as mathematics."""
+    """Return the name of a quantity with its unit.
+
+    Parameters of the carts are set as mathematics.
+    """
     unit = _unit(name, units)
     shown = name_span(name) if _NAME.fullmatch(name) else Span(_called(name))
     return spans(shown, f" [{unit}]" if unit else "")
 
 
 def _called(name: str) -> str:
-    """Return the name of a number; without a name, its key in grade.json."""
+    """Return the name of a quantity; if it has none, its key in grade.json made readable."""
     key = f"quantity_{name}"
     return WORDS.text(key) if key in WORDS.by_key else _capital(clean(name).replace("_", " "))
 
 
 def _unit(name: str, units: Units | None) -> str:
-    """Return the unit of a parameter, of the prefilter, or of an entry of A or B; else ""."""
+    """Return the unit of a parameter, the prefilter, or an entry of A or B; "" without a unit."""
     if entry := _ENTRY.fullmatch(name):
-        if int(entry[2]) % 2:  # a velocity, which is 0 or 1 of the states
+        if int(entry[2]) % 2:  # row for a position's derivative, whose entries are 0 or 1
             return ""
         if entry[1] == "A":
             return "1/s" if int(entry[3]) % 2 == 0 else "1/s²"
@@ -288,13 +291,16 @@ def _value(name: str, value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, Real):
         number = round(float(value), _FINEST) if name.endswith(_SHARE) else float(value)
-        # A number typed with fewer digits is shown as typed.
+        # Numbers have four digits. A number that was typed with fewer is shown as typed.
         return min(significant(number), typeset(f"{number:.6g}"), key=len)
     return clean(value)[:200] if isinstance(value, str) else NOTHING
 
 
 def _off(name: str, found: Any, expected: Any) -> str:
-    """Return the difference of two numbers: percentages in points, others as a share."""
+    """Return the difference of two numbers in words.
+
+    The difference of two percentages is in percentage points, any other is a share of `expected`.
+    """
     if not (_is_number(found) and _is_number(expected)):
         return NOTHING
     if name.endswith(_SHARE):
@@ -323,6 +329,6 @@ def _picture(number: int, file: str, svg: str) -> Picture:
 
 
 def alternative(svg: str) -> str:
-    """Return the text alternative of a figure."""
+    """Return the text alternative of a figure: the title in its SVG."""
     title = _TITLE.search(svg)
     return unescape(title[1]) if title else WORDS.text("some_figure")

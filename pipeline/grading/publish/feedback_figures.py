@@ -1,4 +1,4 @@
-"""Figures of the feedback: measurements with the curves of the reported numbers."""
+"""Figures of the feedback: measurements with the curves that the reported numbers give."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -20,15 +20,16 @@ from pipeline.results import Analysis, Record
 from pipeline.submission import Reported
 from pipeline.words.text import clean, name_span
 
-_RESPONSE = "response"  # begins a figure's name
-_MOST_CARTS = 3  # whose table stands for transfer functions
-_LARGEST = 1e9  # of gains and frequencies, and its reciprocal the least: no figure shows more
+_RESPONSE = "response"  # the names of these figures begin with this
+_MOST_CARTS = 3  # with more carts, a table does not determine the transfer functions
+_LARGEST = 1e9  # largest gain and frequency in a figure; the reciprocal is the smallest
 
 
 def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[str, str], ...]:
-    """Return file names and SVG: the response of each cart, with the curve of the final table.
+    """Return the measured response of each cart with the curve of the reported final table.
 
-    The curve is left out if the table is incomplete or gives no valid response.
+    Each figure is a pair of file name and SVG text. The curve is left out if the table is
+    incomplete or gives no valid response.
     """
     curve = _response({name: float(v) for name, v in (reported.final if reported else {}).items()})
     if curve and (len(curve[0]) != analysis.bench.n or analysis.bench.n > _MOST_CARTS):
@@ -50,9 +51,10 @@ def draw_figures(analysis: Analysis, reported: Reported | None) -> tuple[tuple[s
 
 
 def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tuple[str, str], ...]:
-    """Return file names and SVG: recordings of the initial numbers that lost points.
+    """Return recordings that show why numbers of the initial table lost points.
 
-    Of several repeats the most telling is shown. Files are named after their numbers: `numbers_in`.
+    Each figure is a pair of file name and SVG text. If several recordings show the same number, the
+    most precise one is drawn. The file name contains the numbers; `numbers_in` reads them.
 
     Parameters
     ----------
@@ -97,18 +99,18 @@ def draw_records(analysis: Analysis, criteria: Iterable[Criterion]) -> tuple[tup
 
 
 def numbers_in(file: str) -> frozenset[str]:
-    """Return the parameters in a figure of a recording; empty for other figures."""
+    """Return the parameters in the file name of a recording's figure; empty for other figures."""
     kind, *names = file.removesuffix(".svg").split("-")
     return frozenset(names if kind == "record" else ())
 
 
 def is_response(file: str) -> bool:
-    """Whether a figure is the frequency response of a cart, with the final table's curve."""
+    """Return whether a figure is the frequency response of a cart."""
     return file.startswith(f"{_RESPONSE}-")
 
 
 def _response(values: Mapping[str, float]) -> tuple[Array, Sequence[Array]] | None:
-    """Return the gains and polynomials of a table, None if they are not valid."""
+    """Return the gains and polynomials of the transfer functions of a table; None if not valid."""
     sizes = [abs(v) for name, v in values.items() if not read_name(name).is_damping]
     if any(not 1 / _LARGEST < size < _LARGEST for size in sizes):
         return None

@@ -1,8 +1,10 @@
-"""A grade as the `results.json` of a Gradescope autograder.
+"""Write a grade as the `results.json` of a Gradescope autograder.
 
-Keys and values are those of Gradescope's *Autograder Specifications*. Students who must find the
-numbers themselves (`see = "check"`) see no computed number in it. Partial points reveal the error
-of a number, and resubmission is allowed, so these students see points only after the due date.
+Keys and values are those of Gradescope's *Autograder Specifications*.
+
+If students must find the numbers themselves (`see = "check"`), they see no computed number. Because
+they may resubmit, and partial points would reveal the error of a number, they see points only after
+the due date.
 """
 
 import json
@@ -15,11 +17,12 @@ from pipeline.grading.similarity.shared import told
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.text import with_symbols
 
-_WITHOUT_NUMBERS: tuple[Code, ...] = ("missing", "shared_data")  # remarks without numbers
+# Flags whose text has no computed numbers.
+_WITHOUT_NUMBERS: tuple[Code, ...] = ("missing", "shared_data")
 
 
 def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
-    """Return a grade as `results.json`; same grade, same bytes."""
+    """Return a grade as `results.json`; the same grade gives the same bytes."""
     hidden = rubric.students.see == "check"
     document = {
         "score": grade.points,
@@ -47,12 +50,17 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
 
 
 def told_flags(grade: Grade, *, codes: Collection[Code] = CODES) -> list[str]:
-    """Return the student's text for each remark with one of these codes."""
+    """Return the text that students see for each flag with one of these codes."""
     return [with_symbols(told(flag)) for flag in grade.flags if flag.code in codes]
 
 
 def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
-    """Return the student's text for the whole grade."""
+    """Return the lines that students see about the whole grade.
+
+    Parameters
+    ----------
+    hidden : show no computed number.
+    """
     how = " automatically, points were given by hand" if by_hand else ""
     failed = grade.status == "failed"
     said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
@@ -65,7 +73,12 @@ def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
 
 
 def _say_of(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
-    """Return the student's text for a criterion; if hidden, outcome, titles and reasons only."""
+    """Return the text that students see about a criterion.
+
+    Parameters
+    ----------
+    hidden : show only the outcome, the titles of flags, and reasons for points by hand.
+    """
     outcome = WORDS.text(f"outcome_{judged.outcome}")
     if not hidden:
         return f"{outcome}: {with_symbols(judged.message)}"

@@ -1,6 +1,6 @@
 """Write the output of a grading: `grades.csv`, `class.html`, and all feedback.
 
-The files depend only on the gradebook: written again at any time, they are the same.
+The files depend only on the gradebook. Writing them again gives the same files.
 """
 
 import hashlib
@@ -26,18 +26,19 @@ from pipeline.words.progress import Progress, silent
 
 FEEDBACK = "feedback"
 _PAGE, _JSON, _CLASS = "feedback.html", "grade.json", "class.html"
-_WHOLE = ""  # key of the class page among the submissions' pages
-# Hashes of the data behind each page; an unchanged page is not written again.
+_WHOLE = ""  # key of the class page in the table of hashes
+# File with a hash of the data of each page. A page is written again only if its hash has changed.
 _MADE = ".made.json"
 _BEFORE = ("submission", "authors", "status", "points", "out_of", "days_late", "deducted")
 _AFTER = ("remarks", "by_hand", "reason")
 
 
 def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) -> list[Double]:
-    """Write the class list of a gradebook into a folder; return authors of several submissions.
+    """Write the output files of a gradebook into a folder.
 
-    An `anonymous` rubric leaves out all names, and `anonymous-key.csv` reveals them. Feedback of an
-    earlier batch is removed; other files stay.
+    Returns the people who are authors of several submissions. An `anonymous` rubric leaves out all
+    names; then `anonymous-key.csv` has them. Feedback of submissions that are no longer in the
+    class is removed; other files stay.
     """
     rubric = book.rubric
     names = _names(book, out) if rubric.anonymous else None
@@ -63,7 +64,7 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         if there and made_of.get(grade.submission) == now_of[grade.submission]:
             continue
         progress(f"feedback: {grade.submission}")
-        (folder / _MADE).unlink(missing_ok=True)  # until all pages are written again
+        (folder / _MADE).unlink(missing_ok=True)  # if this run stops, the next one writes all pages
         own.mkdir(exist_ok=True)
         page = feedback_page(
             grade,
@@ -74,7 +75,8 @@ def write_outputs(book: Gradebook, out: Path, *, progress: Progress = silent) ->
         write_file(own / _PAGE, page)
         write_file(own / _JSON, grade_text(grade))
     if names is not None:
-        lines.sort(key=lambda line: line.submission)  # the order would reveal the names
+        # The order of the class list would reveal the names.
+        lines.sort(key=lambda line: line.submission)
     _remove_stale(folder, keep=set(now_of))
     write_file(out / "grades.csv", grades_csv(lines, rubric=rubric))
     doubles = doubles_of(book, authors, gradings=gradings, names=names)
@@ -98,7 +100,13 @@ def doubles_of(
     gradings: Mapping[str, int],
     names: Mapping[str, str] | None,
 ) -> list[Double]:
-    """Return the authors of several submissions, without names if `names` has pseudonyms."""
+    """Return the people who are authors of several submissions.
+
+    Parameters
+    ----------
+    authors, gradings : of each submission: its authors, and the number of its grading.
+    names : pseudonyms by submission, if the result must have no names.
+    """
     found = find_doubles(authors)
     concerned = dict.fromkeys(name for double in found for name in double.submissions)
     found = with_recordings(found, book.prints([gradings[name] for name in concerned]))
@@ -142,7 +150,7 @@ def grades_csv(lines: Sequence[Line], *, rubric: Rubric) -> str:
 
 
 def _names(book: Gradebook, out: Path) -> dict[str, str]:
-    """Return the pseudonyms of a class, and write the key that reveals them."""
+    """Return the pseudonyms of a class; write the file that maps them to names."""
     keys: dict[str, str] = {}
     authors: dict[str, tuple[str, ...]] = {}
     for entry in book.entries():
@@ -155,7 +163,7 @@ def _names(book: Gradebook, out: Path) -> dict[str, str]:
 
 
 def _look(rubric: Rubric) -> str:
-    """Return a hash of everything that pages have in common."""
+    """Return a hash of everything that affects all pages, such as templates and the rubric."""
     names = ("report.html.j2", "blocks.html.j2", "report.css", "page.js", "explore.js")
     parts = [(TEMPLATES / name).read_text(encoding="utf-8") for name in names]
     return _digest(*parts, rubric.model_dump_json())
@@ -177,7 +185,7 @@ def _read_made(folder: Path) -> dict[str, str]:
 
 
 def _checked(name: str) -> str:
-    """Return a submission's name if it is a plain folder name."""
+    """Return the name of a submission; refuse it if it is not a plain folder name."""
     if Path(name).name != name or name in ("", ".", ".."):
         raise ConfigError(f"{name!r}: cannot be the name of a feedback folder")
     return name

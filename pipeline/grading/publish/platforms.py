@@ -1,7 +1,7 @@
 """The tables of learning platforms: their columns and the values written into them.
 
-A column's text names values of a student in braces, see `export.values_of`; `{title}` is the
-assignment's.
+The text of a column has names in braces, which are replaced by values of a student; see
+`export.values_of`. `{title}` is replaced by the title of the assignment.
 """
 
 from collections.abc import Mapping
@@ -12,14 +12,15 @@ from pipeline.grading.intake.lms_names import Platform
 
 @dataclass(frozen=True, kw_only=True)
 class Form:
-    """The columns of a platform.
+    """The columns of a platform's tables.
 
     Attributes
     ----------
-    own : columns of which its own table always has one, and other platforms' never.
-    filled : columns of its own table that receive grades; `if_there` : optional ones.
+    own : sets of columns; a table is the platform's own if it has all columns of one set.
+    filled : columns of the platform's own table that receive grades.
+    if_there : columns that receive values only if the table has them.
     kept : other columns to keep; empty: all.
-    new : the columns of a new table.
+    new : the columns of a table that cartlab makes.
     """
 
     own: tuple[frozenset[str], ...] = ()
@@ -33,7 +34,7 @@ FORMS: Mapping[Platform, Form] = {
     "canvas": Form(
         own=(frozenset({"Student", "ID"}),),
         filled={"{title}": "{points}"},
-        # All that is about the student: the importer wants "Section" to be the last of them.
+        # All columns about the student. The importer wants "Section" to be the last of these.
         kept=(
             "Student", "ID", "SIS User ID", "SIS Login ID", "Integration ID", "Root Account",
             "Section",
@@ -65,7 +66,7 @@ FORMS: Mapping[Platform, Form] = {
         },
     ),
 }  # fmt: skip
-# Of Moodle, where participants have numbers: the offline grading worksheet of one assignment.
+# Moodle's offline grading worksheet of one assignment, used if the participant numbers are known.
 WORKSHEET = Form(
     filled={"Grade": "{points}"},
     if_there={"Feedback comments": "{comment}"},

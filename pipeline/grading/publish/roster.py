@@ -1,4 +1,4 @@
-"""Fill grades into the table of students that a learning platform exports."""
+"""Fill grades into the table of students (roster) that a learning platform exports."""
 
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -18,19 +18,20 @@ from pipeline.submission.complaints import quote
 if TYPE_CHECKING:
     import pandas as pd
 
-POINTS_POSSIBLE = "Points Possible"  # Canvas' row on top, about the assignments
-_MAXIMUM = "Maximum Grade"  # Moodle's, of the assignment: its import refuses a grade above it
-# Columns that say who a row is about.
+POINTS_POSSIBLE = "Points Possible"  # marks the first row of Canvas, which is about the assignments
+_MAXIMUM = "Maximum Grade"  # column of Moodle, whose import refuses a higher grade
+# Columns that identify the student of a row: by number, by id, by name.
 _NUMBERS = ("ID", "Identifier", "Submission ID")
 _IDS = ("SIS User ID", "SIS Login ID", "ID number", "SID", "Username", "Email", "Email address")
 _NAMES = ("Student", "Full name", "Name")
-_PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # of Moodle, in any language
-_TITLE = re.compile(r"(.*?)(?: \(\d+\))?")  # of Canvas, with the assignment's id behind it
+_PARTICIPANT = re.compile(r"^\D+ (\d+)$")  # a participant of Moodle, in any language
+# A title in Canvas, perhaps followed by the assignment's id.
+_TITLE = re.compile(r"(.*?)(?: \(\d+\))?")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Roster:
-    """A platform's own table, all texts; cells that are not filled in stay as they are."""
+    """The table that a platform exports; all cells are texts."""
 
     file: str
     table: "pd.DataFrame"
@@ -57,11 +58,11 @@ class Roster:
         return cls(file=path.name, table=table)
 
     def check_maximum(self, out_of: float, *, title: str) -> None:
-        """Refuse a table with another maximum grade, because the platform keeps its own.
+        """Refuse a table with another maximum grade, because an import would not change it.
 
         Raises
         ------
-        ConfigError : Moodle's column or Canvas' row of possible points differs.
+        ConfigError : Moodle's column or Canvas' row of possible points has another maximum.
         """
         column = self._title(title)
         said = [*self.table[_MAXIMUM].unique()] if _MAXIMUM in self.table else []
@@ -82,13 +83,13 @@ class Roster:
         keep: Collection[str] | None = None,
         possible: str = "",
     ) -> tuple[str, list[Remark]]:
-        """Return the table with these columns filled in, and remarks on mismatches.
+        """Return the table with grades filled in, and remarks on mismatches; other cells stay.
 
         Parameters
         ----------
-        columns : by title; one that is not there yet comes last.
-        keep : the columns to keep beside them, default: all.
-        possible : the points possible, for Canvas' row of them.
+        columns : by title, the value of a student; a column that is missing is added at the end.
+        keep : other columns to keep; default: all.
+        possible : the maximum points, for Canvas' first row.
         """
         titles = {title: self._title(title) for title in columns}
         kept = [name in (keep or self.table.columns) for name in self.table.columns]
@@ -118,15 +119,17 @@ class Roster:
         found: Mapping[Any, Sequence[Student]],
         settled: Mapping[Any, Student],
     ) -> list[Remark]:
-        """Return remarks on mismatches.
+        """Return remarks on students without a row, rows without a student, and similar mismatches.
 
         Parameters
         ----------
-        matched : the row of each student, or None.
-        found, settled : by row, the matching students and the one that counts.
+        matched : each student with the row found, or None.
+        found : by row, the students that match it.
+        settled : by row, the student whose grade is filled in.
         """
         index, shared = self._index
-        # One of the authors, who are named, handed it in.
+        # An account without a row is no problem: it belongs to one of the authors, who have their
+        # own rows.
         unmatched = [student for at, student in matched if at is None and not student.uploader]
         twice = [s for s in unmatched if not shared.isdisjoint(_words(s))]
         strangers = [s for s in unmatched if s not in twice]
@@ -173,8 +176,8 @@ class Roster:
         return remarks
 
     def _of_all(self) -> "pd.Series":
-        """Return the rows that concern the assignments, not a student."""
-        # Several columns may have no name, the first of them too.
+        """Return a mask of the rows that are about assignments, not about a student."""
+        # There may be several columns without a name, and the first column may be one.
         students = self.table["Student"] if "Student" in self.table else self.table.iloc[:, 0]
         return students.str.contains(POINTS_POSSIBLE, regex=False)
 
@@ -187,7 +190,7 @@ class Roster:
 
     @cached_property
     def _index(self) -> tuple[dict[tuple[str, str], Any], set[Any]]:
-        """Return the row of each identifying text, and the texts that several rows share."""
+        """Return the row of each text that identifies a student, and texts of several rows."""
         import pandas as pd
 
         words = []
@@ -212,7 +215,7 @@ def _row_of(student: Student, index: Mapping[tuple[str, str], Any]) -> Any:
 
 
 def _words(student: Student) -> tuple[tuple[str, str], ...]:
-    """Return the texts by which a student can be found, the surest first."""
+    """Return the texts by which the row of a student can be found, the surest first."""
     return (
         ("number", student.number),
         _id_of(student),
@@ -225,7 +228,10 @@ def _id_of(student: Student) -> tuple[str, str]:
 
 
 def _number(text: str) -> float | None:
-    """Return a number as the platform writes it, perhaps with a decimal comma; None for words."""
+    """Return a number as the platform writes it, perhaps with a decimal comma.
+
+    None for other text.
+    """
     try:
         return float(text.replace(",", "."))
     except ValueError:
@@ -233,5 +239,5 @@ def _number(text: str) -> float | None:
 
 
 def _letters(name: str) -> str:
-    """Return a name as Canvas has it in names of files: "Doe, Jane" is "doejane"."""
+    """Return a name as Canvas writes it in file names: "Doe, Jane" becomes "doejane"."""
     return "".join(c for c in name.casefold() if c.isalnum())

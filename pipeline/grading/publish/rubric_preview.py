@@ -1,4 +1,4 @@
-"""The preview of a graded class under another rubric."""
+"""Preview the points of a graded class under another rubric."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from pipeline.grading.judge.work import Verdict
 from pipeline.grading.rubric import Rubric
 from pipeline.words.progress import Progress, silent
 
-_BARS = 10  # of a distribution; each is a tenth of all points
+_BARS = 10  # bars of a distribution; each is a tenth of the total points
 
 
 @dataclass(frozen=True, kw_only=True)
 class CriterionChange:
-    """A criterion that would give a team different points.
+    """The points of a team for one criterion, if the other rubric changes them.
 
     Attributes
     ----------
-    before, after : None if a rubric does not have the criterion.
+    before, after : points under each rubric; None if it lacks the criterion.
     """
 
     id: str
@@ -33,12 +33,12 @@ class CriterionChange:
 
 @dataclass(frozen=True, kw_only=True)
 class TeamChange:
-    """The points of a team, now and under the other rubric.
+    """The points of a team under the current and the other rubric.
 
     Attributes
     ----------
-    late_before, late_after : points taken off for lateness.
-    by_hand : criteria with points by hand, which stay.
+    late_before, late_after : points deducted for lateness.
+    by_hand : criteria with points given by hand, which stay.
     """
 
     submission: str
@@ -57,16 +57,16 @@ class TeamChange:
 
 @dataclass(frozen=True, kw_only=True)
 class RubricPreview:
-    """A graded class under another rubric.
+    """The points of a graded class under another rubric.
 
     Attributes
     ----------
-    assignment : what the class calls the file of its rubric, without `.toml`.
-    teams : those whose points are known under both, the largest change first.
+    assignment : name of the class's rubric file, without `.toml`.
+    teams : those whose points are known under both rubrics, the largest change first.
+    bars_before, bars_after : number of teams in each tenth of the total points.
     unknown : submissions without stored results of the checks.
-    bars_before, bars_after : number of teams in each tenth of all points.
     failed : number of submissions that could not be graded.
-    needs : keys of the rubric that only grading again can apply, see `needs_recordings`.
+    needs : changed keys of the rubric that take effect only if recordings are graded again.
     """
 
     assignment: str
@@ -83,7 +83,7 @@ class RubricPreview:
 def preview_rubric(
     book: Gradebook, rubric: Rubric, *, progress: Progress = silent
 ) -> RubricPreview:
-    """Weigh a class under another rubric; points given by hand stay.
+    """Compute the points of a class under another rubric; points given by hand stay.
 
     Raises
     ------
@@ -122,7 +122,7 @@ def _bars(points: list[float], *, out_of: float) -> tuple[int, ...]:
 
 
 def _usable(text: str, before: Rubric, now: Rubric) -> Mapping[str, Verdict]:
-    """Return the stored results of criteria that still check the same."""
+    """Return the stored results of those criteria whose check is the same in both rubrics."""
     was = {criterion.id: criterion.check for criterion in before.criteria}
     same = {c.id for c in now.criteria if was.get(c.id) == c.check}
     return {id_: found for id_, found in read_findings(text or "{}").items() if id_ in same}

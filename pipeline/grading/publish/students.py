@@ -1,4 +1,4 @@
-"""The students of a class list, each with a grade."""
+"""The students of a class list, each with one grade."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,7 +9,8 @@ from pipeline.grading.gradings import person
 from pipeline.grading.intake.lms_names import Platform, read_owner
 from pipeline.grading.words import points_text
 
-# `results.json` needs a score: "optional, but required if not on each test case".
+# Gradescope's specification of the score in `results.json`: "optional, but required if not on each
+# test case".
 _GRADESCOPE_BLANK = "left blank in gradescope.csv, but 0 in results.json, where a score is required"
 
 
@@ -19,12 +20,15 @@ class Student:
 
     Attributes
     ----------
-    id : as the submission names the author, or "".
-    name, number : of the account that submitted it, on the platform for the grades, or "". If
-        there are several authors, it is not known which one this is; the account is then a
-        separate student, marked as `uploader`.
+    id : as the submission names the author; or "".
+    name, number : of the account that submitted, on the platform for which grades are exported; or
+        "".
+    uploader : this entry is the account that submitted, because it is unknown which of several
+        authors
+        it belongs to.
     by_hand : the criteria whose points were given by hand.
-    undecided : the submissions of a student who is in several with different points.
+    undecided : message that names the submissions, if the student is in several with different
+        points.
     """
 
     id: str
@@ -37,9 +41,10 @@ class Student:
 
     @property
     def points(self) -> str:
-        """The points; "" if not graded yet, because a zero would look like a grade.
+        """The points as text.
 
-        Also "" if a person must decide which of several submissions counts.
+        "" if the submission was not graded, because a zero would look like a grade; also "" if a
+        person must decide which of several submissions counts.
         """
         ungraded = self.grade.status == "failed" and not self.by_hand
         return "" if ungraded or self.undecided else points_text(self.grade.points)
@@ -56,7 +61,7 @@ class Remark:
 
     Attributes
     ----------
-    left_out : somebody with points is missing from the table.
+    left_out : a student with points is missing from the table.
     """
 
     text: str
@@ -64,10 +69,10 @@ class Remark:
 
 
 def one_of(several: Sequence[Student]) -> Student:
-    """Combine one student's entries from several submissions.
+    """Combine the entries that one student has from several submissions.
 
-    An entry with points wins over one without. If points differ, there are none until a person has
-    decided.
+    An entry with points wins over one without. If the points differ, the student has none until a
+    person decides.
     """
     if undecided := [student for student in several if student.undecided]:
         return undecided[0]
@@ -85,11 +90,11 @@ def one_of(several: Sequence[Student]) -> Student:
 def students_of(
     entries: Sequence[Entry], *, platform: Platform
 ) -> tuple[list[Student], list[Remark]]:
-    """Return every student once, with remarks."""
+    """Return every student once, and remarks on students whose grade or name is unclear."""
     found: dict[str, list[Student]] = {}
     for entry in entries:
         for student in _students(entry, platform=platform):
-            # An empty id is not a number or a name.
+            # Two students without an id are not the same student.
             nameless = student.number if student.uploader else entry.submission
             found.setdefault(person(student.id) or f"\0{nameless}", []).append(student)
     students = [one_of(several) for several in found.values()]
@@ -113,16 +118,16 @@ def students_of(
 
 
 def not_exported(why: str, students: Sequence[Student]) -> Remark:
-    """Return the students who are missing from a table, with reasons."""
+    """Return a remark that names students who are missing from a table, with the reason."""
     called = ", ".join(student.called for student in students)
     lost = any(student.points or student.undecided for student in students)
     return Remark(text=f"{why}, so not exported: {called}", left_out=lost)
 
 
 def _students(entry: Entry, *, platform: Platform) -> list[Student]:
-    """Return the authors of a submission, and its account if that may be somebody else.
+    """Return the authors of a submission, and its account if that may be another person.
 
-    If it has no readable authors, use those from before the points by hand.
+    If a broken submission names no authors, those of its points by hand are used.
     """
     name, of, number = read_owner(entry.owner)
     number = number if of in ("", platform) else ""
@@ -133,5 +138,6 @@ def _students(entry: Entry, *, platform: Platform) -> list[Student]:
     if len(authors) == 1:
         return [replace(own, id=authors[0])]
     named = [replace(own, id=author, name="", number="") for author in authors]
-    # Moodle's and Gradescope's numbers of a team's hand-in are not a student's.
+    # Only Canvas' number belongs to a student; those of Moodle and Gradescope belong to the team's
+    # upload.
     return [*named, replace(own, uploader=True)] if number and platform == "canvas" else named

@@ -1,8 +1,9 @@
-"""Make the paper's Tables 4 and 5 from the answers of a questionnaire.
+"""Make the paper's Tables 4 and 5 from the answers to a questionnaire.
 
-A row of the CSV is one student, a column one question. A column is an opinion where its answers
-are on the scale of Table 4; it is about a concept (Table 5) where its heading says when and what:
-`Pre knowledge: Bode plots`, `Post-course confidence [Bode plots]`. Others are left out.
+A row of the CSV is one student, a column one question. A column is an opinion (Table 4) if all
+answers are on the scale of that table. It is about a concept (Table 5) if its heading says when and
+what was asked: `Pre knowledge: Bode plots`, `Post-course confidence [Bode plots]`. Other columns
+are left out.
 """
 
 import re
@@ -37,16 +38,17 @@ _CONCEPT = re.compile(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Survey:
-    """The answers of a questionnaire.
+    """The answers to a questionnaire.
 
     Attributes
     ----------
-    students : rows of the table.
-    opinions : Table 4, a row a question: how many answered what, columns `SCALE`.
-    means : Table 5, a row a concept: the average scores (1 to 4) to two decimals, halves up, NaN
-        where nobody answered; columns `LEVELS`.
-    answers : of how many they are.
-    left_out : headings of columns that are no question of either table.
+    students : number of students.
+    opinions : Table 4, one row per question: how many students gave each answer; columns `SCALE`.
+    means : Table 5, one row per concept: the mean scores (1 to 4), rounded to two decimals, halves
+        up;
+        NaN if nobody answered; columns `LEVELS`.
+    answers : how many answers each mean has.
+    left_out : headings of columns that belong to neither table.
     """
 
     students: int
@@ -57,17 +59,18 @@ class Survey:
 
     @property
     def percents(self) -> "pd.DataFrame":
-        """Table 4 in whole percents of those who answered, halves up, as the paper has them."""
+        """Table 4 in whole percents of those who answered, halves rounded up, as in the paper."""
         total = self.opinions.sum(axis="columns")
         return (200 * self.opinions).add(total, axis="index").floordiv(2 * total, axis="index")
 
 
 def read_survey(path: Path) -> Survey:
-    """Read the answers; commas, semicolons or tabs.
+    """Read the answers from a CSV with commas, semicolons or tabs.
 
     Raises
     ------
-    ConfigError : not a table, no question in it, or an answer that is not on the scale.
+    ConfigError : the file is not a table, has no question, or has an answer that is not on its
+        scale.
     """
     import pandas as pd
 
@@ -114,7 +117,14 @@ def read_survey(path: Path) -> Survey:
 def _read(
     given: "pd.Series", read: Callable[[str], int | None], wanted: str, where: tuple[str, str]
 ) -> "pd.Series":
-    """Return the answers as numbers; `where` is the file and the question, the index its lines."""
+    """Return answers as numbers.
+
+    Parameters
+    ----------
+    given : the answers as text; the index is the line of the file.
+    wanted : end of the message about an answer that cannot be read.
+    where : names of the file and of the question.
+    """
     answers = given.map(read)
     for line, text in given.loc[answers.isna()].items():
         raise ConfigError(f"{where[0]} line {line}, {quote(where[1])}: {quote(text)} is {wanted}")
@@ -122,7 +132,7 @@ def _read(
 
 
 def _average(scores: "pd.Series") -> float:
-    # In whole numbers, as 2.125 is 2.13 whatever its binary digits are.
+    # Whole numbers round 2.125 up to 2.13; its binary value might not.
     return int(200 * scores.sum() + len(scores)) // (2 * len(scores)) / 100 if len(scores) else nan
 
 
@@ -142,7 +152,7 @@ def _score(text: str) -> int | None:
 
 
 def survey_dict(survey: Survey) -> dict[str, Any]:
-    """Return both tables as plain data, with the counts behind them."""
+    """Return both tables as a dictionary for JSON, with the counts from which they are computed."""
     return {
         "schema": "cartlab-survey/1",
         "students": survey.students,
@@ -167,7 +177,7 @@ def survey_dict(survey: Survey) -> dict[str, Any]:
 
 
 def survey_text(survey: Survey) -> str:
-    """Return both tables as Markdown, which reads as it is."""
+    """Return both tables as Markdown, which is also readable as plain text."""
     parts = []
     if len(survey.opinions):
         rows = [[str(q), *(f"{p} %" for p in row)] for q, *row in survey.percents.itertuples()]

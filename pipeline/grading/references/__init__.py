@@ -1,1 +1,1 @@
-"""Reference values from the recordings, and their tolerances."""
+"""The values of parameters that the recordings give, with bounds and tolerances."""

@@ -1,4 +1,4 @@
-"""Recompute each parameter from the student's recordings, with bounds for honest readings."""
+"""Compute each parameter again from the student's recordings, with bounds for honest readings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,13 +17,14 @@ OFF_SCALE = "the recordings are not in the units stated, see the data"
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """A recomputed parameter.
+    """A parameter computed from the recordings.
 
     Attributes
     ----------
-    value : the estimate that is shown; `source` is its method.
-    low, high : an honest reading of these recordings lies between them.
+    value : the estimate that is shown.
+    low, high : an honest reading of these recordings is between them.
     std : standard error of the bounds.
+    source : the method of the estimate.
     """
 
     value: float
@@ -34,26 +35,26 @@ class Reference:
 
     @classmethod
     def at(cls, value: float, *, std: float = 0.0, source: str = "") -> "Reference":
-        """Return the reference of a single number."""
+        """Return a reference without a range: both bounds are the value."""
         return cls(value=value, low=value, high=value, std=std, source=source)
 
     @property
     def said(self) -> str:
-        """The reference in words: a number or a range."""
+        """The reference as text: a number if the bounds are close, otherwise a range."""
         if self.low > 0 and self.within(limits.ONE_NUMBER):
             return f"{self.value:.4g}"
         return f"{self.low:.3g} to {self.high:.3g}"
 
     def within(self, factor: float) -> bool:
-        """Return whether the ratio of its bounds is at most a factor."""
+        """Return whether the ratio of the bounds is at most a factor."""
         return self.high <= self.low * factor
 
     def including(self, value: float) -> "Reference":
-        """Return the reference with bounds extended to include a value."""
+        """Return the reference with bounds extended to include another value."""
         return replace(self, low=min(self.low, value), high=max(self.high, value))
 
     def widened(self, factor: float) -> "Reference":
-        """Return the reference with bounds moved outwards."""
+        """Return the reference with bounds moved outwards by a factor."""
         return replace(self, low=self.low / factor, high=self.high * factor)
 
     def times(self, factor: float) -> "Reference":
@@ -69,23 +70,27 @@ class Reference:
 
 @dataclass(frozen=True, kw_only=True)
 class References:
-    """Both tables by parameter name, without guesses and numbers that cannot be recomputed."""
+    """The references of both tables, by parameter name.
+
+    Guesses and parameters that the recordings do not determine are left out.
+    """
 
     initial: dict[str, Reference]
     final: dict[str, Reference]
 
 
 def off_scale(analysis: Analysis) -> set[str]:
-    """Return which scales differ from the stated ones: positions, input or both."""
+    """Return which scales contradict those stated in the submission: positions, input or both."""
     return {c.kind for c in analysis.checks if c.kind in ("position_scale", "input_scale")}
 
 
 def in_scale(
     references: References, chain: Chain | None, *, analysis: Analysis, per_count: float | None
 ) -> tuple[References, Chain | None]:
-    """Return references and carts in the required units, if the recordings use others.
+    """Return references and chain in the required units, if the recordings are in other units.
 
-    Counts are multiplied by their length, if stated. Numbers in an unknown scale are left out.
+    Positions in counts are converted by the stated length per count. Numbers whose scale is unknown
+    are left out.
     """
     wrong = off_scale(analysis)
     if not wrong:
@@ -107,8 +112,8 @@ def in_scale(
 def recompute(analysis: Analysis) -> References:
     """Return the references of both tables.
 
-    A number measured in several ways is right anywhere between them, in either table. Dry friction
-    adds to every damping ratio; a student who removed it is right too.
+    If a number can be measured in several ways, its bounds include the results of all, in both
+    tables. Dry friction adds to every damping ratio; a damping without that part is right too.
     """
     chain = trusted_chain(analysis)
     trusted, tables = chain is not None, _by_decays(chain, analysis) if chain else []
@@ -122,7 +127,8 @@ def recompute(analysis: Analysis) -> References:
             final[row.name] = fitted
         elif measured is not None:
             final[row.name] = measured
-            # If our fit of a gain fails, the students' fit may fail too; they notice a large error.
+            # If the fit to these data finds a wrong gain, the student's fit may find it too. But
+            # students notice a large error.
             astray = (
                 row.final.value if row.final and read_name(row.name).is_gain else measured.value
             )
@@ -136,7 +142,7 @@ def recompute(analysis: Analysis) -> References:
             for table in (initial, final):
                 if row.name in table:
                     table[row.name] = table[row.name].widened(limits.STUCK)
-    # Without a fit, the peaks in the dwells may be other ones than assumed.
+    # Without a fit, a peak in the dwells may be another resonance than assumed.
     for table in (initial, final) if not trusted else ():
         for name in [n for n, r in table.items() if r.source == "frequency_response"]:
             del table[name]
@@ -144,10 +150,10 @@ def recompute(analysis: Analysis) -> References:
 
 
 def trusted_chain(analysis: Analysis) -> Chain | None:
-    """Return the fitted chain; None if dry friction or worse has spoilt the fit.
+    """Return the fitted chain; None if the fit cannot be trusted, for example because of friction.
 
-    A fit that does not explain the data must at least reproduce the frequencies and gains measured
-    without it, and must determine them.
+    A fit that does not explain the data is trusted only if it determines the frequencies and gains,
+    and agrees with those measured without it.
     """
     if analysis.fit is None or is_explained(analysis):
         return analysis.chain
@@ -155,7 +161,7 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
         if read_name(row.name).is_damping:
             continue
         if row.name in analysis.fit.parameters and row.final is None:
-            return None  # the fit does not determine it
+            return None  # the fit does not determine this parameter
         if row.initial is None or row.final is None:
             continue
         before, after = row.initial.value, row.final.value
@@ -168,15 +174,19 @@ def trusted_chain(analysis: Analysis) -> Chain | None:
 
 
 def is_explained(analysis: Analysis) -> bool:
-    """Return whether linear carts and noise explain the data; without a fit, assume so."""
+    """Return whether a linear chain and noise explain the data.
+
+    Without a fit, assume that they do.
+    """
     return analysis.fit is None or analysis.fit.explains_data
 
 
 def is_followed(analysis: Analysis) -> bool:
-    """Return whether nearly all driven recordings follow the fitted carts.
+    """Return whether nearly all driven recordings agree with a simulation of the fitted chain.
 
-    Near a sharp resonance, a coarse encoder hides the rest of a dwell's transient. Its point is
-    then off by several standard errors, although the recording follows the carts.
+    This can hold although the fit does not explain the measured response. Near a sharp resonance, a
+    coarse encoder hides the end of a dwell's transient; the point of that dwell is then wrong by
+    several standard errors.
     """
     bad = {one.experiment for one in analysis.left_out}
     left = [share for name, share in analysis.unexplained.items() if name not in bad]
@@ -195,10 +205,10 @@ def is_linear(analysis: Analysis) -> bool:
 
 
 def in_doubt(references: References, *, analysis: Analysis) -> References:
-    """Return the references that may count against a student.
+    """Return the references with the bounds that may count against a student.
 
-    If no linear carts move like the recordings, first estimates still belong to their own runs, but
-    a fit means nothing, ours or the students'.
+    On a nonlinear bench the bounds are widened. A first estimate still belongs to its own
+    recording, but a fit means little, whether it is cartlab's or the student's.
     """
     if is_linear(analysis):
         return references
@@ -212,7 +222,8 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
         return {
             name: one.widened(factor(name, of_gains=of_gains))
             for name, one in table.items()
-            # Resonances of nonlinear carts are not parameters, nor are numbers derived from them.
+            # Resonances of nonlinear carts are not parameters, and neither are numbers derived from
+            # them.
             if one.source != "frequency_response"
         }
 
@@ -225,10 +236,10 @@ def in_doubt(references: References, *, analysis: Analysis) -> References:
 def _final(
     row: ParameterRow, analysis: Analysis, tables: Sequence[Mapping[str, float]]
 ) -> Reference | None:
-    """Return the bounds of a final number: the fit, and all measurements without it.
+    """Return the bounds of a final number: from the fit, and from all measurements without it.
 
-    A fit that stops at a damping of zero, its bound, does not measure the damping. A fit that
-    neither explains the points nor the recordings does not count where it is the only measurement.
+    A fit that stops at its bound, zero damping, does not measure the damping. A fit that explains
+    neither the response nor the recordings does not count if there is no other measurement.
     """
     fitted, read_off = row.final, _readings(row.name, analysis)
     if read_name(row.name).is_damping:
@@ -239,8 +250,9 @@ def _final(
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
-    # A damping depends on no unit, sign or clock. But dry friction adds to it, more in dwells than
-    # in decays, and with few dwells the fit explains them anyway.
+    # Dampings from decays count in any case, because they depend on no unit, sign or clock. Dry
+    # friction adds to dampings, more in dwells than in decays, and with few dwells the fit explains
+    # them anyway.
     if fitted and told and not read_name(row.name).is_damping and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
     read = row.initial.source if row.initial and not read_off else "log_decrement"
@@ -259,7 +271,7 @@ def _final(
 def _agrees(value: float, fitted: Estimate) -> bool:
     """Return whether a reading agrees with a fit that explains the data.
 
-    Otherwise its recording contains something else, and it is not used as a bound.
+    If not, its recording contains something else, and it is not used as a bound.
     """
     slack, factor = limits.SIGMAS * (fitted.std or 0.0), 1 + GAIN_AND_FREQUENCY_LIMIT / 100
     least, most = fitted.value / factor, fitted.value * factor
@@ -267,14 +279,15 @@ def _agrees(value: float, fitted: Estimate) -> bool:
 
 
 def _undamped(analysis: Analysis) -> bool:
-    """Return whether the fit stopped at zero damping, which is a bound and not a measurement."""
+    """Return whether the fit stopped at its bound, zero damping, and so measured no damping."""
     return analysis.chain is not None and not np.all(analysis.chain.c > 0)
 
 
 def _by_decays(chain: Chain, analysis: Analysis) -> list[dict[str, float]]:
-    """Return the numbers of the fitted carts with the least and the most damping of their decays.
+    """Return two tables of the fitted chain: with the least and the largest dampings of the decays.
 
-    The fit supplies dampings without decays; there is no result if the fit stopped at zero.
+    A cart without decays has the damping of the fit. If the fit found zero damping, no table is
+    returned.
     """
     readings = [_readings(f"zeta_{cart}", analysis) for cart in range(1, chain.n + 1)]
     if not any(readings) or not chain.is_tied:
@@ -302,16 +315,17 @@ def _initial(row: ParameterRow, final: Reference | None, analysis: Analysis) -> 
         value=measured.value,
         low=min(bounds) / spread,
         high=max(bounds) * spread,
-        std=0.0 if len(readings) > 1 else measured.std or 0.0,  # else the bounds show it
+        # With several readings, the bounds already include the error.
+        std=0.0 if len(readings) > 1 else measured.std or 0.0,
         source=measured.source,
     )
 
 
 def _readings(name: str, analysis: Analysis) -> list[float]:
-    """Return the single readings of a gain or of a cart alone; a student may quote any.
+    """Return the readings of a gain, frequency or damping of a single cart; students may quote any.
 
-    The damping of a decay is read with and without the best-fitting dry friction, even if friction
-    is not certain: with little damping a trace of it counts.
+    The damping of a decay is read twice: with dry friction subtracted, and without. Friction need
+    not be certain, because with little damping even a trace of it matters.
     """
     read = read_name(name)
     if read.is_by_eye:
@@ -335,9 +349,10 @@ def _readings(name: str, analysis: Analysis) -> list[float]:
 
 
 def _by_size(steps: Sequence[StepGain]) -> list[float]:
-    """Return the gain from small steps to large ones, where the two have different ones.
+    """Return the gain as a slope from small to large steps, if it depends on the size of the step.
 
-    A dead zone, or an amplifier that starts late, takes as much off each.
+    The slope is the difference of levels divided by the difference of inputs. A dead zone, or an
+    amplifier that responds only above a threshold, subtracts the same from every step.
     """
     edges = sorted(
         (abs(e.u_after - e.u_before), abs(e.level_after - e.level_before))
@@ -356,7 +371,7 @@ def _by_size(steps: Sequence[StepGain]) -> list[float]:
 
 
 def _held(cart: int, analysis: Analysis) -> float:
-    """Return the largest step of the input that friction kept a free cart from following."""
+    """Return the largest input step that did not move a free cart, because friction held it."""
     held = [
         float(np.abs(r.u).max())
         for r in analysis.records
@@ -370,5 +385,10 @@ def _held(cart: int, analysis: Analysis) -> float:
 
 
 def _shortest(edge: StepEdge, *, held: float) -> float:
-    """Return the gain where so much of the input's worth of friction held the cart far out."""
+    """Return the gain of an edge if friction kept the cart too far out.
+
+    Parameters
+    ----------
+    held : the friction, as the input that it can hold.
+    """
     return abs((edge.level_after - edge.level_before) / (abs(edge.u_after - edge.u_before) + held))

@@ -1,4 +1,4 @@
-"""Accept signs as logged on a bench whose positive input drives the carts to negative x."""
+"""Accept reported signs from a bench whose positive input drives the carts to negative x."""
 
 from collections.abc import Mapping, Sequence
 from decimal import Decimal
@@ -15,10 +15,10 @@ _NOTE = (
 
 
 def turned_round(reported: Reported, records: Sequence[Record]) -> tuple[Reported, tuple[str, ...]]:
-    """Return the reported numbers with the input reversed, if the bench is, and a note.
+    """Return the reported numbers for a positive bench, and a note if that changed them.
 
-    Gains, B and the controller change sign with the input. Numbers with the signs of the log are
-    right, and so are absolute values.
+    On a reversed bench, gains, B and the controller have the opposite sign in the logged data.
+    Numbers with the signs of the log are right, and so are their absolute values.
     """
     if not is_reversed(records):
         return reported, ()

@@ -1,4 +1,4 @@
-"""Find further springs if those of the rubric cannot explain the recordings."""
+"""Add springs if those of the rubric cannot explain the recordings."""
 
 import numpy as np
 
@@ -17,11 +17,11 @@ def with_all_springs(
     *,
     progress: Progress = silent,
 ) -> tuple[Analysis, tuple[str, ...]]:
-    """Return the analysis with all springs and the added ones, if the recordings need them.
+    """Return the analysis with all springs, and the added ones, if the recordings need them.
 
-    A missing spring is fitted with zero stiffness, so no other set of springs explains more. If
-    none of the added springs exists, the carts are still the rubric's. A single cart has one
-    stiffness in any case.
+    If they do not, the analysis is returned unchanged. All springs are tried at once: one that does
+    not exist is fitted with zero stiffness, so no other set explains more. On a single cart only
+    the sum of the springs matters.
     """
     fit, springs = analysis.fit, submission.system.springs
     if analysis.bench.n == 1 or all(springs) or (fit is not None and is_explained(analysis)):
@@ -36,8 +36,8 @@ def with_all_springs(
     if other.fit is None or not (
         is_explained(other)
         or (
-            # Friction and the like remain whatever the springs: a missing one leaves many times
-            # more of χ².
+            # Friction and similar effects remain with any springs. Only a missing spring makes χ²
+            # many times larger.
             fit is not None
             and fit.method == other.fit.method
             and fit.chi_square_per_dof > 10 * other.fit.chi_square_per_dof
@@ -50,11 +50,11 @@ def with_all_springs(
 
 
 def _there(fit: ChainFit) -> list[bool]:
-    """Return for each spring whether it certainly exists, despite an imperfect fit."""
+    """Return for each spring whether it certainly exists, even if the fit is not perfect."""
     wider = max(1.0, fit.chi_square_per_dof) ** 0.5
     std = dict(zip(fit.names, wider * np.sqrt(np.diag(fit.covariance)), strict=True))
     k = fit.chain.k
-    # A spring fitted at zero has no standard error. The limits, ten standard errors and a share of
-    # the stiffest spring, are high because a delay or friction resembles a weak spring.
+    # A spring fitted at zero has no standard error. The limits are high (ten standard errors, and a
+    # share of the stiffest spring), because a delay or friction looks like a weak spring.
     least = [max(10 * std.get(f"k_{j + 1}", np.inf), 0.02 * k.max()) for j in range(k.size)]
     return [bool(stiffness > limit) for stiffness, limit in zip(k, least, strict=True)]

@@ -1,4 +1,7 @@
-"""The error of a number and the points it earns, in exact arithmetic so that limits are sharp."""
+"""The error of a number and the points it earns.
+
+The arithmetic is exact, so that a number exactly at a limit is judged right.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,14 +15,14 @@ from pipeline.grading.rubric import Late
 
 Number = TypeVar("Number", float, Fraction)
 
-NO_CREDIT = Fraction(10**6)  # percent; of a number that is zero or has the wrong sign
-# The largest share of a number that rounding may excuse: that of two digits, 10 for 10.5. One digit
-# says too little of the measurement, and "0e2" says nothing.
+NO_CREDIT = Fraction(10**6)  # percent; the error of a number that is zero or has the wrong sign
+# The largest error that rounding may excuse, as a share: that of two digits, 10 for 10.5. One digit
+# says too little about the measurement, and "0e2" says nothing.
 _MOST_ROUNDING = Fraction(1, 20)
 
 
 def half_digit(typed: Decimal) -> Fraction:
-    """Return half a unit of the last digit as typed: 0.005 for 0.10, 0.5 for 29."""
+    """Return half a unit of the last typed digit: 0.005 for 0.10, 0.5 for 29."""
     exponent = typed.as_tuple().exponent
     if not isinstance(exponent, int):
         raise ValueError(f"{typed} is not a finite number")
@@ -27,31 +30,31 @@ def half_digit(typed: Decimal) -> Fraction:
 
 
 def as_typed(typed: Decimal) -> str:
-    """Return a number as its author wrote it: `0e2` where Python would write `0E+2`."""
+    """Return a number as its author typed it; Python would print `0e2` as `0E+2`."""
     return str(typed).replace("E+", "e").replace("E", "e")
 
 
 def rounding(typed: Decimal) -> Fraction:
-    """Return how far rounding may have moved a number: half a digit, at most 5 % of it."""
+    """Return how far rounding may have moved a number: half of its last digit, at most 5 %."""
     return min(half_digit(typed), _MOST_ROUNDING * abs(Fraction(typed)))
 
 
 def is_vague(typed: Decimal) -> bool:
-    """Return whether rounding hides more of a number than is excused, as with one digit."""
+    """Return whether a number has so few digits that grading does not excuse all its rounding."""
     return half_digit(typed) > _MOST_ROUNDING * abs(Fraction(typed))
 
 
-@lru_cache(1024)  # a rubric has few numbers, which a class uses very often
+@lru_cache(1024)  # a rubric has few numbers, and a class uses each very often
 def exact(value: float) -> Fraction:
-    """Return a number of a rubric as its author typed it: 0.1 is a tenth."""
+    """Return a number of a rubric as its author typed it: 0.1 is exactly a tenth."""
     return Fraction(repr(value))
 
 
 def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
     """Return the error of a number against its reference, in percent of the smaller of the two.
 
-    5 % is a factor of 1.05 either way. The excused `rounding` and `sigmas` standard errors of the
-    reference are subtracted first. Any value between the reference's bounds is right.
+    So an error of 5 % is a factor of 1.05 either way. Rounding, and `sigmas` standard errors of the
+    reference, are subtracted first. Any value between the reference's bounds is right.
     """
     slack = exact(sigmas) * Fraction(reference.std)
     low, high = Fraction(reference.low) - slack, Fraction(reference.high) + slack
@@ -62,12 +65,12 @@ def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fract
 
 @dataclass(frozen=True, kw_only=True)
 class Typed:
-    """A number of a table in floating point, for comparison with many references.
+    """A typed number in floating point, for fast comparison with many references.
 
     Attributes
     ----------
     excused : change that rounding may have caused.
-    hidden : half a digit as a share of the number.
+    hidden : half a unit of the last digit, as a share of the number.
     digits : number of typed digits.
     """
 
@@ -78,7 +81,7 @@ class Typed:
 
     @classmethod
     def of(cls, typed: Decimal) -> "Typed":
-        """Return a number as its author wrote it."""
+        """Return a typed number in this form."""
         return cls(
             value=float(typed),
             excused=float(rounding(typed)),
@@ -87,7 +90,10 @@ class Typed:
         )
 
     def percent_off(self, reference: Reference, *, sigmas: float) -> float:
-        """Return `percent_off` in floating point, where exact limits do not matter."""
+        """Return the same as the function `percent_off`, in floating point.
+
+        Not for exact limits.
+        """
         slack = sigmas * reference.std
         low, high = reference.low - slack, reference.high + slack
         least, most = self.value - self.excused, self.value + self.excused
@@ -97,7 +103,13 @@ class Typed:
 def _apart(
     least: Number, most: Number, low: Number, high: Number, *, nothing: Number, worst: Number
 ) -> Number:
-    """Return the gap between two intervals, in percent."""
+    """Return the gap between two intervals, in percent of the smaller end.
+
+    Parameters
+    ----------
+    nothing : the result if they overlap.
+    worst : the largest result, and that for an interval that reaches zero.
+    """
     if most < low:
         above, below = low, most
     elif least > high:
@@ -108,9 +120,10 @@ def _apart(
 
 
 def credit(error: Fraction, *, full: float, none: float) -> Fraction:
-    """Return the share of the points: full up to `full`, zero from `none`, linear in between.
+    """Return the share of the points that an error earns.
 
-    If the two are equal, an error of exactly that size still earns everything.
+    It is 1 up to `full`, 0 from `none` on, and linear in between. If both are equal, an error of
+    exactly this size still earns everything.
     """
     top, bottom = exact(full), exact(none)
     if error <= top:
@@ -121,14 +134,14 @@ def credit(error: Fraction, *, full: float, none: float) -> Fraction:
 
 
 def to_step(points: Fraction, step: float) -> Fraction:
-    """Round points to the rubric's step, halves up, exactly, so that the order is kept."""
+    """Round points to the rubric's step, halves up; exact, so that more points stay more."""
     return math.floor(points / exact(step) + Fraction(1, 2)) * exact(step)
 
 
 def late_deduction(earned: Fraction, *, late: Late, step: float, days_late: float) -> Fraction:
     """Return the deduction from the points earned, for every day begun after the grace period.
 
-    It is rounded to the rubric's step, halves down: like the points, in the student's favour.
+    It is rounded to the rubric's step, halves down, which favours the student.
     """
     days = max(0, math.ceil(days_late - late.grace_days))
     share = min(exact(late.percent_per_day) * days, exact(late.most_percent)) / 100

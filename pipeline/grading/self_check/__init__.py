@@ -1,1 +1,1 @@
-"""The students' check: which of their numbers are wrong, then where to look."""
+"""The check for students: which of their numbers are wrong, and then where to look."""

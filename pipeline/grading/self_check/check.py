@@ -1,4 +1,4 @@
-"""Check a submission's numbers like the grading; the answer has names but no values."""
+"""Check the numbers of a submission as grading does; the answer never contains a value."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ from pipeline.results import Analysis
 from pipeline.submission import Reported, Submission
 from pipeline.words.progress import Progress, silent
 
-# The tables of `[reported]` that are compared with the recordings, by check.
+# For each check that compares a table with the recordings: the table under `[reported]`.
 _TABLE = {
     "initial": "initial",
     "final": "final",
@@ -47,9 +47,10 @@ def check_numbers(
     where: Collection[str] | None = None,
     progress: Progress = silent,
 ) -> CheckAnswer:
-    """Find the reported numbers that disagree; when asked again, find where to look.
+    """Find the reported numbers that disagree with the recordings.
 
-    The answer is written into the submission's `checks.jsonl` before it is given.
+    If the same numbers were checked before, the answer also has hints where to look. It is written
+    into the submission's `checks.jsonl` before it is returned.
 
     Parameters
     ----------
@@ -68,7 +69,7 @@ def check_numbers(
             "[reported.final] of submission.toml, then check again"
         )
     folder, rubric = submission.folder, rubric or _default_rubric(submission)
-    read_answers(folder)  # report a bad file before the work
+    read_answers(folder)  # report a bad file before the long analysis
     judged = analyse_under(submission, rubric=rubric, progress=progress)
     found = judge_numbers(judged.submission, judged.analysis, rubric=rubric)
     with turn_in(folder):
@@ -80,7 +81,7 @@ def check_numbers(
 
 @dataclass(frozen=True, kw_only=True)
 class JudgedNumbers:
-    """The reported numbers by outcome, and the evidence."""
+    """The reported numbers by outcome, and what is needed for hints."""
 
     work: Work
     flags: Sequence[Flag]
@@ -90,11 +91,13 @@ class JudgedNumbers:
 
 
 def judge_numbers(submission: Submission, analysis: Analysis, *, rubric: Rubric) -> JudgedNumbers:
-    """Judge every reported number like the grading; it must pass all criteria that judge it.
+    """Judge every reported number as grading does.
+
+    A number agrees if it loses no points in any criterion that judges it.
 
     Parameters
     ----------
-    submission : under the rubric's system, see `analyse_under`.
+    submission : with the rubric's system; see `analyse_under`.
     """
     work, flags, _ = prepare_work(submission, analysis, rubric=rubric)
     agrees: dict[str, bool] = {}
@@ -124,8 +127,14 @@ def next_answer(
 ) -> CheckAnswer:
     """Return the answer to the next request.
 
-    A number has a hint only if the last answer said that it disagrees, and nothing was changed
-    since.
+    A number gets a hint only if the last answer said that it disagrees, and if nothing has been
+    changed since.
+
+    Parameters
+    ----------
+    before : the earlier answers.
+    basis : hash of everything whose change withdraws hints; see `find_basis`.
+    where : the numbers to give hints for; None: all that may have one.
     """
     known: Collection[str] = ()
     if before and before[-1].basis == basis:
@@ -144,7 +153,7 @@ def next_answer(
 
 
 def _list_reported(reported: Reported) -> list[str]:
-    """Return the keys of the reported numbers; A and B count as one."""
+    """Return the keys of the reported numbers; A and B together count as one number."""
     found = [f"initial.{name}" for name in reported.initial]
     found += [f"final.{name}" for name in reported.final]
     if reported.state_space and (reported.state_space.A or reported.state_space.B):
@@ -157,7 +166,7 @@ def _list_reported(reported: Reported) -> list[str]:
 
 
 def _default_rubric(submission: Submission) -> Rubric:
-    """Return the shipped rubric for so many carts, for the submission's own system."""
+    """Return the shipped rubric for this number of carts, with the submission's own system."""
     system = submission.system
     shipped = None if system.bench.rigid else shipped_rubric(system.carts)
     criteria = (

@@ -1,8 +1,8 @@
-"""Hints for a wrong number: the kind of mistake and the part of the recording.
+"""Give a hint about a wrong number: the kind of mistake and the part of the recording.
 
-A hint must not reveal a value. A part is one of six coarse ones, so that it shows no period or
-settling time. All sine dwells are named, because the one nearest to a resonance would reveal its
-frequency.
+A hint must not reveal a value. There are only six parts of a recording, so a part does not reveal a
+period or a settling time. All sine dwells are named together, because the one nearest to a
+resonance would reveal its frequency.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,9 +15,9 @@ from pipeline.names import read_name
 from pipeline.results import Analysis, Kind
 
 _TABLES = ("initial", "final")
-# Mistakes in reading a time record, which also explains them in a final table.
+# Mistakes in reading a decay or a step. If a final table has one, the hint names those recordings.
 _OF_TIME_RECORDS: tuple[Slip, ...] = ("peak_count", "log10_for_ln", "peak_for_steady_state")
-# Mistakes that no part of a recording shows.
+# Mistakes that no part of a recording can show.
 _OF_NO_RECORD: tuple[Slip, ...] = ("physically_impossible", "no_fit_done")
 _IN_FREQUENCY: tuple[Kind, ...] = ("sine", "sweep", "bode")
 _OF_LOOP: dict[str, Slip] = {
@@ -33,7 +33,7 @@ def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
 
     Parameters
     ----------
-    number : its key under `[reported]`, "final.K_1".
+    number : its key under `[reported]`, such as "final.K_1".
     flags : of the whole submission, in the order of their codes.
     """
     table, _, name = number.partition(".")
@@ -52,7 +52,7 @@ def find_hint(number: str, work: Work, flags: Sequence[Flag]) -> Hint:
 
 def _find_slip(table: str, name: str, flags: Sequence[Flag]) -> tuple[Slip, tuple[Slip, ...]]:
     mine = [flag for flag in flags if _is_about(flag, table, name)]
-    # A difference between the tables says less than a mistake in one.
+    # A mistake in one table is a better hint than a difference between the tables.
     mine.sort(key=lambda flag: flag.code == "initial_final_disagree")
     if not mine:
         return ("initial_off" if table == "initial" else "final_off"), ()
@@ -68,7 +68,7 @@ def _is_about(flag: Flag, table: str, name: str) -> bool:
 
 
 def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> Iterator[Stretch]:
-    """Yield the parts of recordings from which a number is read."""
+    """Yield the parts of recordings in which a mistake in a number can be seen."""
     if slip in _OF_NO_RECORD:
         return
     if table == "initial" or slip in _OF_TIME_RECORDS:
@@ -83,7 +83,7 @@ def _find_stretches(table: str, name: str, slip: Slip, analysis: Analysis) -> It
 
 
 def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, Kind, Part]]:
-    """Yield the recordings from which a first estimate is read: run, kind, part."""
+    """Yield experiment, kind and part of each recording from which a first estimate is read."""
     read = read_name(name)
     if read.is_by_eye and read.suffix != "n":
         return
@@ -103,7 +103,7 @@ def _list_readings(name: str, analysis: Analysis) -> Iterator[tuple[str, Kind, P
 
 
 def _find_kinds(analysis: Analysis) -> dict[str, Kind]:
-    """Return the kind of every recording, and of tables that the students reduced."""
+    """Return the kind of every recording, and of each table that the students reduced."""
     kinds: dict[str, Kind] = {}
     for response in analysis.frequency_responses:
         kinds |= dict.fromkeys(response.experiments, "bode")
@@ -113,7 +113,7 @@ def _find_kinds(analysis: Analysis) -> dict[str, Kind]:
 
 
 def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Part:
-    """Return the coarse part of a recording that contains a window."""
+    """Return the smallest of the six parts of a recording that contains a window of time."""
     record = next((one for one in analysis.records if one.id == run), None)
     if record is None:
         return "whole"
@@ -131,7 +131,7 @@ def _name_part(run: str, window: tuple[float, float], analysis: Analysis) -> Par
 
 
 def _gather(told: Sequence[tuple[str, Kind, Part]]) -> Iterator[Stretch]:
-    """Yield the parts, joining all recordings of the same kind and part."""
+    """Yield the parts; recordings of the same kind and part are named together."""
     order = [(kind, part) for kind in get_args(Kind) for part in get_args(Part)]
     for kind, part in order:
         runs = tuple(dict.fromkeys(run for run, k, p in told if (k, p) == (kind, part)))

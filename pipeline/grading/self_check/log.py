@@ -1,7 +1,7 @@
-"""The answers of the check, one per request: `checks.jsonl` in the submission, without values.
+"""Store the answers of the check, one line per request, in `checks.jsonl` of the submission.
 
-With enough guesses the answers would lead to the number. So every request is counted, and the file
-is part of the submission.
+The answers contain no values. But with enough guesses they would reveal a number, so the file
+counts every request and is part of the submission.
 """
 
 import hashlib
@@ -18,14 +18,17 @@ from pipeline.submission import Submission
 from pipeline.submission.load import outside
 
 FILE = "checks.jsonl"
-MAX_BYTES = 5_000_000  # several thousand requests
+MAX_BYTES = 5_000_000  # bytes; enough for several thousand requests
 
 Part = Literal["whole", "beginning", "first_half", "middle", "second_half", "end"]
 Slip = Code | Literal["claims_off"]
 
 
 class Stretch(GradeTable):
-    """A part of some recordings; all dwells are named, because one alone would tell a value."""
+    """The same part of some recordings of one kind.
+
+    All sine dwells are named, because a single one would reveal a resonance.
+    """
 
     kind: Kind
     recordings: tuple[str, ...]
@@ -44,7 +47,7 @@ class Hint(GradeTable):
 
 
 class CheckAnswer(GradeTable):
-    """One answer, a line of the file; numbers are called by their key under `[reported]`."""
+    """One answer, a line of `checks.jsonl`; each number is named by its key under `[reported]`."""
 
     model_config = ConfigDict(json_schema_serialization_defaults_required=True)
 
@@ -64,11 +67,11 @@ class CheckAnswer(GradeTable):
 
 
 def read_answers(folder: Path) -> tuple[CheckAnswer, ...]:
-    """Return all answers so far; empty without a file.
+    """Return all earlier answers; empty without a file.
 
     Raises
     ------
-    SubmissionError : the file was changed.
+    SubmissionError : the file was changed by hand.
     """
     path = folder / FILE
     if not path.exists() and not path.is_symlink():
@@ -95,7 +98,10 @@ def read_answers(folder: Path) -> tuple[CheckAnswer, ...]:
 
 
 def write_answer(folder: Path, answer: CheckAnswer) -> None:
-    """Write one more line; the caller holds the lock and has read the other lines."""
+    """Append an answer to the file.
+
+    The caller must hold the lock and have read the other answers.
+    """
     path = folder / FILE
     before = path.read_bytes() if path.exists() else b""
     write_file(path, before + answer_line(answer).encode())
@@ -107,6 +113,6 @@ def answer_line(answer: CheckAnswer) -> str:
 
 
 def find_basis(submission: Submission) -> str:
-    """Return a text that changes only with set-up, experiments or numbers."""
+    """Return a hash that changes only if set-up, experiments or reported numbers change."""
     about = {"system", "design", "experiments", "reported"}
     return hashlib.sha256(submission.model_dump_json(include=about).encode()).hexdigest()[:12]

@@ -1,4 +1,4 @@
-"""An answer of the check in words: `templates/words/check.toml`."""
+"""An answer of the check as text, with sentences from `templates/words/check.toml`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -12,19 +12,19 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import symbol_text
 
 WORDS = phrases("check")
-_NAMED = 4  # recordings named one by one; of more, the first and the last
+_NAMED = 4  # recordings named one by one; of a longer list, only the first and the last
 
 
 @dataclass(frozen=True, kw_only=True)
 class HintWords:
-    """A hint in words: the kind of mistake and where to look, one sentence each."""
+    """A hint as text, one sentence each for the kind of mistake and for where to look."""
 
     title: str
     look: tuple[str, ...]
 
 
 def number_words(number: str) -> str:
-    """Return the name of a reported number on a page: "K₁, first estimate"."""
+    """Return the name of a reported number as a page shows it: "K₁, first estimate"."""
     table, _, name = number.partition(".")
     if table == "feedback":
         return WORDS.text(f"feedback_{name}")
@@ -35,7 +35,7 @@ def number_words(number: str) -> str:
 
 
 def result_words(answer: CheckAnswer) -> str:
-    """Return the result in a sentence."""
+    """Return the result of a check as a sentence."""
     wrong, checked = len(answer.disagree), len(answer.disagree) + len(answer.agree)
     if not checked:
         return WORDS.text("nothing_checked")
@@ -47,12 +47,12 @@ def result_words(answer: CheckAnswer) -> str:
 
 
 def asked_words(times: int) -> str:
-    """Return the number of checks, and who sees it."""
+    """Return a sentence with the number of checks, and who sees it."""
     return WORDS.text("asked", times=count(times, "time"))
 
 
 def hint_words(hint: Hint) -> HintWords:
-    """Return a hint in words."""
+    """Return a hint as text."""
     look = [WORDS.text("where", place=_slip_text("place", hint.slip))]
     look += [
         WORDS.text("or_else", title=_slip_text("title", slip), place=_slip_text("place", slip))
@@ -80,7 +80,7 @@ def _runs_text(runs: Sequence[str]) -> str:
 
 
 def answer_lines(answer: CheckAnswer) -> Iterator[str]:
-    """Yield an answer as lines for a terminal; numbers are called by their keys."""
+    """Yield an answer as lines for a terminal; each number is named by its key."""
     yield result_words(answer)
     hinted: dict[tuple, list[Hint]] = {}
     for hint in answer.hints:
@@ -102,7 +102,7 @@ def answer_lines(answer: CheckAnswer) -> Iterator[str]:
 
 
 def asked_note(folder: Path) -> tuple[str, ...]:
-    """Return the note for a TA on how often the check was used, if at all."""
+    """Return a note for the TA on how often the students used the check; empty if never."""
     try:
         times = len(read_answers(folder))
     except SubmissionError:

@@ -1,1 +1,1 @@
-"""Recordings and people found in several submissions of a class."""
+"""Recordings and people that occur in several submissions of a class."""

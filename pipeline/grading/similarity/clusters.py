@@ -14,9 +14,11 @@ from pipeline.grading.grade import Flag
 
 @dataclass(frozen=True, kw_only=True)
 class Cluster:
-    """Submissions each of which shares a recording with another.
+    """Submissions that are connected by shared recordings.
 
-    `recordings` are the shared ones, each as a list of (submission, experiment).
+    Attributes
+    ----------
+    recordings : each shared recording, as a list of (submission, experiment).
     """
 
     recordings: tuple[tuple[tuple[str, str], ...], ...]
@@ -27,7 +29,7 @@ class Cluster:
         return tuple(sorted({name for recording in self.recordings for name, _ in recording}))
 
     def by_submissions(self) -> dict[tuple[str, ...], list[str]]:
-        """Return the shared recordings in words, grouped by their submissions."""
+        """Return the shared recordings in words, by the submissions that contain them."""
         found: dict[tuple[str, ...], list[str]] = defaultdict(list)
         for recording in self.recordings:
             (_, first), *_ = recording
@@ -38,7 +40,12 @@ class Cluster:
 
 
 def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
-    """Return the clusters that follow from flags for shared data, given by submission."""
+    """Return the clusters of a class.
+
+    Parameters
+    ----------
+    flags : by submission, its flag for shared data.
+    """
     pairs = [
         ((name, mine["experiment"]), (mine["submission"], mine["other_experiment"]))
         for name, flag in flags.items()
@@ -55,7 +62,13 @@ def find_clusters(flags: Mapping[str, Flag]) -> list[Cluster]:
 
 
 def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str) -> list[Cluster]:
-    """Return clusters with these names for submissions; unnamed ones become `other`."""
+    """Return clusters with other names for submissions.
+
+    Parameters
+    ----------
+    names : the new name of each submission.
+    other : the new name of submissions that are not in `names`.
+    """
     return sorted(
         (
             Cluster(
@@ -73,7 +86,7 @@ def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str
 
 
 def _joined(pairs: Sequence[tuple[Any, Any]]) -> list[tuple[Any, ...]]:
-    """Join pairs into groups, in order."""
+    """Join pairs that have an element in common into sorted groups."""
     nodes = sorted({node for pair in pairs for node in pair})
     at = {node: i for i, node in enumerate(nodes)}
     ends = np.array([(at[a], at[b]) for a, b in pairs], dtype=int).reshape(-1, 2).T

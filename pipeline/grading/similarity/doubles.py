@@ -1,7 +1,7 @@
 """Find people who are authors of several submissions of a class.
 
-Submissions that share an author count as one team and are not flagged as copies. Somebody could
-hide a copy by adding another student's id, so the TA is informed, but no student is accused.
+Submissions that share an author count as one team and are not flagged as copies. So adding another
+student's id could hide a copy. The TA is informed of such authors; no student is accused.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,18 +12,19 @@ from pipeline.grading.similarity.shared import find_shared
 from pipeline.words.numbers import count, listing
 from pipeline.words.text import clean
 
-_NAMED = 8  # submissions named per person
+_NAMED = 8  # submissions named for one person
 
 
 @dataclass(frozen=True, kw_only=True)
 class Double:
-    """The authors that several submissions have in common.
+    """People who are authors of the same several submissions.
 
     Attributes
     ----------
-    authors : each "" if names are left out.
-    recordings : the largest number that one of the submissions shares with the others.
-    compared : whether each has readable recordings.
+    authors : each is "" if names are left out.
+    recordings : the largest number of recordings that one of the submissions shares with the
+        others.
+    compared : whether all of the submissions have readable recordings.
     """
 
     authors: tuple[str, ...]
@@ -32,7 +33,7 @@ class Double:
     compared: bool = True
 
     def __str__(self) -> str:
-        """The message for a TA."""
+        """Return the message for the TA."""
         named = [" ".join(clean(author).split()) for author in self.authors]
         several = len(named) > 1
         nameless = f"{len(named)} people" if several else "One person"
@@ -46,7 +47,12 @@ class Double:
 
 
 def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
-    """Find the authors of several submissions, given the authors of each."""
+    """Return the people who are authors of several submissions.
+
+    Parameters
+    ----------
+    authors : of each submission.
+    """
     typed: dict[str, str] = {}
     found: dict[str, dict[str, None]] = {}
     for submission, people in authors.items():
@@ -64,7 +70,10 @@ def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:
 
 
 def with_recordings(doubles: Iterable[Double], prints: Iterable[Member]) -> list[Double]:
-    """Return them with the number of shared recordings, including those given out by the lab."""
+    """Return the doubles with the number of recordings that their submissions share.
+
+    Recordings that were given out by the lab count too.
+    """
     alone = [replace(one, authors=(one.submission,)) for one in prints]
     shared = find_shared(alone)
     read = {one.submission for one in alone if one.fingerprints}

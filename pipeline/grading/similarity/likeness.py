@@ -1,10 +1,12 @@
-"""Measure the similarity of two recordings by their noise, beyond what the whole class shares.
+"""Measure how similar the noise of two recordings is, beyond what the whole class shares.
 
-A copy has the noise of its original, even if noise was added: the regression of one residual on
-the other, in the same scale, has slope one. Honest runs share the bench: its knocks and limits are
-as sharp as noise and equal in every run, and an encoder with little noise rounds motions equally.
-So the class is the reference: the part that recordings of others explain is subtracted from both,
-and slope and probability are computed from the rest.
+A copy has the noise of its original, even if more noise was added. So if one noise is regressed on
+the other, in the same scale, the slope is one.
+
+Honest recordings also have something in common: the knocks and end stops of the bench are as sudden
+as noise and equal in every run, and an encoder rounds equal motions equally. All this occurs in the
+whole class. So the part that other teams' recordings explain is subtracted from both first. Slope
+and probability are computed from the remainder.
 """
 
 from collections.abc import Sequence
@@ -15,18 +17,20 @@ from scipy.fft import next_fast_len
 
 from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
 
-LEAST_OVERLAP = 80  # informative samples in both
+LEAST_OVERLAP = 80  # samples with noise in both recordings
 LEAST_SLOPE = 0.5
 _LEAST_SIGMAS = 4.5
-_SPREAD = 2.5  # standard deviations by which a copy's slope may differ from one
-_SAMPLES_EACH = 10  # samples of a recording per other recording used to explain it
-_RIDGE = 1e-6  # share of a recording's power; needed if others copied each other
-_LEAST_PART = 1e-9  # share of a recording's power that must remain unexplained
-_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA  # least noise for finding the scale of two recordings
-# A residual is kept to half a step.
+_SPREAD = 2.5  # standard deviations by which the slope of a copy may differ from one
+# Samples needed for each recording of others that is used to explain a recording.
+_SAMPLES_EACH = 10
+_RIDGE = 1e-6  # share of a recording's power; needed if the others are copies of each other
+_LEAST_PART = 1e-9  # share of a recording's power that the others must leave unexplained
+# Smallest noise from which the scale between two recordings is estimated.
+_LEAST_NOISE = 0.5 * STEPS_PER_SIGMA
+# Residuals are stored as whole steps, so each may be wrong by half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
-_EQUAL_PART = 0.5  # of the shorter recording
-_DIFFERENT_STEPS = 4  # encoder steps between clearly different readings
+_EQUAL_PART = 0.5  # share of the shorter recording that must be equal
+_DIFFERENT_STEPS = 4  # encoder steps between readings that count as different
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +39,12 @@ class Likeness:
 
     Attributes
     ----------
+    experiments : names of the two recordings.
+    times : start and end of the compared or equal part, in s, in each recording.
     slope : of one noise on the other, after subtracting what the class explains.
     sigmas : standard deviations above chance.
-    experiments, times : of both recordings; start and end of the compared or equal part, s.
     equal_rows : number of consecutive rows that are equal up to a factor; 0 if not significant.
-    different : number of different readings among them.
+    different : number of different readings in these rows.
     """
 
     experiments: tuple[str, str]
@@ -51,27 +56,30 @@ class Likeness:
 
     @property
     def is_sure(self) -> bool:
-        """Return whether chance and the class cannot explain it."""
+        """Return whether neither chance nor the class can explain the similarity."""
         return self.sigmas >= _LEAST_SIGMAS and self.slope >= LEAST_SLOPE
 
     @property
     def is_whole(self) -> bool:
-        """Return whether it is sure and as strong as for a copy."""
+        """Return whether it is sure, and the slope is that of a full copy."""
         return self.is_sure and (1 - self.slope) * self.sigmas <= _SPREAD * self.slope
 
 
 def compare(
     a: Print, b: Print, *, shift: int, others: Sequence[tuple[Print, int]] = ()
 ) -> Likeness:
-    """Compare the noise of two recordings, beyond what those of others explain.
+    """Compare the noise of two recordings, beyond what other recordings explain.
 
-    Sample i of `a` is sample i + shift of `b`, and of each of the others i + its shift.
+    Parameters
+    ----------
+    shift : sample i of `a` corresponds to sample i + shift of `b`.
+    others : recordings of other teams, each with its own shift relative to `a`.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
     found = _between(a, b, shift=shift, first=first, last=last)
     if last - first < LEAST_OVERLAP:
         return found
-    # In units of b's noise, so that every cart counts.
+    # All carts are scaled to units of b's noise, so that each of them counts.
     of_a, of_b = a.spread(first, last), b.spread(first + shift, last + shift)
     factor = of_b / of_a * a.step / b.step if of_a * of_b > 0 else np.ones(len(a.step))
     in_a = a.noise[:, first:last] * factor[:, None]
@@ -81,7 +89,7 @@ def compare(
     if n.sum() < LEAST_OVERLAP:
         return found
     in_a, in_b = in_a * both, in_b * both
-    for row in range(len(a.measured), len(n)):  # an input has its own scale
+    for row in range(len(a.measured), len(n)):  # the input has another scale than the carts
         in_a[row] *= np.linalg.norm(in_b[row]) / max(np.linalg.norm(in_a[row]), 1e-30)
     x = np.stack([in_a, in_b], axis=1)
     left = x @ x.transpose(0, 2, 1)
@@ -93,7 +101,7 @@ def compare(
             rest = _left(np.array([*x[row], *beside])[:, both[row]])
             left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
             n[row] -= len(beside)
-    # The signs of carts and of the input may be reversed.
+    # Signs may be reversed in a copy: of all carts together, and of the input.
     product = sum(abs(float(part[:, 0, 1].sum())) for part in np.split(left, [len(a.measured)]))
     of_a, of_b = np.diag(left.sum(axis=0)).tolist()
     if not of_a * of_b > 0:
@@ -103,7 +111,7 @@ def compare(
 
 
 def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likeness:
-    """Return an empty likeness that only states the compared part of `a`."""
+    """Return a result for a part of `a`, with experiments and times but without similarity."""
     return Likeness(
         experiments=(a.experiment, b.experiment),
         times=(a.times(first, last), b.times(first + shift, last + shift)),
@@ -111,7 +119,7 @@ def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likene
 
 
 def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
-    """Return a row's noise between two samples, 0 where it is unknown."""
+    """Return a row's noise between two samples; 0 where the recording has none."""
     part = np.zeros(last - first, dtype=np.float32)
     start, stop = max(first, 0), min(last, one.noise.shape[1])
     if start < stop:
@@ -120,7 +128,7 @@ def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
 
 
 def _left(x: np.ndarray) -> np.ndarray:
-    """Return the products (2, 2) of the first two rows, less what the further rows explain."""
+    """Return the products (2, 2) of the first two rows, minus what the other rows explain."""
     products = x.astype(np.float64) @ x.T
     size = np.sqrt(np.maximum(np.diag(products), 1.0))
     products /= np.outer(size, size)
@@ -132,7 +140,8 @@ def _left(x: np.ndarray) -> np.ndarray:
 def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
     """Return the longest stretch in which two recordings are equal up to one factor per row.
 
-    None if it is not significant: repeated rows, as from a cart at rest, count once.
+    Repeated readings, as from a cart at rest, count once. Returns None if too few remain to be
+    significant.
     """
     first, last = max(0, -shift), min(a.residual.shape[1], b.residual.shape[1] - shift)
     if last - first < LEAST_OVERLAP:
@@ -162,7 +171,7 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
 
 
 def align(a: Print, b: Print) -> tuple[float, int]:
-    """Return the best agreement of the noise of two recordings, and its shift."""
+    """Return the best agreement of the noise of two recordings, and the shift that gives it."""
     n = a.residual.shape[1] + b.residual.shape[1]
     length = next_fast_len(n, real=True)
     spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)

@@ -1,8 +1,8 @@
-"""Fingerprints of recordings: the part that no second run on the same bench repeats.
+"""Fingerprints of recordings: the part that is different in every run on a bench.
 
-Two honest teams that step the same bench get the same response, so the motion proves nothing. Noise
-and encoder rounding, isolated by a high-pass filter, are different in every run. They survive when
-a recording is cut, shifted in time, rescaled, renamed or covered with further noise.
+Two honest teams that step the same bench get the same motion, so motion proves nothing. Noise and
+encoder rounding are different in every run; a high-pass filter isolates them. They survive when a
+recording is cut, shifted in time, rescaled, renamed or covered with further noise.
 """
 
 import json
@@ -18,27 +18,31 @@ from pipeline.arrays import Array
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Record
 
-# The filter passes what is faster than 0.4 of the Nyquist frequency: a bench logged at 113 Hz
-# moves below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
-PASSED = 0.6  # of the band
+# The filter passes frequencies above 0.4 of the Nyquist frequency. On a bench logged at 113 Hz,
+# motion is below 12 Hz. A Kaiser window of 7 lets less than 1e-3 of the motion through.
+PASSED = 0.6  # share of the band
 _TAPS, _WINDOW = 41, 7.0
-MARGIN = _TAPS // 2  # samples lost at either end
+MARGIN = _TAPS // 2  # samples lost at each end of a recording
 
-STEPS_PER_SIGMA = 100.0  # fine enough to see a sensor's noise beside knocks that repeat
+STEPS_PER_SIGMA = 100.0  # fine enough to keep a sensor's noise next to much larger knocks
 _STORED = np.dtype("<i2")
 _MOST_STEPS = np.iinfo(_STORED).max
-_KINK = 4.5  # standard deviations: more is the motion's own kink (a step, a stop), not noise
-_JUMP = 30.0  # standard deviations: no cart kinks so, but the input where the reference steps
-_NOTHING = 1e-7  # of the travel: rounding in the filter
+# Standard deviations; a larger residual is a sudden change of the motion (a step, a stop), not
+# noise.
+_KINK = 4.5
+_JUMP = 30.0  # standard deviations; only an input that jumps has a larger residual
+_NOTHING = 1e-7  # share of the travel; a smaller residual is a rounding error of the filter
 
-_LEAST_SWING = 0.25  # of the largest: smaller swings are affected by noise
-_FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)  # of a swing, where there are few of them
-_MOST_ANCHORS = 12  # in the motion
-_NOISE_ANCHORS, _APART = 12, 5  # samples
+_LEAST_SWING = 0.25  # share of the largest swing; noise affects smaller ones
+# If a motion has at most this many turns, these parts of each swing are used as anchors.
+_FEW_TURNS, _PARTS = 5, (0.5, 0.3, 0.7)
+_MOST_ANCHORS = 12  # anchors from the motion of one recording
+# Anchors from the noise, and the samples by which they must be apart.
+_NOISE_ANCHORS, _APART = 12, 5
 _FEWEST_SAMPLES = 60
-_EVERY = 8  # samples, of which the motion is kept
-_MOST_SAMPLES = 8192  # of one record; more does not make it surer
-_MOST_VALUES = 2_000_000  # of one submission: sixty such records of four carts
+_EVERY = 8  # the motion is stored at every 8th sample
+_MOST_SAMPLES = 8192  # of one recording; more samples do not make the comparison surer
+_MOST_VALUES = 2_000_000  # of one submission: sixty recordings of four carts with this many samples
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,15 +51,18 @@ class Print:
 
     Attributes
     ----------
-    group : the kind of run; only recordings of the same kind are compared.
-    residual : (n_rows, n) whole numbers. A row for each free cart, and one for the
-        input of a closed loop.
+    group : the kind of run; only recordings of the same group are compared.
+    residual : (n_rows, n) whole numbers; one row for each free cart, and one for the input of a
+        closed
+        loop.
     step : (n_rows,) value of 1 in the recording's position unit or input unit.
-    anchors : lists of samples that can be found again in a copy, the surest first, to find its
-        shift: midpoints between two extrema of the motion (robust against noise), and maxima of the
-        noise of carts and input (robust against cuts).
-    motion : of the first cart, at every few samples, to find the scale between two recordings.
-    start, interval : s; the time of the first sample, and from one to the next.
+    anchors : lists of samples that can be found again in a copy, the surest first; they give the
+        shift
+        of the copy. One list has midpoints between two extrema of the motion, which noise does not
+        affect. The others have maxima of the noise, which cutting does not affect.
+    motion : of the first cart at every few samples; it gives the scale between two recordings.
+    start : time of the first sample, in s.
+    interval : time between samples, in s.
     """
 
     experiment: str
@@ -69,12 +76,15 @@ class Print:
 
     @property
     def measured(self) -> np.ndarray:
-        """The residual's rows of positions, without the input, which is computed from them."""
+        """The rows of positions in the residual, without the input that the controller computed."""
         return self.residual[: -1 if self.group.startswith("closed_loop") else None]
 
     @cached_property
     def noise(self) -> np.ndarray:
-        """The residual (n_rows, n) in standard deviations, 0 where a kink or a jump rings in it."""
+        """The residual (n_rows, n) in standard deviations.
+
+        0 near sudden changes of motion or input.
+        """
         sigmas = self.residual.astype(np.float32) / STEPS_PER_SIGMA
         for row in sigmas:
             rings = np.convolve(np.abs(row) > _JUMP, np.ones(_TAPS), "same") > 0
@@ -82,12 +92,12 @@ class Print:
         return sigmas
 
     def times(self, first: int, last: int) -> tuple[float, float]:
-        """Return the times of one sample and of another, s."""
+        """Return the times of two samples, in s."""
         start, end = (round(self.start + at * self.interval, 3) for at in (first, last - 1))
         return start, end
 
     def spread(self, first: int, last: int) -> float:
-        """Return the standard deviation of the motion in some samples, 0 where noise hides it."""
+        """Return the standard deviation of the motion between two samples; 0 if noise hides it."""
         part = self.motion[first // _EVERY : last // _EVERY + 1]
         noise = (STEPS_PER_SIGMA * self.step[0]) ** 2
         spread = float(np.mean((part - part.mean()) ** 2)) - (1 / PASSED - 1) * noise
@@ -95,7 +105,7 @@ class Print:
 
 
 def fingerprint(records: Sequence[Record]) -> bytes:
-    """Return the packed fingerprints of a submission's recordings; b"" without recordings."""
+    """Return the fingerprints of a submission's recordings, packed; b"" without recordings."""
     rows = sum(len(record.carts) + 1 for record in records)
     most = min(_MOST_SAMPLES, _MOST_VALUES // max(rows, 1))
     prints = [found for record in records for found in _prints(record, most=most)]
@@ -119,7 +129,7 @@ def fingerprint(records: Sequence[Record]) -> bytes:
 
 
 def unpack(packed: bytes) -> tuple[Print, ...]:
-    """Read fingerprints packed by `fingerprint`; those of an older version are ignored."""
+    """Return the fingerprints that `fingerprint` packed; those of an older version are ignored."""
     if not packed:
         return ()
     head, _, body = zlib.decompress(packed).partition(b"\0")
@@ -148,8 +158,8 @@ def unpack(packed: bytes) -> tuple[Print, ...]:
 def _prints(record: Record, *, most: int) -> Iterator[Print]:
     """Yield the fingerprint of a recording, unless a cart does not move or it is too short.
 
-    Under feedback the controller passes the noise of the measured positions to the input. Noise
-    added to the positions later does not change it there.
+    In closed loop the controller passes the noise of the measured positions to the input. If
+    somebody adds noise to the positions later, the input still has the old noise.
     """
     carts = [cart for cart in record.free if cart in record.carts]
     if not carts or record.t.size < _FEWEST_SAMPLES + 2 * MARGIN:
@@ -186,9 +196,9 @@ def _prints(record: Record, *, most: int) -> Iterator[Print]:
 
 
 def _sigma(noise: Array, *, travel: float) -> float:
-    """Return the standard deviation of a residual (n,) over its nonzero part; 0 if all is zero.
+    """Return the standard deviation of the nonzero samples of a residual (n,); 0 if they are few.
 
-    A cart at rest reads the same count for seconds, which would only measure how long it rested.
+    A cart at rest has a residual of zero for as long as it rests, which is not its noise.
     """
     there = np.abs(noise[np.abs(noise) > _NOTHING * travel])
     return MEDIAN_TO_SIGMA * float(np.median(there)) if there.size >= _FEWEST_SAMPLES else 0.0
@@ -196,7 +206,7 @@ def _sigma(noise: Array, *, travel: float) -> float:
 
 @cache
 def _high_pass() -> Array:
-    """Return the taps of the filter: 1 minus a low pass, with no response to a constant."""
+    """Return the taps of the filter: 1 minus a low pass, without response to a constant."""
     cut = 1 - PASSED
     lag = np.arange(_TAPS) - MARGIN
     taps = -cut * np.sinc(cut * lag) * np.kaiser(_TAPS, _WINDOW)
@@ -205,14 +215,17 @@ def _high_pass() -> Array:
 
 
 def _noise_anchors(loudness: Array) -> list[int]:
-    """Return the samples with the largest residual (n,), including kinks of the motion."""
+    """Return the samples with the largest residual (n,), including sudden changes of motion."""
     peak = np.max(np.lib.stride_tricks.sliding_window_view(loudness, 2 * _APART + 1), axis=1)
     peaks = _APART + np.flatnonzero(loudness[_APART:-_APART] == peak)
     return peaks[np.argsort(-loudness[peaks], kind="stable")[:_NOISE_ANCHORS]].tolist()
 
 
 def _motion_anchors(motion: Array) -> list[int]:
-    """Return where the motion (n,) passes through its larger swings."""
+    """Return the samples at which the motion (n,) passes through the middle of its larger swings.
+
+    If there are few swings, two more samples of each are returned.
+    """
     turns = _turning_points(motion, least=_LEAST_SWING * float(np.ptp(motion)))
     parts = (0.5,) if turns.size > _FEW_TURNS else _PARTS
     places = []
@@ -224,7 +237,7 @@ def _motion_anchors(motion: Array) -> list[int]:
 
 
 def _turning_points(motion: Array, *, least: float) -> np.ndarray:
-    """Return the extrema between which the motion changes by at least a given size."""
+    """Return the extrema between which the motion changes by at least `least`."""
     if not least > 0:
         return np.zeros(0, dtype=np.int64)
     slope = np.sign(np.diff(motion))
@@ -235,7 +248,7 @@ def _turning_points(motion: Array, *, least: float) -> np.ndarray:
             len(turns) > 1
             and (motion[at] - motion[turns[-1]]) * (motion[turns[-1]] - motion[turns[-2]]) > 0
         ):
-            turns[-1] = at  # the same swing goes on
+            turns[-1] = at  # the same swing continues
         elif not turns or abs(motion[at] - motion[turns[-1]]) >= least:
             turns.append(at)
     return np.array(turns, dtype=np.int64)

@@ -1,7 +1,8 @@
 """Find recordings that two submissions share, by comparing their noise.
 
-Equal noise, beyond what the class shares, is evidence unless other pairs of the class agree in
-part. Equal rows are always evidence. In a class of less than five teams, only equal rows count.
+Equal noise is evidence if it goes beyond what the class shares. But if other pairs of the class
+have partly equal noise, it proves nothing. Equal rows are always evidence. In a class of fewer than
+five teams, only equal rows count.
 """
 
 from collections import Counter, defaultdict
@@ -27,29 +28,33 @@ from pipeline.grading.similarity.likeness import (
 from pipeline.grading.similarity.prints import PASSED, Print, unpack
 from pipeline.words.numbers import first_few
 
-_WIDTH = 512  # samples around an anchor in the first comparison
-_BEFORE = 128  # of them before it
-_FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1  # anchors with which all others are compared
-_PER_SIGMA, _LEVELS = 1.5, 5.0  # noise levels in the first comparison; finer ones show rounding
-_BLOCK = 2048  # anchors compared in one product
-_WORTH_A_LOOK = 3.2  # sigmas in the first comparison: one in a thousand by chance
-# These limits make the remaining work grow with the number of recordings, not its square. With
-# 4,000 recordings of one kind, chance gives so many candidates. Two honest teams with 20 runs each
-# need a tenth of the limit on comparisons.
-_MOST_ALIKE = 16  # candidates per anchor, the most similar, plus the lab's own recordings
+_WIDTH = 512  # samples around an anchor that the first comparison uses
+_BEFORE = 128  # those of them that precede the anchor
+# The best anchors of each recording, with which all others are compared.
+_FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1
+# Levels of noise in the first comparison; finer ones would show rounding.
+_PER_SIGMA, _LEVELS = 1.5, 5.0
+_BLOCK = 2048  # anchors compared in one matrix product
+_WORTH_A_LOOK = 3.2  # sigmas in the first comparison; chance reaches this once in a thousand
+# These limits let the further work grow with the number of recordings, not with its square. With
+# 4,000 recordings of one kind, chance gives this many candidates. Two honest teams with 20
+# recordings each need a tenth of the limit on comparisons.
+_MOST_ALIKE = 16  # candidates per anchor, most similar first; the lab's own recordings are added
 _MOST_COMPARED = 10  # times the number of recordings of one kind in two submissions
-_COUNTS = 4.5  # sigmas for a recording that counts together with others
-_ALONE = 6.5  # … by itself: a class of 200 offers 1e9 comparisons, chance reaches 6.1 in them
-_TOGETHER = 7.5  # root of the summed squares of several
-# With noise of 1/25 count and the very same motion and zero, one reading in so many is rounded
-# differently. So that many equal ones have a probability of 1/e in each pair of recordings.
+_COUNTS = 4.5  # sigmas of a recording that counts together with others
+# Sigmas of one that counts alone; chance reaches 6.1 in 1e9 comparisons, a class of 200.
+_ALONE = 6.5
+_TOGETHER = 7.5  # sigmas of several: the root of their summed squares
+# Suppose two honest runs have the same motion and encoder zero, and noise of 1/25 count. Then one
+# reading in 22 is rounded differently, so 22 equal readings have a probability of 1/e.
 _TO_A_ROUNDING = 22
-_MOST_ALIGNED = 60  # recordings of others that are aligned
-_MOST_OTHERS = 24  # of these that are used to explain
-_FEWEST_TEAMS = 3  # of them
-_COPIES = 1 / 3  # of the other teams, the most similar, are left out: they may have the same copy
-_MOST_IN_PART = 1  # pair of a class with partly equal noise: two knocks may coincide once
-_MATCHES_TO_IN_PART = 10  # not by chance, if so many pairs agree fully per partial agreement
+_MOST_ALIGNED = 60  # recordings of other teams that are aligned
+_MOST_OTHERS = 24  # aligned recordings that are used to explain a recording
+_FEWEST_TEAMS = 3  # teams from which these recordings must come
+# Share of the other teams that is left out, the most similar; they may have the same copy.
+_COPIES = 1 / 3
+_MOST_IN_PART = 1  # tolerated pairs with partly equal noise: two knocks may coincide once
+_MATCHES_TO_IN_PART = 10  # tolerated is also one such pair for each 10 pairs with fully equal noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +63,13 @@ class SharedRecord:
 
     Attributes
     ----------
-    submission : the other one.
+    experiment : its name in this submission.
+    submission, other_experiment : the other submission, and the recording's name there.
     sigmas : agreement of the noise, in standard deviations above chance.
-    equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this
-        is not the evidence.
-    time, other_time : start and end of the equal part, s.
+    equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
+        not
+        the evidence.
+    time, other_time : start and end of the equal part, in s, in both recordings.
     """
 
     experiment: str
@@ -76,13 +83,13 @@ class SharedRecord:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Entry:
-    """A fingerprint and the number of its submission."""
+    """A fingerprint, and the number of the submission that contains it."""
 
     owner: int
     print: Print
 
 
-# Likeness, owner, recording and shift.
+# (likeness, owner, recording, shift)
 _Aligned = tuple[float, int, Print, int]
 
 
@@ -92,12 +99,13 @@ def find_shared(
     earlier: Iterable[Member] = (),
     examples: Iterable[bytes] = (),
 ) -> dict[str, tuple[SharedRecord, ...]]:
-    """Return, by submission of the batch, its recordings that another submission also contains.
+    """Return the shared recordings of each submission of the batch, by submission.
 
     Parameters
     ----------
-    earlier : of earlier batches; compared only with the batch, not with each other.
-    examples : packed fingerprints of recordings given out by the lab, which may be shared.
+    batch : submissions of the current class.
+    earlier : submissions of earlier batches; compared only with the batch, not with each other.
+    examples : packed fingerprints of recordings that the lab gave out; everybody may have them.
     """
     everyone = [*batch, *earlier]
     names = [
@@ -139,11 +147,11 @@ def find_shared(
 
 
 def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
-    """Group fingerprints that may be of the same recording, each once per owner."""
+    """Group fingerprints that may come from the same recording; each owner has each only once."""
     groups: dict[str, list[_Entry]] = defaultdict(list)
     for owner, prints in enumerate(owners):
         once: dict[tuple[str, bytes], Print] = {}
-        for one in unpack(prints.fingerprints):  # one recording under several names counts once
+        for one in unpack(prints.fingerprints):  # a recording under several names counts once
             once.setdefault((one.group, one.residual.tobytes()), one)
         for one in once.values():
             groups[one.group].append(_Entry(owner=owner, print=one))
@@ -151,7 +159,7 @@ def _by_group(owners: Iterable[Member]) -> dict[str, list[_Entry]]:
 
 
 def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> SharedRecord:
-    """Return a likeness from the view of one side."""
+    """Return a likeness as seen from one of the two submissions."""
     return SharedRecord(
         experiment=one.experiments[mine],
         submission=submission,
@@ -164,7 +172,7 @@ def _record_of(one: Likeness, mine: int, other: int, *, submission: str) -> Shar
 
 
 def shared_flag(records: Sequence[SharedRecord]) -> Flag:
-    """Return the flag of one submission: its shared recordings and their other places."""
+    """Return the flag of one submission for its shared recordings."""
     recordings = [asdict(record) for record in records]
     others = list(dict.fromkeys(record.submission for record in records))
     return Flag(
@@ -178,7 +186,9 @@ def shared_flag(records: Sequence[SharedRecord]) -> Flag:
 def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str]) -> str:
     """Return the sentence about recordings in other submissions, with the best evidence.
 
-    `recordings` are those of a flag's evidence; a gradebook may hold some without times.
+    Parameters
+    ----------
+    recordings : those of a flag's evidence; an older gradebook may have some without times.
     """
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
     stand = "stands" if len(experiments) == 1 else "stand"
@@ -194,7 +204,7 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
 
 
 def told(flag: Flag) -> str:
-    """Return the flag without the other submission's name, which only the instructor gives."""
+    """Return the message of a flag as students see it, without the name of another submission."""
     if flag.code != "shared_data":
         return flag.message
     return shared_message(flag.evidence["recordings"], ["another submission"])
@@ -203,7 +213,8 @@ def told(flag: Flag) -> str:
 def same_team(a: Member, b: Member) -> bool:
     """Return whether two submissions are from the same team.
 
-    They share an author or a platform's number; without authors, they have the same name.
+    They are if they have an author or an account number in common. If one names no authors, equal
+    names are enough.
     """
     if same_number(a.owner, b.owner):
         return True
@@ -213,7 +224,7 @@ def same_team(a: Member, b: Member) -> bool:
 
 
 def same_recordings(a: Member, b: Member) -> bool:
-    """Return whether one of two submissions has all recordings of the other, unchanged."""
+    """Return whether one of two submissions contains all recordings of the other, unchanged."""
     of_a, of_b = ({one.residual.tobytes() for one in unpack(p.fingerprints)} for p in (a, b))
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
@@ -221,10 +232,10 @@ def same_recordings(a: Member, b: Member) -> bool:
 def _telling(
     matches: Mapping[tuple[int, int], Sequence[Likeness]],
 ) -> dict[tuple[int, int], list[Likeness]]:
-    """Return the matches of a class that prove a copy, by pair of submissions.
+    """Return the matches that prove a copy, by pair of submissions.
 
-    If the noise of several pairs agrees in part, the bench or its encoder causes this, and full
-    agreement proves nothing either. Equal rows always prove a copy.
+    If the noise of several pairs agrees only partly, the bench or its encoder causes the agreement.
+    Then full agreement of noise proves nothing either. Equal rows always prove a copy.
     """
     sure = [one for found in matches.values() for one in found if one.is_sure]
     whole = sum(one.is_whole for one in sure)
@@ -237,9 +248,11 @@ def _telling(
 
 
 def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
-    """Return the matches of one pair of submissions, one per recording, if they suffice.
+    """Return the matches of two submissions, one per recording, if together they prove a copy.
 
-    `compared` is the number of pairs of recordings that chance had.
+    Parameters
+    ----------
+    compared : number of pairs of recordings in which chance could have made a match.
     """
     chosen: list[Likeness] = []
     for one in sorted(found, key=lambda one: (-one.different, -one.sigmas, one.experiments)):
@@ -258,9 +271,9 @@ def _decisive(found: Sequence[Likeness], *, compared: int) -> list[Likeness]:
 def _matches(
     entries: Sequence[_Entry], *, first_batch: int, everyone: int, owners: Sequence[Member]
 ) -> Iterator[tuple[tuple[int, int], Likeness]]:
-    """Yield pairs of similar recordings of different teams, with their owners."""
+    """Yield pairs of similar recordings from different teams, each with its two owners."""
     best: dict[tuple[int, int], Likeness] = {}
-    alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # at first comparison
+    alike: dict[tuple[int, int], float] = defaultdict(lambda: _COUNTS)  # best likeness so far
     seen: set[tuple[int, int, int]] = set()
     aligned: dict[int, list[_Aligned]] = {}
 
@@ -268,7 +281,8 @@ def _matches(
     def same(a: int, b: int) -> bool:
         return same_team(owners[a], owners[b])
 
-    partner: dict[tuple[int, int], int] = {}  # of a recording, in a submission: certainly a copy
+    # Recording and submission: the recording there that is certainly a copy.
+    partner: dict[tuple[int, int], int] = {}
     compared: Counter[tuple[int, int]] = Counter()
     recordings = Counter(entry.owner for entry in entries)
     for i, anchor_i, j, anchor_j in _candidates(entries, everyone=everyone):
@@ -307,7 +321,7 @@ def _matches(
 
 
 def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
-    """Return recordings of others aligned with one, the most similar first."""
+    """Return recordings of other submissions, aligned with recording i, the most similar first."""
     rest = [one for one in entries if one.owner != entries[i].owner]
     found = []
     for one in rest[:: max(1, len(rest) // _MOST_ALIGNED)]:
@@ -319,7 +333,7 @@ def _aligned(entries: Sequence[_Entry], i: int) -> list[_Aligned]:
 def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
     """Return recordings that show what a class shares, with their shifts; empty for a small class.
 
-    The most similar ones may belong to teams with the same copy, and are left out.
+    The most similar ones are left out, because their teams may have the same copy.
     """
     teams = list(dict.fromkeys(owner for _, owner, _, _ in aligned))
     if len(teams) < _FEWEST_TEAMS:
@@ -329,12 +343,13 @@ def _others(aligned: Sequence[_Aligned]) -> list[tuple[Print, int]]:
 
 
 def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[int, int, int, int]]:
-    """Yield (entry, its anchor, other entry, its anchor) with similar surroundings.
+    """Yield anchors with similar noise around them: (entry, anchor, other entry, other anchor).
 
-    All anchors are compared with the first ones, separately in motion and noise. An index would not
-    be faster than this product: with six times its noise added, a copy is hardly more similar than
-    chance. The most similar come first, separately for motion and noise. Recordings given out by
-    the lab (owners beyond `everyone`) are always candidates.
+    Motion and noise have separate anchors, and each yields the most similar pairs first. All
+    anchors are compared with the best ones of each recording. An index would not be faster than
+    this product, because a copy with six times its noise added is hardly more similar than chance.
+
+    Recordings that the lab gave out (owners from `everyone` on) are always candidates.
     """
     owners = np.array([entry.owner for entry in entries])
     kinds = zip_longest(*(one.print.anchors for one in entries), fillvalue=())
@@ -345,7 +360,7 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
             continue
         columns = _windows(entries, first).T
         of_columns = owners[[i for i, _ in first]]
-        found: list[tuple[float, int, int]] = []  # similarity, place, first anchor
+        found: list[tuple[float, int, int]] = []  # similarity, place, best anchor
         for start in range(0, len(places), _BLOCK):
             block = places[start : start + _BLOCK]
             alike = np.abs(_windows(entries, block) @ columns)
@@ -363,7 +378,7 @@ def _candidates(entries: Sequence[_Entry], *, everyone: int) -> Iterator[tuple[i
 def _windows(entries: Sequence[_Entry], places: Sequence[tuple[int, int]]) -> np.ndarray:
     """Return the residuals around anchors, (n, n_free * _WIDTH).
 
-    Scaled so that a product of two is approximately in sigmas.
+    They are scaled so that the product of two is approximately in sigmas.
     """
     n_free = entries[0].print.residual.shape[0]
     windows = np.zeros((len(places), n_free, _WIDTH), dtype=np.float32)
