@@ -273,7 +273,7 @@ class Gradebook:
             return read_figures(connection, entry.grading)
 
     def findings(self, entry: Entry) -> str:
-        """Return the stored results of a submission's checks; "" if there are none."""
+        """Return the stored results of a submission's checks; "" if they were not kept."""
         mine = select(findings.c.found).where(findings.c.grading_id == entry.grading)
         with self._database.reading() as connection:
             return connection.scalar(mine) or ""
@@ -430,6 +430,6 @@ class Gradebook:
 
 
 def _named(team: str, rows: Sequence[Row]) -> list[Row]:
-    """Return the rows with this submission name; if there is none, those with this author."""
+    """Return the rows with this submission name; if no name matches, those with this author."""
     exact = [row for row in rows if row.name == team]
     return exact or [row for row in rows if person(team) in map(person, row.authors)]

@@ -428,7 +428,7 @@ def _in_class(batch: Row) -> Select:
 
 
 def _given(connection: Connection, batch: Row) -> dict[int, dict[int, HandPoints]]:
-    """Return all points ever given by hand in a class, by the number of the submission."""
+    """Return all overrides of a class, by number of submission and number of override."""
     given: dict[int, dict[int, HandPoints]] = defaultdict(dict)
     mine = _overrides().where(overrides.c.submission_id.in_(_in_class(batch)))
     for row in connection.execute(mine):
@@ -478,7 +478,7 @@ def points_of(grade: Grade, criterion: str) -> float | None:
 
 
 def _changed_at(batch: Row, at: str) -> Select:
-    """Return the query for all points given by hand at one moment in a class."""
+    """Return the query for the overrides that were made in a class at one time."""
     return _overrides().where(overrides.c.at == at, overrides.c.submission_id.in_(_in_class(batch)))
 
 
@@ -519,7 +519,7 @@ def name_version(row: Row, newest: Row | None) -> str:
 
 
 def find_version(connection: Connection, row: Row, criterion: str) -> tuple[str, HandPoints | None]:
-    """Return the state behind the points of a criterion, and the last points by hand."""
+    """Return the version of a criterion's points, and the last points given by hand, or None."""
     newest = newest_overrides(connection, [row.submission_id])[row.submission_id].get(criterion)
     return name_version(row, newest), _read_override(newest) if newest is not None else None
 

@@ -192,14 +192,14 @@ def class_list(batch: Row, *columns: ColumnElement) -> Select:
 
 
 def final_entry(connection: Connection, row: Row, *, shared: Flag | None, rubric: Rubric) -> Entry:
-    """Return the current grade, with the flag for shared data and points given by hand."""
+    """Return a line of the class list with its current grade; the overrides are read here."""
     return final_entries(connection, [(row, shared)], rubric=rubric)[0]
 
 
 def final_entries(
     connection: Connection, lines: Sequence[tuple[Row, Flag | None]], *, rubric: Rubric
 ) -> list[Entry]:
-    """Return the current grade of each line; there are two queries, however many lines there are.
+    """Return lines of the class list with their current grades, in two queries.
 
     Parameters
     ----------
@@ -226,7 +226,7 @@ def final_entries(
 
 
 def first_keys(connection: Connection, submitted: Iterable[int] | Select) -> dict[int, str]:
-    """Return, by the number of the submission, the key of its first version."""
+    """Return the key of the first version of each submission, by number of submission."""
     firsts = select(func.min(gradings.c.id)).where(gradings.c.submission_id.in_(submitted))
     firsts = firsts.group_by(gradings.c.submission_id)
     keys = select(gradings.c.submission_id, gradings.c.key).where(gradings.c.id.in_(firsts))

@@ -267,7 +267,7 @@ def _label(name: str, units: Units | None) -> str | tuple[Span, ...]:
 
 
 def _called(name: str) -> str:
-    """Return the name of a quantity; if it has none, its key in grade.json made readable."""
+    """Return the name of a quantity; without a name, its key in grade.json made readable."""
     key = f"quantity_{name}"
     return WORDS.text(key) if key in WORDS.by_key else _capital(clean(name).replace("_", " "))
 

@@ -119,7 +119,7 @@ def _between(a: Print, b: Print, *, shift: int, first: int, last: int) -> Likene
 
 
 def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
-    """Return a row's noise between two samples; 0 where the recording has none."""
+    """Return a row's noise between two samples; 0 outside the recording."""
     part = np.zeros(last - first, dtype=np.float32)
     start, stop = max(first, 0), min(last, one.noise.shape[1])
     if start < stop:
