@@ -8,7 +8,7 @@ from pipeline.output import write_file
 from pipeline.plant.linear.presets import PRESETS
 from pipeline.plant.nonlinear.effects import CATALOGUE, Effect
 from pipeline.report.effects.catalogue import parameter_text
-from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_command
+from pipeline.report.effects.gallery import BENCH, effect_picture, hiding_option
 from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.builder import PageBuilder
@@ -37,7 +37,10 @@ def effects_page() -> str:
         "# The effects",
         "<!-- written by python -m docs.codegen -->",
         _wrapped(phrases("effects").text("effects")),
-        "[`cartlab gap`](gap.md) looks for them, [`cartlab simulate`](commands.md) hides them.",
+        _wrapped(
+            "[`cartlab gap`](gap.md) looks for these effects. To simulate a bench with one, add "
+            f"its option to `cartlab simulate --preset {BENCH} --out bench`."
+        ),
     ]
     return "\n\n".join([*head, *(part for e in CATALOGUE for part in _entry(e))]) + "\n"
 
@@ -48,7 +51,7 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield _wrapped(f"`{effect.key}`: {effect.sentence}")
     yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
-    yield f"![{effect.title}: fingerprint and example]({picture})"
+    yield f"![Fingerprint and example]({picture})"
     facts = {
         f"Parameters ({effect.place})": ", ".join(
             parameter_text(p) for p in effect.parameters if p.reported
@@ -59,7 +62,7 @@ def _entry(effect: Effect) -> Iterator[str]:
         "Read": effect.reference,
     }
     lines = [_wrapped(f"- **{name}**: {fact}") for name, fact in facts.items() if fact]
-    yield "\n".join([*lines, f"- **Try it**: `{hiding_command(term)}`"])
+    yield "\n".join([*lines, f"- **Option**: `{hiding_option(term)}`"])
 
 
 def _wrapped(text: str) -> str:

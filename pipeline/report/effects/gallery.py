@@ -93,8 +93,12 @@ def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: 
 
 def hiding_command(term: EffectTerm) -> str:
     """Return the command that hides this effect, as in the picture."""
+    return f"cartlab simulate --preset {BENCH} {hiding_option(term)} --out bench"
+
+
+def hiding_option(term: EffectTerm) -> str:
+    """Return the option of that command."""
     place = [f"{term.effect.place}={term.place}"] if term.place else []
     pairs = zip(term.effect.parameters, term.values, strict=True)
     sizes = [f"{p.name}={value:.3g}" for p, value in pairs if p.reported]
-    hide = f"{term.effect.key}:{','.join(place + sizes)}"
-    return f"cartlab simulate --preset {BENCH} --hide {hide} --out bench"
+    return f"--hide {term.effect.key}:{','.join(place + sizes)}"

@@ -8,17 +8,19 @@ from pipeline.words.math import dot, row, sub
 EFFECT = Effect(
     key="actuator_lag",
     title="First-order lag of the drive",
-    sentence="The force follows the input with a time constant.",
+    sentence="The force follows the input gradually, with one time constant.",
     place="input",
     law=BuiltLaw("lag", row("τ", dot("u"), "+", "u", "=", sub("u", "command"))),
     parameters=(
         EffectParameter("time_constant", "τ", "s", scale="sample_time", typical=1.5, neutral=0.0),
     ),
-    fingerprint="Edges of the input are rounded; at higher frequencies less force arrives, later.",
-    deciding_run="A sweep beyond the resonances: a delay keeps the amplitude, a lag does not.",
+    fingerprint="The cart answers an edge of the input gradually. At high frequencies it moves "
+    "less and later than the linear model says.",
+    deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, a delay does "
+    "not.",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
-    equivalent="A delay, where the time constant is much shorter than the sample time.",
+    equivalent="A delay, if the time constant is much shorter than the sample time.",
     same_as="input_delay",
     same_below=MUCH_SHORTER,
 )

@@ -52,8 +52,10 @@ EFFECT = Effect(
             reported=False,
         ),
     ),
-    fingerprint="A short pause and a knock at each reversal of the force; small inputs are lost.",
-    deciding_run="Small steps about zero against the same steps on a bias that keeps contact.",
+    fingerprint="At each reversal of the force, a short pause and then a knock. Very small inputs "
+    "do not move the cart.",
+    deciding_run="Small steps about zero, and the same steps on top of a constant input that keeps "
+    "the teeth in contact: only the former are delayed.",
     reference="M. Nordin, P.-O. Gutman, Automatica 38 (2002), 1633-1649",
     axis="time",
 )

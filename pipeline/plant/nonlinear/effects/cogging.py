@@ -6,7 +6,8 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw, Growth
 EFFECT = Effect(
     key="cogging",
     title="Cogging of the motor",
-    sentence="The teeth of the motor (or of pinion and rack) pull cart 1 to and fro as it travels.",
+    sentence="As cart 1 travels, the magnets of the motor (or the teeth of pinion and rack) push "
+    "it forwards and backwards in turn.",
     place="input",
     law=ForceLaw("F * sin(2 * π * x / λ + φ)", on_motor=True, step=1e-3),
     growth=Growth(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
@@ -26,10 +27,11 @@ EFFECT = Effect(
         ),
         EffectParameter("phase", "φ", "rad", scale="1", typical=3.142, signed=True),
     ),
-    fingerprint="The cart rests at some positions rather than at others, evenly apart; the "
-    "residual force is the same wave over position in both directions.",
-    deciding_run="A slow ramp of the input, up and down: the cart moves in even steps, at the same "
-    "positions both ways, where dry friction shifts them.",
+    fingerprint="The cart tends to rest at evenly spaced positions. Plotted against position, the "
+    "force that the linear model cannot explain is a sine wave, the same in both directions of "
+    "travel.",
+    deciding_run="A slow ramp of the input, up and down. With cogging the cart jumps from one rest "
+    "position to the next, at the same positions both ways. With dry friction they differ.",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )

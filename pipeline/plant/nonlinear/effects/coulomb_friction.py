@@ -13,9 +13,10 @@ EFFECT = Effect(
     place="cart",
     law=FrictionLaw("F"),
     parameters=(FORCE,),
-    fingerprint="Peaks fall along a straight line, not an exponential; the cart stops dead and "
-    "its rest point scatters.",
-    deciding_run="Free decay from two release heights: the fitted ζ falls as the amplitude grows.",
+    fingerprint="In a decay, the peaks fall along a straight line instead of an exponential. The "
+    "cart stops abruptly, and not always at the same position.",
+    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger "
+    "swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
     family="dry friction",

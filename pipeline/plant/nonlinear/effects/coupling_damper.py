@@ -8,7 +8,8 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="coupling_damper",
     title="A damper between two carts",
-    sentence="The spring (or a hose, a cable) dissipates as it is stretched.",
+    sentence="The spring between two carts (or a hose or cable) takes energy out when its length "
+    "changes.",
     place="spring",
     law=ForceLaw("c * rate", step=inf),
     parameters=(
@@ -16,10 +17,11 @@ EFFECT = Effect(
             "coefficient", "c", "input s/position", scale="damping", typical=0.3, neutral=0.0
         ),
     ),
-    fingerprint="Modes in which the carts move against each other are damped more.",
-    deciding_run="Free decay of each mode: damping of the in-phase against the opposed mode.",
+    fingerprint="Modes in which the two carts move against each other are damped more than modes "
+    "in which they move together.",
+    deciding_run="A free decay of each mode: compare their damping.",
     reference="L. Meirovitch, Fundamentals of Vibrations, chapter 7",
     axis="velocity",
     between_carts=True,
-    equivalent="The carts' own damping, where the spring ends at a wall.",
+    equivalent="The carts' own damping, if the spring ends at a wall.",
 )

@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="cubic_spring",
     title="Hardening or softening spring",
-    sentence="The spring grows stiffer (or softer) the further it is stretched, either way.",
+    sentence="The spring becomes stiffer (or softer) the more it is stretched or compressed.",
     place="spring",
     law=ForceLaw("a * d**3"),
     parameters=(
@@ -20,11 +20,11 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="The frequency changes with the amplitude; the static gain depends on the step's "
-    "size.",
-    deciding_run="Free decay from a large release: the period of the first swings against the "
-    "last.",
+    fingerprint="The frequency of a decay changes with the amplitude, and the static gain with the "
+    "size of the step.",
+    deciding_run="Free decay from a large release distance: the period of the first swings differs "
+    "from that of the last.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
-    equivalent="The other wall spring, on a single cart.",
+    equivalent="On a single cart, the same law in the other wall spring.",
 )

@@ -8,7 +8,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="drive_damping",
     title="Braking by the driven motor",
-    sentence="The motor brakes cart 1 while it is powered, and runs free when it is off.",
+    sentence="The motor brakes cart 1 while the input is on, but not while it is zero.",
     place="input",
     law=ForceLaw("-c * v * on", step=inf),
     parameters=(
@@ -22,9 +22,9 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="More damping after the step on than after the step off.",
-    deciding_run="A step of zero mean after the first: the same displaced position with and "
-    "without the drive.",
+    fingerprint="The cart is damped more after a step on than after a step off.",
+    deciding_run="Steps of two sizes and a free decay: the cart is damped more after the steps, "
+    "and equally for both.",
     reference="back-EMF of a voltage-driven DC motor; any text on electric drives",
     axis="velocity",
 )

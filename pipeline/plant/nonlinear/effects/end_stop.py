@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ContactLaw, Growth
 EFFECT = Effect(
     key="end_stop",
     title="End stop",
-    sentence="Past some position the cart runs against a stop.",
+    sentence="Beyond some position the cart runs against a stop.",
     place="cart",
     law=ContactLaw("-k * (x - p) - c * v", past="p"),
     growth=Growth(("k", "p", "c")),
@@ -31,8 +31,9 @@ EFFECT = Effect(
             reported=False,
         ),
     ),
-    fingerprint="The largest swings are cut off on one side, at one position, with a bounce.",
-    deciding_run="The same step a third smaller: the cut disappears.",
+    fingerprint="The largest swings are cut off on one side, always at the same position, and the "
+    "cart bounces there.",
+    deciding_run="The same step, a third smaller: the swings are no longer cut off.",
     reference="K. H. Hunt, F. R. E. Crossley, Journal of Applied Mechanics 42 (1975), 440-445",
     axis="position",
 )

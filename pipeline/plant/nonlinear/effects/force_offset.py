@@ -6,7 +6,8 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="force_offset",
     title="A constant force",
-    sentence="A tilted track, or a motor that pushes a little at zero input.",
+    sentence="A constant force acts on the cart, from a tilted track or a motor that pushes at "
+    "zero input.",
     place="cart",
     law=ForceLaw("F"),
     parameters=(
@@ -20,11 +21,12 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="The rest point is displaced by the same force in every run, whatever is held.",
-    deciding_run="Runs with different carts held: an encoder's zero stays, a force's displacement "
-    "changes with the springs that carry it.",
+    fingerprint="In every run the cart rests off zero. One constant force explains this, whichever "
+    "carts are held.",
+    deciding_run="Runs with different carts held: with stiffer springs a force displaces the cart "
+    "less, whereas a wrong encoder zero stays the same.",
     reference="statics of the chain",
     axis="position",
     only_rest=True,
-    equivalent="The encoder zero, in one configuration of held carts alone.",
+    equivalent="A wrong encoder zero, if the same carts are held in all runs.",
 )

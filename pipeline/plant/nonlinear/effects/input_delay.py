@@ -16,8 +16,10 @@ EFFECT = Effect(
             "delay", "T", "s", scale="sample_time", typical=1.5, signed=True, neutral=0.0
         ),
     ),
-    fingerprint="Every motion starts late by the same time; free decays show nothing.",
-    deciding_run="A sharp edge of the input at a high sample rate.",
+    fingerprint="Every driven motion starts late by the same time. Free decays fit the linear "
+    "model.",
+    deciding_run="A step at a high sample rate: the cart begins to move some time after the edge "
+    "of the input.",
     reference="K. J. Åström, B. Wittenmark, Computer-Controlled Systems, section 2.3",
     axis="time",
     equivalent="A lag much shorter than the sample time.",

@@ -10,9 +10,9 @@ EFFECT = Effect(
     place="cart",
     law=FrictionLaw("μ * abs(u)"),
     parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
-    fingerprint="More damping while the motor pushes than in free decay, in proportion to the "
-    "push, and constant over the swing.",
-    deciding_run="Steps of two sizes: the extra friction doubles with the input.",
+    fingerprint="While the motor pushes, there is more dry friction than in a free decay, in "
+    "proportion to the input.",
+    deciding_run="Steps of two sizes: twice the input gives twice the friction.",
     reference="G. Amontons' law applied to the rack; see Armstrong-Hélouvry, Control of Machines "
     "with Friction, chapter 2",
     axis="velocity",

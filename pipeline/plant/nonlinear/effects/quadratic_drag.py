@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="quadratic_drag",
     title="Quadratic drag",
-    sentence="Air or fluid resists with the square of the speed.",
+    sentence="Air or another fluid resists with a force that grows with the square of the speed.",
     place="cart",
     law=ForceLaw("-q * v * abs(v)"),
     parameters=(
@@ -19,8 +19,9 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="Large swings die faster than small ones: the fitted ζ grows with the amplitude.",
-    deciding_run="Free decay from two release heights: the fitted ζ grows with the amplitude.",
+    fingerprint="Large swings lose a larger share of their amplitude per period than small ones.",
+    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
+    "swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
 )

@@ -12,11 +12,12 @@ EFFECT = Effect(
     law=BuiltLaw("reading", row("y", "=", "g", "x")),
     growth=Growth(("e",), {"g": "1 + e"}, signed=True),
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
-    fingerprint="The carts' amplitudes are in a ratio that no chain of springs gives.",
-    deciding_run="Move the carts by a ruler and read the encoders.",
+    fingerprint="No chain of springs gives the measured ratio between the carts' amplitudes.",
+    deciding_run="Move each cart along a ruler and compare with its encoder.",
     reference="statics of the chain",
     axis="position",
     fewest_carts=2,
     same_as="sensor_gain",
-    equivalent="Another cart's gain: only ratios show, and none without a spring at both ends.",
+    equivalent="The gain of another cart, because the data show only ratios of gains. Without "
+    "springs to both walls they do not even show ratios.",
 )

@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ContactLaw, Growth
 EFFECT = Effect(
     key="slack_spring",
     title="A spring that changes past a stretch",
-    sentence="Past some stretch the spring goes slack, or coil meets coil.",
+    sentence="Beyond some stretch the spring goes slack, or its coils touch.",
     place="spring",
     law=ContactLaw("r * k * (d - s)", past="s", pulls=True),
     growth=Growth(("h", "s"), {"r": "h / k"}, signed=True),
@@ -23,9 +23,11 @@ EFFECT = Effect(
         ),
         EffectParameter("stretch", "s", "position", scale="position", typical=0.35, side=True),
     ),
-    fingerprint="The swing is of a different shape on one side, beyond one position.",
-    deciding_run="Static steps of both signs and several sizes: the gain has a corner.",
+    fingerprint="On one side only, the stiffness changes beyond some position: the tips of the "
+    "swings have another shape there.",
+    deciding_run="Steps of both signs and several sizes: plotted against the input, the settled "
+    "positions are on two straight lines with a corner.",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
-    equivalent="The other wall spring with the stretch on the other side, on a single cart.",
+    equivalent="On a single cart, the other wall spring with the stretch on the other side.",
 )

@@ -8,7 +8,7 @@ from pipeline.plant.nonlinear.effects.law import FrictionLaw, Growth
 EFFECT = Effect(
     key="stiction",
     title="Stiction (Stribeck friction)",
-    sentence="Dry friction that holds more firmly at rest than it drags in motion.",
+    sentence="Dry friction that is larger at rest than in motion.",
     place="cart",
     law=FrictionLaw(
         "F + (S - F) * exp(-(v / w)**2)", at_rest="S", beyond="coulomb_friction", step=1.2e-3
@@ -19,10 +19,10 @@ EFFECT = Effect(
         EffectParameter("static_force", "S", "input", scale="stiffness * position", typical=0.06),
         EffectParameter("velocity", "w", "position/s", scale="velocity", typical=0.1),
     ),
-    fingerprint="The cart sticks at its turning points and breaks loose with a jerk; the last "
+    fingerprint="The cart sticks at its turning points and breaks loose with a jerk. The last "
     "swings end abruptly.",
-    deciding_run="A slow ramp of the input: the force at which the cart breaks loose is above the "
-    "force that keeps it moving.",
+    deciding_run="A slow ramp of the input: the cart needs more force to break loose than to keep "
+    "moving.",
     reference="B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994)",
     axis="velocity",
     family="dry friction",
