@@ -52,17 +52,15 @@ def _entry(effect: Effect) -> Iterator[str]:
     yield f"```math\n{to_tex(effect.formula)}\n```"
     picture = (IMAGES / f"{effect.key}.svg").as_posix()
     yield f"![Fingerprint and example]({picture})"
+    parameters = ", ".join(parameter_text(p) for p in effect.parameters if p.reported)
     facts = {
-        f"Parameters ({effect.place})": ", ".join(
-            parameter_text(p) for p in effect.parameters if p.reported
-        ),
+        f"Parameters ({effect.place})": f"{parameters}, as in `{hiding_option(term)}`",
         "Fingerprint": effect.fingerprint,
         "Deciding run": effect.deciding_run,
         "Easily taken for": effect.equivalent,
         "Read": effect.reference,
     }
-    lines = [_wrapped(f"- **{name}**: {fact}") for name, fact in facts.items() if fact]
-    yield "\n".join([*lines, f"- **Option**: `{hiding_option(term)}`"])
+    yield "\n".join(_wrapped(f"- **{name}**: {fact}") for name, fact in facts.items() if fact)
 
 
 def _wrapped(text: str) -> str:

@@ -15,12 +15,12 @@ EFFECT = Effect(
         EffectParameter("time_constant", "τ", "s", scale="sample_time", typical=1.5, neutral=0.0),
     ),
     fingerprint="The cart answers an edge of the input gradually. At high frequencies it moves "
-    "less and later than the linear model says.",
+    "less and later.",
     deciding_run="A sweep beyond the resonances: a lag lowers the amplitude there, a delay does "
     "not.",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 3.2",
     axis="frequency",
-    equivalent="A delay, if the time constant is much shorter than the sample time.",
+    equivalent="A delay, if the time constant is much shorter than a sample.",
     same_as="input_delay",
     same_below=MUCH_SHORTER,
 )

@@ -52,10 +52,9 @@ EFFECT = Effect(
             reported=False,
         ),
     ),
-    fingerprint="At each reversal of the force, a short pause and then a knock. Very small inputs "
-    "do not move the cart.",
-    deciding_run="Small steps about zero, and the same steps on top of a constant input that keeps "
-    "the teeth in contact: only the former are delayed.",
+    fingerprint="At each reversal of the force, a short pause and then a knock.",
+    deciding_run="Small steps about zero, and the same steps on top of a constant input. Only the "
+    "former cross the gap and are late.",
     reference="M. Nordin, P.-O. Gutman, Automatica 38 (2002), 1633-1649",
     axis="time",
 )

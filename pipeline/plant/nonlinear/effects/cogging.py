@@ -6,8 +6,8 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw, Growth
 EFFECT = Effect(
     key="cogging",
     title="Cogging of the motor",
-    sentence="As cart 1 travels, the magnets of the motor (or the teeth of pinion and rack) push "
-    "it forwards and backwards in turn.",
+    sentence="The magnets of the motor (or the teeth of pinion and rack) push cart 1 forwards and "
+    "backwards in turn as it travels.",
     place="input",
     law=ForceLaw("F * sin(2 * π * x / λ + φ)", on_motor=True, step=1e-3),
     growth=Growth(("a", "b", "λ"), {"F": "hypot(a, b)", "φ": "atan2(b, a)"}, signed=True),
@@ -27,11 +27,10 @@ EFFECT = Effect(
         ),
         EffectParameter("phase", "φ", "rad", scale="1", typical=3.142, signed=True),
     ),
-    fingerprint="The cart tends to rest at evenly spaced positions. Plotted against position, the "
-    "force that the linear model cannot explain is a sine wave, the same in both directions of "
-    "travel.",
-    deciding_run="A slow ramp of the input, up and down. With cogging the cart jumps from one rest "
-    "position to the next, at the same positions both ways. With dry friction they differ.",
+    fingerprint="The cart tends to rest at evenly spaced positions. The remaining force is a sine "
+    "wave over position, the same in both directions of travel.",
+    deciding_run="A slow ramp of the input, up and down: the cart jumps between rest positions "
+    "that are the same both ways. With dry friction they differ.",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )

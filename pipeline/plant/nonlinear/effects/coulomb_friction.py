@@ -13,10 +13,9 @@ EFFECT = Effect(
     place="cart",
     law=FrictionLaw("F"),
     parameters=(FORCE,),
-    fingerprint="In a decay, the peaks fall along a straight line instead of an exponential. The "
-    "cart stops abruptly, and not always at the same position.",
-    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger "
-    "swings.",
+    fingerprint="The peaks of a decay fall along a straight line, not an exponential. The cart "
+    "stops abruptly, not always at the same position.",
+    deciding_run="Free decays from two distances: the fitted ζ is smaller for the larger swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
     family="dry friction",

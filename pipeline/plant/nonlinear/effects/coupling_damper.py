@@ -8,8 +8,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="coupling_damper",
     title="A damper between two carts",
-    sentence="The spring between two carts (or a hose or cable) takes energy out when its length "
-    "changes.",
+    sentence="The spring between two carts (or a hose or cable) damps changes of its length.",
     place="spring",
     law=ForceLaw("c * rate", step=inf),
     parameters=(
@@ -17,8 +16,7 @@ EFFECT = Effect(
             "coefficient", "c", "input s/position", scale="damping", typical=0.3, neutral=0.0
         ),
     ),
-    fingerprint="Modes in which the two carts move against each other are damped more than modes "
-    "in which they move together.",
+    fingerprint="Modes in which the carts move against each other are damped more than the others.",
     deciding_run="A free decay of each mode: compare their damping.",
     reference="L. Meirovitch, Fundamentals of Vibrations, chapter 7",
     axis="velocity",

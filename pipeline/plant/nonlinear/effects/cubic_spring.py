@@ -20,11 +20,10 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="The frequency of a decay changes with the amplitude, and the static gain with the "
-    "size of the step.",
-    deciding_run="Free decay from a large release distance: the period of the first swings differs "
-    "from that of the last.",
+    fingerprint="The frequency changes with the amplitude, and the static gain with the size of "
+    "the step.",
+    deciding_run="Free decay from a large distance: the first period differs from the last.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="stretch",
-    equivalent="On a single cart, the same law in the other wall spring.",
+    equivalent="On a single cart, the other wall spring.",
 )

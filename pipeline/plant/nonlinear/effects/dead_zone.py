@@ -10,10 +10,9 @@ EFFECT = Effect(
     place="input",
     law=InputLaw("sign(u) * max(abs(u) - w, 0)"),
     parameters=(EffectParameter("width", "w", "input", scale="input", typical=0.08, neutral=0.0),),
-    fingerprint="Small inputs move the cart too little: the static gain grows with the size of the "
-    "step.",
-    deciding_run="Steps of three sizes: plotted against the input, the settled positions are on a "
-    "line that misses the origin.",
+    fingerprint="Small inputs move the cart too little: the static gain grows with the step.",
+    deciding_run="Steps of three sizes: settled position against input is a line that misses the "
+    "origin.",
     reference="K. J. Åström, R. M. Murray, Feedback Systems, section 10.5",
     axis="input",
 )

@@ -23,8 +23,7 @@ EFFECT = Effect(
         ),
     ),
     fingerprint="The cart is damped more after a step on than after a step off.",
-    deciding_run="Steps of two sizes and a free decay: the cart is damped more after the steps, "
-    "and equally for both.",
+    deciding_run="Steps of two sizes and a free decay: both steps add the same damping.",
     reference="back-EMF of a voltage-driven DC motor; any text on electric drives",
     axis="velocity",
 )

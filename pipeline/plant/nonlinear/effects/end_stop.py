@@ -31,8 +31,8 @@ EFFECT = Effect(
             reported=False,
         ),
     ),
-    fingerprint="The largest swings are cut off on one side, always at the same position, and the "
-    "cart bounces there.",
+    fingerprint="The largest swings are cut off on one side, always at the same position, with a "
+    "bounce.",
     deciding_run="The same step, a third smaller: the swings are no longer cut off.",
     reference="K. H. Hunt, F. R. E. Crossley, Journal of Applied Mechanics 42 (1975), 440-445",
     axis="position",

@@ -7,8 +7,7 @@ from pipeline.words.math import WIDE_SPACE, dot, parens, row, sub
 EFFECT = Effect(
     key="extra_mode",
     title="A hidden mass on a cart",
-    sentence="Something on the cart (a weight, a cable, the post) swings as if on a spring of its "
-    "own.",
+    sentence="Something on the cart (a weight, a cable, the post) swings on a spring of its own.",
     place="cart",
     law=BuiltLaw(
         "hidden mass",
@@ -47,9 +46,9 @@ EFFECT = Effect(
             typical=0.06 * 0.1 * 1.05,
         ),
     ),
-    fingerprint="There is one resonance more than there are carts, or one resonance has two peaks.",
-    deciding_run="A sweep through the extra resonance, then the same sweep with the suspect part "
-    "held by hand.",
+    fingerprint="There is one resonance more than there are carts, or a resonance has two peaks.",
+    deciding_run="A sweep through the extra resonance, then the same with the suspect part held by "
+    "hand.",
     reference="J. P. Den Hartog, Mechanical Vibrations, section 3.2",
     axis="frequency",
 )

@@ -6,8 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="force_offset",
     title="A constant force",
-    sentence="A constant force acts on the cart, from a tilted track or a motor that pushes at "
-    "zero input.",
+    sentence="A tilted track, or a motor at zero input, pushes the cart with a constant force.",
     place="cart",
     law=ForceLaw("F"),
     parameters=(
@@ -21,10 +20,9 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="In every run the cart rests off zero. One constant force explains this, whichever "
-    "carts are held.",
-    deciding_run="Runs with different carts held: with stiffer springs a force displaces the cart "
-    "less, whereas a wrong encoder zero stays the same.",
+    fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
+    deciding_run="Runs with different carts held: a force displaces the cart less against stiffer "
+    "springs, a wrong encoder zero is always the same.",
     reference="statics of the chain",
     axis="position",
     only_rest=True,

@@ -10,9 +10,8 @@ EFFECT = Effect(
     place="cart",
     law=FrictionLaw("μ * abs(u)"),
     parameters=(EffectParameter("coefficient", "μ", "", scale="1", typical=0.03, neutral=0.0),),
-    fingerprint="While the motor pushes, there is more dry friction than in a free decay, in "
-    "proportion to the input.",
-    deciding_run="Steps of two sizes: twice the input gives twice the friction.",
+    fingerprint="While the motor pushes, there is more dry friction than in a free decay.",
+    deciding_run="Steps of two sizes: twice the input adds twice the friction.",
     reference="G. Amontons' law applied to the rack; see Armstrong-Hélouvry, Control of Machines "
     "with Friction, chapter 2",
     axis="velocity",

@@ -14,8 +14,8 @@ EFFECT = Effect(
         FORCE,
         EffectParameter("distance", "δ", "position", scale="position", typical=0.02),
     ),
-    fingerprint="The half periods become shorter as the amplitude falls. The cart does not stop "
-    "abruptly: it ends with small, fast oscillations about its rest position.",
+    fingerprint="The half periods become shorter as the amplitude falls. The cart ends with small, "
+    "fast oscillations about its rest position.",
     deciding_run="Small free decays: the frequency rises as the amplitude falls below δ.",
     reference="P. R. Dahl, AIAA Journal 14 (1976), 1675-1682",
     axis="velocity",

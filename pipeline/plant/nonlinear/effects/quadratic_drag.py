@@ -6,7 +6,7 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw
 EFFECT = Effect(
     key="quadratic_drag",
     title="Quadratic drag",
-    sentence="Air or another fluid resists with a force that grows with the square of the speed.",
+    sentence="Air or another fluid resists with the square of the speed.",
     place="cart",
     law=ForceLaw("-q * v * abs(v)"),
     parameters=(
@@ -19,9 +19,8 @@ EFFECT = Effect(
             neutral=0.0,
         ),
     ),
-    fingerprint="Large swings lose a larger share of their amplitude per period than small ones.",
-    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
-    "swings.",
+    fingerprint="Large swings decay faster than small ones.",
+    deciding_run="Free decays from two distances: the fitted ζ is larger for the larger swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
 )

@@ -23,10 +23,9 @@ EFFECT = Effect(
         ),
         EffectParameter("stretch", "s", "position", scale="position", typical=0.35, side=True),
     ),
-    fingerprint="On one side only, the stiffness changes beyond some position: the tips of the "
-    "swings have another shape there.",
-    deciding_run="Steps of both signs and several sizes: plotted against the input, the settled "
-    "positions are on two straight lines with a corner.",
+    fingerprint="Beyond some position, on one side only, the swings have another shape.",
+    deciding_run="Steps of both signs and several sizes: settled position against input is a line "
+    "with a corner.",
     reference="S. W. Shaw, P. J. Holmes, Journal of Sound and Vibration 90 (1983), 129-155",
     axis="stretch",
     equivalent="On a single cart, the other wall spring with the stretch on the other side.",

@@ -19,8 +19,7 @@ EFFECT = Effect(
         EffectParameter("static_force", "S", "input", scale="stiffness * position", typical=0.06),
         EffectParameter("velocity", "w", "position/s", scale="velocity", typical=0.1),
     ),
-    fingerprint="The cart sticks at its turning points and breaks loose with a jerk. The last "
-    "swings end abruptly.",
+    fingerprint="The cart sticks at its turning points and breaks loose with a jerk.",
     deciding_run="A slow ramp of the input: the cart needs more force to break loose than to keep "
     "moving.",
     reference="B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994)",
