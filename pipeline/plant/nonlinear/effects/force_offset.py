@@ -21,8 +21,8 @@ EFFECT = Effect(
         ),
     ),
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
-    deciding_run="Runs with different carts held: a force displaces the cart less against stiffer "
-    "springs, a wrong encoder zero is always the same.",
+    deciding_run="Runs with different carts held: against stiffer springs a force displaces the "
+    "cart less, but a wrong encoder zero stays the same.",
     reference="statics of the chain",
     axis="position",
     only_rest=True,
