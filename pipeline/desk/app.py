@@ -1,4 +1,4 @@
-"""The desk as an application: every address in one table, and the server that answers there."""
+"""The desk as a web application: the table of its addresses, and the server that answers them."""
 
 import asyncio
 import socket
@@ -43,11 +43,17 @@ from pipeline.grading.intake.unpack import HAND_IN
 from pipeline.web.guard import Door, Guard
 from pipeline.web.server import Served
 
-Handler = Callable[[Ask], Any]  # a Response, or one that is awaited
+Handler = Callable[[Ask], Any]  # returns a Response or a coroutine of one
 
 
 def _start(task: str, title: str, *, then: str = "") -> Handler:
-    """Return what begins a long task in the folder of the address."""
+    """Return a handler that starts a long task in the folder of the address.
+
+    Parameters
+    ----------
+    task : name of a function in `tasks.py`.
+    then : end of the address to which the page then goes.
+    """
 
     def start(ask: Ask) -> Response:
         ask.start(task, title=title)
@@ -57,31 +63,31 @@ def _start(task: str, title: str, *, then: str = "") -> Handler:
 
 
 def _serve(inside: str) -> Handler:
-    """Return what serves a file of a folder inside the one of the address."""
+    """Return a handler that serves a file from the subfolder `inside` of the address's folder."""
     return lambda ask: serve_file(ask.folder(), f"{inside}/{ask.request.path_params['name']}")
 
 
 def _stop(ask: Ask) -> Response:
-    """Stop what is under way in the folder of the address; what is done is kept."""
+    """Stop the work in the folder of the address; what is already done stays."""
     ask.stop(ask.folder())
     return ask.back(ask.here + ("#work" if ask.here.startswith("/grades/") else "#report"))
 
 
 async def _tell_news(ask: Ask) -> Response:
-    """Tell of the work in the place of the address."""
+    """Return a stream with news of the work in the place of the address."""
     return StreamingResponse(_news(ask, ask.place_or_404()), media_type="text/event-stream")
 
 
 async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
-    """Send a line for every stage; one a person has not read is not kept for them."""
-    seen, quiet, frame = -1, 0.0, 0.2  # s between looks for news
+    """Yield a line for every new stage of the work; a slow reader gets only the latest stage."""
+    seen, quiet, frame = -1, 0.0, 0.2  # s between two looks for news
     while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
             shown = ask.job or job
             said = " ".join(ask.user.told(shown.said).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
-        elif quiet > 5.0:  # s
+        elif quiet > 5.0:  # s without news, after which a line keeps the connection open
             quiet = 0.0
             yield ": still here\n\n"
         if job.over:
@@ -91,8 +97,8 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     yield "event: end\ndata: \n\n"
 
 
-# Address, method, who answers. Every change is a POST of a form that works without scripts.
-# Streams of news are coroutines and take no thread: those that answer would soon be used up.
+# Address, method, handler. Every change is a POST from a form that works without scripts. Handlers
+# of streams are coroutines: as threads, they would soon occupy all threads that answer requests.
 ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/", "GET", show_home),
     ("/open", "GET", show_folders),
@@ -171,18 +177,19 @@ ROUTES: tuple[tuple[str, str, Handler], ...] = (
 
 
 class DeskServer:
-    """The desk, served; a context.
+    """The desk and its server, as a context manager.
 
     Parameters
     ----------
-    folder : to begin with, of the person at this computer.
-    port : to serve at; 0: a free one.
-    host, users : of a lab server: the address to listen at, and the file that says who may what.
-    jupyter : the secret of the Jupyter server that starts the desk and passes requests on.
+    folder : the folder that the person at this computer sees first.
+    port : to listen at; 0: any free port.
+    host : address to listen at, on a lab server.
+    users : file that states who may do what, on a lab server.
+    jupyter : the secret of the Jupyter server that starts the desk and forwards requests to it.
 
     Attributes
     ----------
-    url : to open; the secret in it, if any, opens once.
+    url : address to open; if it contains a secret, the secret works only once.
     """
 
     def __init__(
@@ -229,7 +236,7 @@ class DeskServer:
 
     @property
     def runs(self) -> bool:
-        """Whether it is served."""
+        """Whether the server runs."""
         return self._served.runs
 
     def __exit__(self, *raised: object) -> None:
@@ -238,7 +245,7 @@ class DeskServer:
 
 
 def application(desk: Desk) -> Starlette:
-    """Return what answers, where a guard has said who asks (`scope["user"]`)."""
+    """Return the application; a guard must have stored the person who asks in `scope["user"]`."""
     return Starlette(
         routes=[
             Route(path, _answer(desk, handler, path=path), methods=[method])
@@ -249,7 +256,7 @@ def application(desk: Desk) -> Starlette:
 
 
 def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], Awaitable[Response]]:
-    """Return what reads the form, answers, and tells a person what went wrong."""
+    """Return a function that checks access, reads the form, calls the handler, reports errors."""
 
     async def answer(request: Request) -> Response:
         user, room = request.scope["user"], path.split("/")[1]
@@ -265,7 +272,8 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
                 raise HTTPException(403, REFUSED)
             if iscoroutinefunction(handler):
                 return await handler(ask)
-            # A Stop does not wait for one of the threads in which all others are answered.
+            # A Stop must not wait until one of the shared threads is free, so it gets a thread of
+            # its own.
             at_once = path.endswith(("/stop", "/press"))
             run = asyncio.to_thread if at_once else run_in_threadpool
             return await run(handler, ask)
@@ -282,7 +290,7 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
 
 
 def _explain(desk: Desk) -> Callable[[Request, Exception], Response]:
-    """Return the handlers for unknown addresses and for internal errors."""
+    """Return the handler for unknown addresses, refused access, and failures of the desk."""
 
     def answer(request: Request, error: Exception) -> Response:
         ask = Ask(desk=desk, user=request.scope["user"], request=request, form=FormData())

@@ -1,4 +1,4 @@
-"""One request: of whom, for which place, how it is answered; and what outlives requests."""
+"""One request to the desk, and the data that the desk keeps between requests."""
 
 import re
 import secrets
@@ -32,16 +32,17 @@ NOTHING_KNOWN: dict[str, Any] = {
     "kind": None, "format": "", "duration": None, "remarks": [], "unusable": [], "unsure": [],
     "lines": [], "fractions": False, "frequency": None, "needs": [], "hardly": [], "still": {},
 }  # fmt: skip
-Stamp = tuple[int, int, dict[str, str | int]]  # time, size, columns as stated
+# Time of change, size, and columns as stated in submission.toml.
+Stamp = tuple[int, int, dict[str, str | int]]
 
 
 @dataclass(frozen=True)
 class Said:
-    """A line that a page says once.
+    """A message that a page shows once.
 
     Attributes
     ----------
-    tone : done, changed (done, but not as it was asked), or refused.
+    tone : done; changed (done, but not exactly as asked); or refused.
     """
 
     text: str
@@ -53,11 +54,12 @@ class Said:
 
 @dataclass(kw_only=True)
 class Desk:
-    """What outlives a request.
+    """The data that the desk keeps between requests.
 
     Attributes
     ----------
-    root : the folder in which the person at this computer chooses folders from a list.
+    root : the folder from which the person at this computer chooses folders in a list.
+    said : messages still to be shown, by person and room.
     """
 
     root: Path = field(default_factory=find_root)
@@ -66,7 +68,7 @@ class Desk:
     benches: Benches = field(default_factory=Benches)
     books: Books = field(default_factory=Books)
     said: dict[tuple[str, str], list[Said]] = field(default_factory=dict)
-    # The content of each downloaded zip.
+    # The files and their state when the zip of a folder was last downloaded.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
@@ -74,11 +76,11 @@ class Desk:
     def looks(
         self, folder: Path, stated: Callable[[str], dict[str, str | int]]
     ) -> dict[str, dict[str, Any]]:
-        """Return what the data files of a submission are, by name; each is looked at once.
+        """Return what each data file of a submission contains, by name; read only changed files.
 
         Parameters
         ----------
-        stated : which column of a file is what.
+        stated : returns the columns that `submission.toml` states for a file.
         """
         found = {}
         for file in self.workers.do("list_files", folder=str(folder)):
@@ -94,9 +96,14 @@ class Desk:
         return found
 
     def keep_shown(self, text: str, *, digest: str, to: str) -> None:
-        """Keep what a page shows, by which a form that comes back tells what was typed in it.
+        """Keep the text that a page shows, to find later which values of its form were changed.
 
-        It is kept for every person: while one fills in a form, a class saves theirs.
+        Each person has texts of their own, so that many others cannot push them out.
+
+        Parameters
+        ----------
+        digest : identifies the text.
+        to : name of the person.
         """
         texts = self._shown.setdefault(to, OrderedDict())
         texts[digest] = text
@@ -105,17 +112,17 @@ class Desk:
             texts.popitem(last=False)
 
     def shown(self, digest: str, *, to: str) -> str | None:
-        """Return what a page showed somebody; None where it is not known any more."""
+        """Return a text that a page showed; None if it is no longer kept."""
         return self._shown.get(to, {}).get(digest)
 
     def _look(self, folder: Path, file: str, columns: dict[str, str | int]) -> dict[str, Any]:
         try:
             return self.workers.do("look_at_file", folder=str(folder), file=file, columns=columns)
-        except Failed as error:  # what the file did to the process, it did to this row only
+        except Failed as error:  # the file stopped its process; only its own row is affected
             return {**NOTHING_KNOWN, "remarks": [str(error)]}
 
     def close(self) -> None:
-        """End all work; benches are told to stop first."""
+        """End all work; recordings on benches are stopped first."""
         self.benches.close()
         self.jobs.close()
         self.books.close()
@@ -124,7 +131,7 @@ class Desk:
 
 @dataclass(frozen=True, kw_only=True)
 class Ask:
-    """One request: of whom, for what. Its form is checked, something is done, a page comes back."""
+    """One request: who asks, about which place, with which form."""
 
     desk: Desk
     user: User
@@ -133,11 +140,12 @@ class Ask:
 
     @property
     def place(self) -> Place | None:
-        """The submission or gradebook of the address; None if it is not one of the user's.
+        """The submission or gradebook of the address; None if the user has no such place.
 
-        Of others' places there is no address.
+        Addresses count only the user's own places, so no address leads to those of others.
         """
-        if self.here.startswith("/feedback/"):  # a grade in a gradebook, of which no more is theirs
+        # A student may see only their own grade, not the gradebook.
+        if self.here.startswith("/feedback/"):
             return None
         is_class = self.here.startswith("/grades/")
         places = self.user.gradebooks if is_class else self.user.folders
@@ -145,11 +153,11 @@ class Ask:
         return places[number] if number < len(places) else None
 
     def folder(self) -> Path:
-        """Return the folder that the address is about: a submission, or the output of a grading.
+        """Return the folder of the address: a submission, or the output of a grading.
 
         Raises
         ------
-        ConfigError : it is about a class in a database.
+        ConfigError : the address is about a class in a database.
         """
         place = self.place_or_404()
         if isinstance(place, str):
@@ -157,13 +165,16 @@ class Ask:
         return place
 
     def place_or_404(self) -> Place:
-        """Return the place that the address is about, a folder or a database, else refuse."""
+        """Return the place of the address, a folder or a database.
+
+        Refuse the request without one.
+        """
         if self.place is None:
             raise HTTPException(404, "you have no access to anything here")
         return self.place
 
     def require_place(self) -> None:
-        """Refuse an address whose folder was moved or deleted, or lies on a lost disk.
+        """Refuse the request if its folder was moved or deleted, or its disk is not connected.
 
         Raises
         ------
@@ -178,47 +189,58 @@ class Ask:
 
     @property
     def job(self) -> Job | None:
-        """The last work in the place of the address, as this person may read of it."""
+        """The last job in the place of the address.
+
+        Its text is hidden if this person may not read it.
+        """
         place = self.place
         if not isinstance(place, Path):
             return None
         return show_job(self.desk.jobs.of(place), self.user, place)
 
     def start(self, task: str, *, title: str, **given: Any) -> None:
-        """Begin a long task in the folder that the address is about."""
+        """Start a long task in the folder of the address.
+
+        Parameters
+        ----------
+        given : further arguments of the task.
+        """
         folder = self.folder()
         self.desk.jobs.start(task, title=title, place=folder, folder=str(folder), **given)
 
     def stop(self, folder: Path) -> None:
-        """Have the work in a folder stop; what is done is kept."""
+        """Stop the job in a folder; what is already done stays."""
         if job := self.desk.jobs.of(folder):
             job.stop.set()
 
     @property
     def here(self) -> str:
-        """The address of the room that the request is about."""
+        """The address of the room: the first two parts of the request's address."""
         return "/".join(self.request.url.path.split("/")[:3]).rstrip("/") + "/"
 
     def _room(self, place: str = "") -> tuple[str, str]:
-        """The room of the address, perhaps with a place on its pages."""
+        """The key for messages of this room: person and address, or person and part of a page."""
         return self.user.name, self.here + place
 
     @property
     def sent(self) -> FormData | QueryParams:
-        """The form, or what the address of a page asks for."""
+        """The form of a POST, or the query of the address."""
         return self.form if self.request.method == "POST" else self.request.query_params
 
     def text(self, name: str) -> str:
-        """Return a field of what was sent as text, "" where it is not there."""
+        """Return a field of the form or query as text; "" if it is missing."""
         value = self.sent.get(name)
         return value.replace("\r\n", "\n").strip() if isinstance(value, str) else ""
 
     def query(self, name: str) -> str:
-        """Return what the address asks for by a name, whatever form was sent to it."""
+        """Return a value from the query of the address, even if a form was sent.
+
+        "" if it is missing.
+        """
         return self.request.query_params.get(name, "")
 
     def page(self, template: str, *, status: int = 200, **context: Any) -> Response:
-        """Return a page, with the work that is under way in its place."""
+        """Return a page made from a template; it also shows the job in its folder."""
         folder = self.place if isinstance(self.place, Path) else None
         everywhere = {
             "user": self.user,
@@ -228,7 +250,8 @@ class Ask:
             "version": __version__,
             "folder": folder,
             "job": self.job,
-            "said": lambda place="": self.desk.said.pop(self._room(place), []),  # once
+            # The template removes its messages, so that they are shown only once.
+            "said": lambda place="": self.desk.said.pop(self._room(place), []),
         }
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
         if prefix := self.request.scope.get("prefix"):
@@ -236,18 +259,22 @@ class Ask:
         return HTMLResponse(self.user.told(text), status_code=status)
 
     def go(self, to: str) -> Response:
-        """Return what has htmx open another page; a proxy adds its prefix to plain ways on only."""
+        """Return an answer that makes htmx open another page.
+
+        No proxy adds the prefix to its address.
+        """
         return Response(headers={"HX-Redirect": self.request.scope.get("prefix", "") + to})
 
     def back(self, to: str, *said: str | Said, place: str = "") -> Response:
-        """Return to a page, which says this once: at its head, or at a place that it has."""
+        """Return to a page, which shows messages once: at its top, or at its part `place`."""
         if said:
             lines = [Said(one) if isinstance(one, str) else one for one in said]
             self.desk.said.setdefault(self._room(place), []).extend(lines)
         return RedirectResponse(to, status_code=303)
 
 
-# An address in a page that we wrote. Texts of others have no quotation marks there.
+# Addresses in pages of the desk. Text that others wrote cannot match, because its quotation marks
+# are escaped.
 _ADDRESS = re.compile(
     r'\b(href|src|action|formaction|hx-get|hx-post|data-events|data-page)="/(?!/)'
 )
@@ -263,17 +290,21 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["called"] = name_place
-    # Whatever is cached of an earlier version of a style sheet or script is not asked for again.
+    # A new number in the addresses of style sheets and scripts prevents old ones from a browser's
+    # cache.
     environment.globals["fresh"] = secrets.token_hex(4)
     return environment
 
 
 def prepare_pages() -> None:
-    """Compile all templates: a fifth of the first look at a large class, else."""
+    """Compile all templates now.
+
+    For a large class this is a fifth of the time of its first page.
+    """
     for name in _environment().list_templates(extensions=["j2"]):
         _environment().get_template(name)
 
 
 def plain_error(ask: Ask, text: str, *, status: int) -> Response:
-    """Return a page that says what is wrong."""
+    """Return a page with an error message."""
     return ask.page("wrong", status=status, title="That did not work", text=text)

@@ -1,4 +1,4 @@
-"""Acquisitions that the desk has begun: each a process of its own, told by what it says."""
+"""The acquisitions that the desk has started; each is a process of its own."""
 
 import json
 import queue
@@ -17,11 +17,13 @@ from pipeline.processes import LineProcess
 
 
 class BenchSession(ShownSession):
-    """One acquisition, or one exploration, as its process tells it.
+    """One acquisition or exploration, with the state that its process reports.
 
     Attributes
     ----------
-    said : how it ended; "" while it goes on. `failed`: by what was wrong.
+    said : how it ended; "" while it runs.
+    failed : whether it ended with an error.
+    ended : set when the process has ended.
     """
 
     def __init__(self, given: Mapping[str, Any]) -> None:
@@ -40,15 +42,21 @@ class BenchSession(ShownSession):
 
     @property
     def is_shown(self) -> bool:
-        """Whether there is something to see: before, it may be that no bench is there."""
+        """Whether there is a state to show.
+
+        Before the first one, it may be that no bench answers.
+        """
         return self.version > 0
 
     def snapshot(self) -> dict[str, Any]:
-        """Return all but the points, for JSON."""
+        """Return the state without the points of the plots, for JSON."""
         return self._state
 
     def heed(self, wish: str, number: int) -> bool:
-        """Pass on a button; tell whether it counts, by what the pages show. The process decides."""
+        """Send a pressed button to the process; return whether it fits what the page shows.
+
+        The process itself decides whether to act on it.
+        """
         asked = self._state.get("instruction")
         if wish == "done":
             counts = asked is not None and number == asked["number"]
@@ -60,35 +68,43 @@ class BenchSession(ShownSession):
         return counts
 
     def press(self, wish: str, number: str) -> int:
-        """Pass on a button; return the status to answer with, 503 where nobody hears it."""
+        """Send a pressed button to the process.
+
+        Return the HTTP status, 503 if the process has ended.
+        """
         if not self.is_shown and wish != "stop":
             return 503
         try:
             return press_button(self, wish, number)
         except OSError:
-            return 503  # its process ends
+            return 503  # the process is ending
 
     def stop(self) -> None:
-        """End it, after stopping the bench."""
-        with suppress(OSError, ValueError):  # it has ended, its pipe is closed
+        """Stop the bench and end the session."""
+        with suppress(OSError, ValueError):  # the process has ended and closed its pipe
             self.heed("stop", 0)
 
     def stream(self) -> Response:
-        """Return its news as they come, and that it has ended."""
+        """Return a stream of the session's news, ended by the news of its end."""
         ended = "event: ended\ndata:\n\n"
         if self.ended.is_set():
             return Response(ended, media_type="text/event-stream")
         return stream_news(self, is_over=self.ended.is_set, last_words=ended)
 
     def close(self, *, by: float) -> None:
-        """Wait for its end until a time (s, monotonic), then end its process."""
+        """Wait for the end of the session, then end its process.
+
+        Parameters
+        ----------
+        by : when to stop waiting, in s of the monotonic clock.
+        """
         if not self.ended.wait(max(0.0, by - time.monotonic())):
             self._process.close()
 
     # --------------------------------------------------------------------- by its process
 
     def _listen(self) -> None:
-        """Take down what the process says until it ends."""
+        """Read what the process reports until it ends."""
         try:
             while line := self._line():
                 self._take(**json.loads(line))
@@ -99,7 +115,7 @@ class BenchSession(ShownSession):
             self.ended.set()
 
     def _line(self) -> bytes:
-        """Wait for the next line of the process; b"" where it has ended."""
+        """Wait for the next line from the process; b"" if it has ended."""
         while True:
             with suppress(queue.Empty):
                 return self._process.line(timeout=10.0)
@@ -112,7 +128,7 @@ class BenchSession(ShownSession):
         over: str = "",
         failed: bool = False,
     ) -> None:
-        """Keep what the process said: one of these."""
+        """Store one report of the process: a state, points, or the end."""
         self.said, self.failed = over, failed
         if state is not None:
             self._state = state
@@ -127,7 +143,9 @@ class Benches:
 
     Attributes
     ----------
-    planned : ids that the plan of a folder had before it last grew; None where there was no plan.
+    planned : for each folder, the ids of its plan before recordings were last added; None if there
+        was
+        no plan.
     """
 
     def __init__(self) -> None:
@@ -136,7 +154,7 @@ class Benches:
         self._lock = threading.Lock()
 
     def of(self, folder: Path) -> BenchSession | None:
-        """Return the last one in a folder."""
+        """Return the last session in a folder, if any."""
         return self._sessions.get(folder)
 
     def start(
@@ -147,12 +165,12 @@ class Benches:
         only: Sequence[str] = (),
         explore: tuple[str, str] = ("", ""),
     ) -> BenchSession:
-        """Begin one; where one is under way, that is what is returned.
+        """Start a session, or return the one that is running in the folder.
 
         Parameters
         ----------
         only : ids to acquire; () for the whole plan.
-        explore : until when to explore, and for how long, as `cartlab explore` takes them.
+        explore : goal and time limit of an exploration, as `cartlab explore` takes them.
         """
         with self._lock:
             before = self._sessions.get(folder)
@@ -162,10 +180,10 @@ class Benches:
             return self._sessions[folder]
 
     def close(self) -> None:
-        """Have all of them end, and wait until their benches have been told."""
+        """Stop all sessions, and wait until their benches are stopped."""
         for session in self._sessions.values():
             session.stop()
-        # s to stop the bench and save the data, on a busy machine
+        # 20 s are enough to stop the bench and save the data, even on a busy machine.
         by = time.monotonic() + 20.0
         for session in self._sessions.values():
             session.close(by=by)

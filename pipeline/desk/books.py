@@ -1,4 +1,4 @@
-"""The gradebooks that are open at this desk, and each class as it was read last."""
+"""The gradebooks that are open at this desk, and the last state read from each class."""
 
 import getpass
 import threading
@@ -17,14 +17,14 @@ from pipeline.grading.rubric import Rubric
 
 @dataclass(frozen=True)
 class Class:
-    """A class as pages show it: under other names where it is anonymous, and in their order."""
+    """A class as pages show it; if it is anonymous, with pseudonyms and in their order."""
 
     now: ClassNow
     state: State
 
     @property
     def rubric(self) -> Rubric:
-        """By which it is graded."""
+        """The rubric by which the class is graded."""
         return self.now.rubric
 
     @cached_property
@@ -36,20 +36,24 @@ class Class:
 
     @cached_property
     def teams(self) -> Mapping[str, Listing]:
-        """All of it, by the names that are shown."""
+        """The teams by the names that pages show."""
         teams = list(self.now.listings)
-        if self.names is not None:  # the order of the names would tell
+        if self.names is not None:  # the order of the real names would reveal them
             teams = [replace(one, line=anonymous_line(one.line, self.names)) for one in teams]
             teams.sort(key=lambda team: team.line.submission)
         return {team.line.submission: team for team in teams}
 
     @cached_property
     def lost(self) -> Mapping[str, set[str]]:
-        """The graded submissions without full points of a criterion; an unjudged one has 0."""
+        """For each criterion, the teams without full points.
+
+        A criterion that was not judged has 0.
+        """
         lost: dict[str, set[str]] = {asked.id: set() for asked in self.rubric.criteria}
         whole = {asked.id: asked.points for asked in self.rubric.criteria}
         for name, team in self.teams.items():
-            if team.line.status == "failed":  # as on the class page: nothing was lost
+            # A failed submission lost no single criterion; the class page counts in the same way.
+            if team.line.status == "failed":
                 continue
             judged = team.line.judged
             for key, points in whole.items():
@@ -61,16 +65,17 @@ class Class:
 def _find_user() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError):  # KeyError until Python 3.12: a system that does not know them
+    except (OSError, KeyError):  # KeyError until Python 3.12: the system does not know the user
         return ""
 
 
 class Books:
-    """Every gradebook is opened once, and a class read when something in it is another."""
+    """The open gradebooks; each is opened once, and its class is read again only after a change."""
 
     def __init__(self) -> None:
-        self.signed = _find_user()  # who changes points, where no proxy says it
-        self.asked: dict[Path | str, dict[str, str]] = {}  # what was graded again last, from where
+        self.signed = _find_user()  # who changes points, unless a proxy states it
+        # By gradebook: submissions and options of the last regrading.
+        self.asked: dict[Path | str, dict[str, str]] = {}
         self._books: dict[Path | str, RequestBook] = {}
         self._classes: dict[Path | str, Class] = {}
         self._drawn: dict[tuple[Path | str, str], tuple[State, Any]] = {}
@@ -91,19 +96,20 @@ class Books:
             return self._books[place]
 
     def n_waiting(self, place: Path | str) -> int:
-        """Return how many requests wait in a gradebook; 0 where that cannot be read now.
+        """Return how many requests wait in a gradebook; 0 if it cannot be read now.
 
-        A database that nobody opened yet is not waited for: every page asks this.
+        Every page asks this. So a database that is not open yet is not opened here, which could
+        take long.
         """
         if isinstance(place, str) and place not in self._books:
             return 0
         try:
             return self.book(place).n_waiting()
-        except (ConfigError, OSError):  # its own page says why
+        except (ConfigError, OSError):  # the gradebook's own page reports the error
             return 0
 
     def of(self, place: Path | str) -> Class:
-        """Return the class as it is now."""
+        """Return the class in its current state."""
         book = self.book(place)
         state, known = book.state(), self._classes.get(place)
         if known is None or known.state != state:
@@ -112,7 +118,12 @@ class Books:
         return known
 
     def drawn(self, place: Path | str, what: str, draw: Callable[[Class], Any]) -> Any:
-        """Return what is drawn of a class, again only where that is another; one at a time."""
+        """Return a drawing of a class; draw it again only after a change, one drawing at a time.
+
+        Parameters
+        ----------
+        what : name of the drawing.
+        """
         shown = self.of(place)
         with self._drawing:
             known = self._drawn.get((place, what))
@@ -121,6 +132,6 @@ class Books:
             return known[1]
 
     def close(self) -> None:
-        """Let go of all."""
+        """Close all gradebooks."""
         for book in self._books.values():
             book.close()

@@ -1,4 +1,4 @@
-"""The folders that the person at this computer chooses from: under one root, a level at a time."""
+"""The list from which the person at this computer chooses a folder, one level at a time."""
 
 import os
 from collections.abc import Iterator
@@ -11,20 +11,20 @@ from pipeline.errors import ConfigError
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import NAME
 
-MOST = 200  # folders in a list
-_LOOKED_AT = 20_000  # folders of one, in their order, that are looked into
+MOST = 200  # folders shown in a list
+_LOOKED_AT = 20_000  # folders whose content is checked, the first by name
 
 Kind = Literal["submission", "grading", "empty", "folder"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """A folder of the list.
+    """A folder in the list.
 
     Attributes
     ----------
-    inside : its path under the root, "." for the root itself.
-    kind : "empty" holds nothing that shows; "folder" is any other folder.
+    inside : its path relative to the root; "." for the root itself.
+    kind : "grading", "submission", "empty" (without visible entries), or "folder" for any other.
     """
 
     path: Path
@@ -34,13 +34,14 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class FolderList:
-    """The folders in one folder.
+    """The folders inside one folder.
 
     Attributes
     ----------
     here : the folder itself.
-    above : the name and the address under the root of each folder on the way to it.
-    left_off : more folders are there than are listed.
+    above : name and path relative to the root of each folder above it.
+    found : the folders inside it.
+    left_off : whether there are more folders than listed.
     """
 
     here: Found
@@ -50,19 +51,26 @@ class FolderList:
 
 
 def find_root() -> Path:
-    """Return where lists begin: the folder that the desk was started in, else the home folder."""
+    """Return the root of the list: the folder in which the desk was started, or the home folder.
+
+    The home folder is used if the desk was started at the top of the file system.
+    """
     here = Path.cwd()
     return here if here != Path(here.anchor) else Path.home()
 
 
 def list_folders(root: Path, inside: str) -> FolderList:
-    """Return the folders in one under the root, what can be opened first.
+    """Return the folders inside one folder; submissions and gradings come first.
 
-    Hidden folders are left out, and links that lead out of the root or to a hidden folder.
+    Hidden folders are left out, and so are links that lead out of the root or to a hidden folder.
+
+    Parameters
+    ----------
+    inside : the folder, relative to the root.
 
     Raises
     ------
-    ConfigError : it is no folder that a list of this root shows.
+    ConfigError : it is not a folder that this list may show.
     """
     root = root.resolve()
     folder = read_path(inside or ".", wanted="choose a folder", inside=root)
@@ -85,7 +93,7 @@ def list_folders(root: Path, inside: str) -> FolderList:
 
 
 def _list_names(folder: Path) -> tuple[list[str], bool]:
-    """Return the first folders in a folder by name, and whether there are more."""
+    """Return the names of the first folders inside a folder, and whether there are more."""
     try:
         with os.scandir(folder) as entries:
             names = [e.name for e in entries if not _is_hidden(e.name) and _is_folder(e)]
@@ -107,7 +115,7 @@ def _is_hidden(name: str) -> bool:
 
 
 def _is_shown(path: Path, root: Path) -> bool:
-    """Whether a resolved path is the root or lies under it, with nothing hidden on the way."""
+    """Return whether a resolved path is inside the root, and no part of the path is hidden."""
     return path.is_relative_to(root) and not any(map(_is_hidden, path.relative_to(root).parts))
 
 
@@ -122,7 +130,7 @@ def _find_kind(path: Path) -> Kind:
         if (path / NAME).is_file():
             return "submission"
         return "folder" if any(_shown_entries(path)) else "empty"
-    except OSError:  # the desk may not look into it
+    except OSError:  # the desk has no right to read it
         return "folder"
 
 

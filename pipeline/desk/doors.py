@@ -1,4 +1,4 @@
-"""The two ways in: the one-time secret of an address, or a reverse proxy that knows the person."""
+"""Three ways to identify a person: a one-time secret, a reverse proxy, or a Jupyter server."""
 
 import re
 import secrets
@@ -21,35 +21,36 @@ PAGE_HEADERS = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
     "connect-src 'self'; img-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; "
     "frame-ancestors 'none'",
-    "Referrer-Policy": "same-origin",  # a form says where it is from only where the page may tell
+    "Referrer-Policy": "same-origin",  # browsers then state the origin of a form, which is checked
 }
 JUPYTER_SECRET = "X-Cartlab-Secret"
-MOST_FORM = 2_000_000  # bytes of a request that is no upload
+MOST_FORM = 2_000_000  # bytes of a request that is not an upload
 
 
 class SecretDoor:
-    """For the person at this computer: who opens the printed address first is let in.
+    """Let in the person at this computer: whoever first opens the address that was printed.
 
-    The secret opens once; then a cookie that no script reads and no other site sends does, and the
-    address is without a secret that a history or a picture of the screen could keep.
+    The secret in that address works once. From then on a cookie identifies the person. Scripts
+    cannot read it, and other sites cannot send it. So no secret stays in an address, where the
+    browser's history or a screenshot could keep it.
     """
 
-    arrivals = False  # the cookie does not come along
+    arrivals = False  # the cookie is not sent if the person comes from another site
 
     def __init__(self, user: User, *, port: int, start: str) -> None:
         self._sites = list_own_names(port)
         self.secret = secrets.token_urlsafe(24)
         self._user, self._session, self._opened = user, secrets.token_urlsafe(24), False
         self._start = start
-        self._cookie = f"cartlab-{port}"  # cookies do not tell ports apart
+        self._cookie = f"cartlab-{port}"  # named by port, because cookies do not distinguish ports
         self._sent = re.compile(rf"\b{self._cookie}=([\w-]+)".encode())
 
     def site(self, headers: Headers) -> str:
-        """Return by which of its own addresses the request asks."""
+        """Return the address of the desk that the request uses."""
         return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
-        """Return who asks, or the answer to who may not."""
+        """Return the person who asks, or a refusal."""
         known = self._knows(headers.get("cookie", "").encode("latin-1"))
         if not _is_same(scope["path"].strip("/").encode(), self.secret):
             why = "open the desk with the address that cartlab printed when it started"
@@ -65,27 +66,30 @@ class SecretDoor:
         return answer
 
     def _knows(self, sent: bytes) -> bool:
-        """Whether the cookie is among those sent: any page of this computer may set its like."""
+        """Return whether one of the cookies sent is right.
+
+        Other pages may have set some with this name.
+        """
         return any([_is_same(found[1], self._session) for found in self._sent.finditer(sent)])
 
 
 class ProxyDoor:
-    """For a lab server: the proxy in front says who somebody is, and nobody else is heard."""
+    """Let in people whom the reverse proxy of a lab server names; refuse all other requests."""
 
-    arrivals = True  # from the page of a login, or of a course
+    arrivals = True  # people come from the page of a login or a course
 
     def __init__(self, proxy: Proxy, users: Mapping[str, User]) -> None:
         self._sites = frozenset([proxy.site])
         self._proxy, self._users = proxy, users
 
     def site(self, headers: Headers) -> str:
-        """Return by which of its own addresses the request asks."""
+        """Return the address of the desk that the request uses."""
         return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
-        """Return who asks, or the answer to who may not."""
+        """Return the person who asks, or a refusal."""
         sent = headers.getlist(self._proxy.secret_header)
-        # Whoever is logged in where the proxy runs has its address, and not its secret.
+        # Other people on the proxy's computer have the same address, but not the proxy's secret.
         known = len(sent) == 1 and _is_same(sent[0].encode("latin-1"), self._proxy.secret)
         if not known or ip_address(scope["client"][0]) != ip_address(self._proxy.address):
             return refuse("use the address of the lab's server")
@@ -97,23 +101,26 @@ class ProxyDoor:
 
 
 class JupyterDoor:
-    """For a person's own Jupyter server, which passes on what this person asks, and the secret.
+    """Let in the owner of a Jupyter server, which forwards requests and adds a secret.
 
-    The addresses of the desk then begin with a prefix, which Jupyter takes away and names.
+    The browser's addresses begin with a prefix. Jupyter removes it, and states it in a header.
     """
 
-    arrivals = True  # from the page of a login
+    arrivals = True  # people come from the page of a login
 
     def __init__(self, user: User, *, secret: str) -> None:
         self._user, self._secret = user, secret
 
     def site(self, headers: Headers) -> str:
-        """Return the name by which Jupyter lets itself be asked; another page has another."""
+        """Return the address under which the browser asks Jupyter, from the headers.
+
+        A page of another site has another origin, so it is refused.
+        """
         scheme = headers.get("origin", "").partition("://")[0] or "http"
         return f"{scheme}://{headers.get('host', '')}"
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
-        """Return who asks, or the answer to who may not."""
+        """Return the person who asks, or a refusal."""
         sent = headers.getlist(JUPYTER_SECRET)
         if len(sent) != 1 or not _is_same(sent[0].encode("latin-1"), self._secret):
             return refuse("open the desk from the launcher of Jupyter")
@@ -121,7 +128,7 @@ class JupyterDoor:
 
 
 def _read_name(name: str) -> Iterator[str]:
-    """Yield what the bytes of a header may say: a proxy writes a name in UTF-8 or in Latin-1."""
+    """Yield the possible names in a header; a proxy may write a name in UTF-8 or in Latin-1."""
     with suppress(UnicodeDecodeError):
         yield name.encode("latin-1").decode()
     yield name
@@ -132,11 +139,11 @@ def _is_same(sent: bytes, secret: str) -> bool:
 
 
 def limit_bodies(app: ASGIApp, *, uploads: int) -> ASGIApp:
-    """Return an application to which nobody sends more than is read.
+    """Return an application that refuses requests with too much data.
 
     Parameters
     ----------
-    uploads : bytes of an upload, which goes to an address that ends in /files.
+    uploads : largest number of bytes of an upload, whose address ends in /files.
     """
 
     async def limited(scope: Scope, receive: Receive, send: Send) -> None:
@@ -144,7 +151,7 @@ def limit_bodies(app: ASGIApp, *, uploads: int) -> ASGIApp:
         too_much = f"too much data in one request: at most {most:,} bytes"
 
         async def count() -> Message:
-            """Read on, whatever the request says of its length itself."""
+            """Receive and count data, because the length that a request states may be false."""
             nonlocal left
             message = await receive()
             left -= len(message.get("body", b""))

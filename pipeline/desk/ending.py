@@ -1,4 +1,4 @@
-"""Whatever ends a desk, it says so on stderr, and the log keeps it."""
+"""Report why the desk ends, whatever the cause, on stderr and in a log."""
 
 import faulthandler
 import os
@@ -21,7 +21,7 @@ from pipeline.output import OWNERS_FOLDER
 
 
 class Ending:
-    """Hears of what ends the desk; a context, around all that is served.
+    """Report what ends the desk; a context manager around the server.
 
     Parameters
     ----------
@@ -29,15 +29,15 @@ class Ending:
 
     Attributes
     ----------
-    asked : whether a signal asked the desk to end.
-    log : where it is kept what ended desks.
+    asked : set when a signal asks the desk to end.
+    log : file that records why desks ended.
     """
 
     def __init__(self, *, say: Callable[[str], None]) -> None:
         self.asked = threading.Event()
         self.log = find_log()
         self._say, self._why = say, "no reason was given"
-        # In a session of its own: what ends all of a terminal's programs does not end this one.
+        # It runs in a session of its own, so that closing the terminal does not end it too.
         self._watch = subprocess.Popen(
             [sys.executable, "-I", watch.__file__, str(self.log), str(os.getpid())],
             stdin=subprocess.PIPE,
@@ -49,10 +49,10 @@ class Ending:
         assert self._watch.stdin is not None
         faulthandler.enable(file=self._watch.stdin)
         threading.excepthook = self._in_thread
-        # Signals that a program can catch: Ctrl-C, kill, a closed terminal or session.
+        # All signals that a program can catch: Ctrl-C, kill, a closed terminal or session.
         for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK"):
             number = getattr(signal, name, None)
-            # nohup has a program ignore SIGHUP; it stays ignored.
+            # nohup makes a program ignore SIGHUP; it stays ignored.
             if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, self._signalled)
         self.note(f"begins: cartlab {__version__}, Python {platform.python_version()}")
@@ -62,7 +62,8 @@ class Ending:
         if isinstance(error, BaseException):
             self._why = _name(error)
             self._note_traceback(error)
-        if not isinstance(error, PipelineError | OSError):  # whose text the command line says
+        # The command line itself prints these two kinds of errors.
+        if not isinstance(error, PipelineError | OSError):
             self._say(f"cartlab: the desk ends: {self._why}")
         faulthandler.disable()
         self.note(f"{watch.SAID}{self._why}")
@@ -72,7 +73,7 @@ class Ending:
         self._watch.wait()
 
     def note(self, text: str) -> None:
-        """Write lines into the log."""
+        """Write lines to the log."""
         lines = "".join(f"\t{line}\n" for line in text.splitlines())
         with suppress(OSError, ValueError):  # the watching process was killed
             assert self._watch.stdin is not None
@@ -84,7 +85,7 @@ class Ending:
         self.asked.set()
 
     def _in_thread(self, raised: threading.ExceptHookArgs) -> None:
-        """Tell of an exception that a thread died of; the desk goes on as far as it can."""
+        """Report an exception that ended a thread; the desk itself continues."""
         if raised.exc_value is None or isinstance(raised.exc_value, SystemExit):
             return
         name = raised.thread.name if raised.thread else "?"
@@ -98,16 +99,16 @@ class Ending:
 
 
 def find_log() -> Path:
-    """Return the file in which it is kept what ended desks; its folder is made where it can be."""
+    """Return the path of the log; create its folder if possible."""
     defaults = {"win32": "~/AppData/Local", "darwin": "~/Library/Logs"}
     root = os.environ.get("XDG_STATE_HOME") or defaults.get(sys.platform, "~/.local/state")
     try:
         log = Path(root).expanduser() / "cartlab" / "desk.log"
-    except RuntimeError:  # a user without a home
+    except RuntimeError:  # the user has no home folder
         log = Path(tempfile.gettempdir()) / "cartlab-desk.log"
-    with suppress(OSError):  # a home that nobody may write to: stderr has what matters
+    with suppress(OSError):  # the home folder is not writable: stderr has the most important lines
         log.parent.mkdir(OWNERS_FOLDER, parents=True, exist_ok=True)
-        if log.stat().st_size > 1_000_000:  # bytes; it starts again from nothing
+        if log.stat().st_size > 1_000_000:  # bytes; a larger log is started again
             log.unlink()
     return log
 

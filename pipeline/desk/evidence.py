@@ -1,4 +1,4 @@
-"""What decided a criterion, as the TA's page and the student's show it."""
+"""The evidence for the points of a criterion, as the pages of TAs and students show it."""
 
 from itertools import count
 
@@ -11,16 +11,16 @@ from pipeline.words.text import rich
 
 
 def show_evidence(criterion: Criterion, check: str, units: Units | None) -> str:
-    """Return the message and the numbers, theirs beside ours, as HTML."""
+    """Return the message, and the reported numbers next to the recomputed ones, as HTML."""
     return show_message(criterion) + show_numbers(criterion, check, units)
 
 
 def show_message(criterion: Criterion) -> str:
-    """Return the criterion's message as HTML."""
+    """Return the message of a criterion as HTML."""
     return render_blocks([paragraph(rich(sentence(criterion.message)))])
 
 
 def show_numbers(criterion: Criterion, check: str, units: Units | None) -> str:
-    """Return the numbers, theirs beside ours, as HTML; "" without numbers."""
+    """Return the reported numbers next to the recomputed ones as HTML; "" without numbers."""
     table = numbers_table(criterion, check=check, units=units, numbers=count(0))
     return render_blocks([table]) if table else ""

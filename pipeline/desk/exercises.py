@@ -1,6 +1,6 @@
 """Tasks of the instructor's room: benches with hidden effects, and their solutions.
 
-A bench is what a form says of one: `preset`, or the `m`, `c` and `k` of an own chain as typed.
+A bench is given by the fields of a form: `preset`, or `m`, `c` and `k` of a custom chain, as typed.
 """
 
 import json
@@ -19,7 +19,7 @@ from pipeline.simulated.hidden import default_values, prepare_bench, usual_term
 from pipeline.submission import load_submission
 from pipeline.words.progress import Progress
 
-SLIDE = 1.0  # decades that a slider goes to each side of the usual size
+SLIDE = 1.0  # decades from the usual size to each end of a slider
 
 _OWN = "custom chain"
 
@@ -27,7 +27,7 @@ _OWN = "custom chain"
 def look_at_exercise(
     bench: Mapping[str, str], chosen: Sequence[Mapping[str, Any]], *, progress: Progress
 ) -> dict[str, Any]:
-    """Return a bench with each chosen effect as a form shows it, and what is wrong with them."""
+    """Return the chosen effects on a bench as a form shows them, or what is wrong with them."""
     try:
         plain = _prepare(bench)
     except ConfigError as error:
@@ -41,7 +41,7 @@ def look_at_exercise(
 
 
 def draw_effect(bench: Mapping[str, str], hide: str, *, progress: Progress) -> str:
-    """Return the picture of an effect on a bench: its fingerprint, a run with and without it."""
+    """Return the picture of an effect on a bench: its fingerprint, as a run with and without it."""
     from pipeline.report.effects.gallery import effect_picture
     from pipeline.report.figures.style import drawing
     from pipeline.report.figures.svg import plain_svg
@@ -62,7 +62,10 @@ def make_exercises(
     *,
     progress: Progress,
 ) -> list[str]:
-    """Write an exercise, of several seeds one in each of as many folders; return them."""
+    """Write an exercise for each seed; return the folders.
+
+    With one seed the exercise is in `out`; with several, each is in a subfolder of `out`.
+    """
     from pipeline.simulated.submission import write_submission
 
     hidden, root = _prepare(bench, hide), new_folder(Path(out))
@@ -75,12 +78,12 @@ def make_exercises(
 
 
 def tell_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:
-    """Return what is hidden in a bench, a sentence each."""
+    """Return what is hidden in a bench, one sentence for each effect."""
     return list(_prepare(bench, hide).told)
 
 
 def make_solution(folder: str, *, progress: Progress) -> None:
-    """Write the reference of a submission into its own folder."""
+    """Write the reference solution of a submission into its folder."""
     from pipeline.report.solution.write import make_solution as write_solution
 
     submission = load_submission(Path(folder))
@@ -108,7 +111,7 @@ def _read_numbers(name: str, typed: str) -> list[float]:
 
 
 def _describe_effect(bench: SimulatedBench, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return an effect with its sizes: those typed, else those at which it shows."""
+    """Return an effect with its parameters, as typed or at sizes that make the effect visible."""
     effect, chain = find_effect(entry["key"]), bench.chain
     places = {
         "input": [],
@@ -140,7 +143,11 @@ def _describe_effect(bench: SimulatedBench, entry: Mapping[str, Any]) -> dict[st
 def _describe_parameter(
     parameter: EffectParameter, usual: float, typed: Mapping[str, str], bench: SimulatedBench
 ) -> dict[str, Any]:
-    """Return one parameter: a slider that was moved counts, else what was typed, else the usual."""
+    """Return one parameter for the form, with the slider and the number in agreement.
+
+    A slider that was moved decides the value. Otherwise the typed number does, and otherwise the
+    usual one.
+    """
     none = parameter.neutral or 0.0
     value = typed.get("value", "") if typed.get("value") != typed.get("usual") else ""
     if typed.get("slide", "") != typed.get("was", ""):

@@ -1,4 +1,4 @@
-"""The first page: what one can do, what is open and how far it is; and the folders to choose."""
+"""The first page: what a person can do, the state of what is open, and folders to choose from."""
 
 from pathlib import Path
 from typing import Any
@@ -17,13 +17,13 @@ from pipeline.experiments.plan_file import NAME as PLAN
 from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import outside
 
-_MADE = 3  # exercises that the first page lists
-# What a folder can be chosen for: the room that shows it then.
+_MADE = 3  # exercises listed on the first page
+# The rooms for which a folder can be chosen.
 _ROOMS = ("student", "bench", "solution")
 
 
 def show_home(ask: Ask) -> Response:
-    """Show what somebody may do here; who has one place only is led there."""
+    """Show what a person can do here; a person with only one place goes directly there."""
     user = ask.user
     places = {"student": user.folders, "grades": user.gradebooks, "feedback": user.grades}
     rooms = [room for room, listed in places.items() for _ in listed]
@@ -42,7 +42,7 @@ def show_home(ask: Ask) -> Response:
 
 
 def show_folders(ask: Ask) -> Response:
-    """Show the folders of one to choose from, for what one wants to do."""
+    """Show the list of folders to choose from."""
     to, folders = ask.text("to"), list_folders(ask.desk.root, ask.text("in"))
     return ask.page(
         "folders",
@@ -55,7 +55,7 @@ def show_folders(ask: Ask) -> Response:
 
 
 def open_place(ask: Ask) -> Response:
-    """Open what somebody chose or named: a folder of this computer, or a database."""
+    """Open what a person chose or typed: a folder on this computer, or a database."""
     typed, to = ask.text("folder"), ask.text("to")
     if "://" in typed:
         ask.desk.books.book(typed)
@@ -69,11 +69,13 @@ def open_place(ask: Ask) -> Response:
 
 
 def enter(user: User, folder: Path) -> str:
-    """Open a folder: a submission, there or not yet, or a grading's output; return its address.
+    """Open a folder as a submission or as the output of a grading; return its address.
+
+    A folder that does not exist is created, as an empty submission.
 
     Raises
     ------
-    ConfigError : it is no folder, and none can be made there.
+    ConfigError : it is a file, or the folder cannot be created.
     """
     folder = folder.resolve()
     if folder.name == FILE and folder.is_file():
@@ -98,20 +100,20 @@ def _add_place(place: Place, places: list[Any], room: str) -> str:
 
 
 def _list_made(ask: Ask) -> list[Job]:
-    """Return the last exercises that were made, or are, of those that are theirs to see."""
+    """Return the jobs of the last exercises, finished or not, that the person may see."""
     shop, jobs = ask.user.workshop, ask.desk.jobs.list_of("make_exercises")
     seen = [job for job in jobs if ask.user.owns or (shop and job.place.is_relative_to(shop))]
     return seen[:_MADE]
 
 
 def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
-    """Return how far a submission is: its files, report, recordings and solution."""
+    """Return the state of a submission: its files, report, recordings and solution."""
     session, data = ask.desk.benches.of(folder), folder / "data"
     try:
-        # A link may lead to a whole disk.
+        # A link is not followed, because it may lead to a whole disk.
         files = 0 if data.is_symlink() else sum(1 for path in data.rglob("*") if path.is_file())
         report = find_state(folder) if folder.is_dir() else "unreadable"
-    except OSError:  # the desk may not look into it, or its disk is gone
+    except OSError:  # the desk may not read it, or its disk is not connected
         files, report = 0, "unreadable"
     return {
         "n": n,
@@ -126,7 +128,7 @@ def _describe_submission(ask: Ask, n: int, folder: Path) -> dict[str, Any]:
 
 
 def _describe_class(ask: Ask, n: int, place: Place) -> dict[str, Any]:
-    """Return how many of a class somebody has looked at; both are 0 if it cannot be read."""
+    """Return how many teams of a class were reviewed; all numbers are 0 if it cannot be read."""
     try:
         teams = ask.desk.books.of(place).now.listings
     except (PipelineError, OSError):

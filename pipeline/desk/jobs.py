@@ -1,4 +1,4 @@
-"""Work in processes of its own: told by stages, to be stopped, still there after a reload."""
+"""Long work in separate processes: it reports stages, can be stopped, and survives a reload."""
 
 import os
 import queue
@@ -13,27 +13,27 @@ from typing import Any, Literal
 from pipeline.errors import PipelineError
 from pipeline.processes import Failed, Supervisor
 
-_GLANCE = 0.1  # s between looks whether its turn has come, or who wants it stopped
-_HANDS = 3  # processes for short tasks, of 150 MB each
-_WAITING = 8  # requests about one folder; each keeps one of the server's 40 threads
+_GLANCE = 0.1  # s between two looks at whether a job may start or must stop
+_HANDS = 3  # processes for short tasks, each with 150 MB
+_WAITING = 8  # requests that may wait for one folder; each holds one of the server's 40 threads
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
 
 
 class Busy(PipelineError):
-    """A task was not begun, since others are under way; the text says which."""
+    """A task was not started, because others are running; the message says which."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Job:
-    """A piece of long work.
+    """One piece of long work.
 
     Attributes
     ----------
     place : the folder that it works in.
-    asked : the task, and what it was given.
-    said : what it is about now, or what became of it: the task's answer where that is a text.
-    news : goes up whenever that changes.
+    asked : name and arguments of the task.
+    said : its current stage; at the end the task's answer if that is a text, or the error.
+    news : number that grows with every change of state or stage.
     """
 
     title: str
@@ -47,26 +47,26 @@ class Job:
 
     @property
     def over(self) -> bool:
-        """Whether nothing more happens."""
+        """Whether the job has ended."""
         return self.state in ("done", "failed", "stopped")
 
     def without_talk(self) -> "Job":
-        """Return how it stands, without what it says, for somebody who may not read that."""
+        """Return a copy that hides the stages, for a person who may not read them."""
         return replace(self, title="Work in this folder", said="done" if self.over else "under way")
 
     def tell(self, state: State, said: str) -> None:
-        """Note what it is about."""
+        """Set the state and the stage."""
         with self.lock:
             self.state, self.said, self.news = state, said, self.news + 1
 
     def at_this_moment(self) -> "Job":
-        """Return a copy that no longer changes: its state and what it says belong together."""
+        """Return a copy whose state and stage belong together and no longer change."""
         with self.lock:
             return replace(self)
 
 
 class Jobs:
-    """The long work of this desk: as many at once as there are processors, one in a folder."""
+    """The long work of this desk: at most one job per folder and one per processor at a time."""
 
     def __init__(self) -> None:
         self._jobs: dict[Path, Job] = {}
@@ -74,11 +74,11 @@ class Jobs:
         self._turns = threading.Semaphore(os.cpu_count() or 1)
 
     def start(self, task: str, *, title: str, place: Path, **given: Any) -> Job:
-        """Begin a task; one that is under way with the same is not begun again.
+        """Start a task; if the same task is running already, do nothing.
 
         Raises
         ------
-        Busy : something else is under way in the folder.
+        Busy : another job is running in the folder.
         """
         asked = task, given
         with self._lock:
@@ -95,7 +95,7 @@ class Jobs:
         return job
 
     def of(self, place: Path) -> Job | None:
-        """Return the last job in a folder, as it is now."""
+        """Return the last job in a folder, as a copy that does not change."""
         job = self._jobs.get(place)
         return job and job.at_this_moment()
 
@@ -106,7 +106,7 @@ class Jobs:
         return [job.at_this_moment() for job in jobs]
 
     def close(self) -> None:
-        """Stop all, and wait until their processes have ended."""
+        """Stop all jobs, and wait until their processes have ended."""
         for job in list(self._jobs.values()):
             job.stop.set()
         while any(not job.over for job in self._jobs.values()):
@@ -130,7 +130,7 @@ class Jobs:
             job.tell("stopped" if job.stop.is_set() else "failed", str(error))
         except OSError as error:
             job.tell("failed", f"its process could not be started ({error.strerror or error})")
-        except BaseException as error:  # report it to the waiting page; the log has the rest
+        except BaseException as error:  # shown on the waiting page; the log has the traceback
             job.tell("failed", f"the desk itself failed ({type(error).__name__}: {error})")
             raise
         finally:
@@ -141,11 +141,10 @@ class Jobs:
 class WorkerPool:
     """Processes for short tasks, which look at files and fill in tables.
 
-    The tasks of a folder are done one after the other: who has a slow file waits for it, and with
-    them who looks at the same folder.
+    The tasks of one folder run one after the other. So a slow file delays only people who look at
+    the same folder.
 
-    A process that was used up, or that a file ended, is replaced at once: nobody waits a second for
-    the next one to start.
+    A process that ended is replaced at once in the background, because starting one takes a second.
     """
 
     def __init__(self) -> None:
@@ -157,12 +156,12 @@ class WorkerPool:
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
 
     def do(self, task: str, **given: Any) -> Any:
-        """Return the answer of a task.
+        """Run a task and return its answer.
 
         Raises
         ------
-        Failed : with the reason; what a file does to the process, the next task does not feel.
-        Busy : too many wait for the folder already.
+        Failed : with the reason; a file that ends its process does not affect the next task.
+        Busy : too many requests already wait for the folder.
         """
         with self._turn(given.get("folder")):
             process = self._free.get()
@@ -177,7 +176,7 @@ class WorkerPool:
                     self._replace(process)
 
     def start(self) -> None:
-        """Start all processes in the background, for a desk at which many will soon ask."""
+        """Start all processes in the background, if many people will use the desk soon."""
         for _ in range(_HANDS):
             self._replace(self._free.get())
 
@@ -186,7 +185,7 @@ class WorkerPool:
 
     def _start(self, process: Supervisor) -> None:
         try:
-            with suppress(Failed, OSError):  # then the next task tries again, and says why not
+            with suppress(Failed, OSError):  # the next task tries again, and reports an error
                 process.start(self._closed)
         finally:
             self._free.put(process)
@@ -208,7 +207,7 @@ class WorkerPool:
             waiting.release()
 
     def close(self) -> None:
-        """End the processes, and what they are about."""
+        """End the processes and their tasks."""
         self._closed.set()
         processes = [self._free.get() for _ in range(_HANDS)]
         for process in processes:

@@ -1,4 +1,4 @@
-"""The last report: what it said and asked, and whether anything changed since it was made."""
+"""The last report: its questions and assumptions, and whether its sources have changed since."""
 
 import json
 import tomllib
@@ -12,19 +12,20 @@ from pipeline.report.sections.answers import written_answer
 from pipeline.submission.load import MAX_NOTES_BYTES, NAME, list_experiments, outside
 from pipeline.submission.toml_file import read_text
 
-ASKED = "questions.json"  # beside the report: what it asks, assumed, found, and is made of
+# A file next to the report: its questions, assumptions, findings, and state of its sources.
+ASKED = "questions.json"
 NOTES = "notes.md"
 NOTHING_TOLD: Mapping[str, Any] = {
     "questions": [], "assumed": [], "contradicted": [], "failed": [], "changes": "", "turned": {},
 }  # fmt: skip
 PLOTS = "report/compare.html"
-PLOTS_OF = "report/plots.json"  # what the plots are made of
+PLOTS_OF = "report/plots.json"  # state of the sources of the plots
 
 
 def stat_sources(folder: Path) -> dict[str, list[int]]:
-    """Return the time and the size of every file that a report is made of.
+    """Return time and size of every file from which a report is made.
 
-    With all of them kept, a file that is gone, or was replaced by an older one, shows too.
+    If a file was deleted or replaced by an older one, the result differs too.
     """
     data = (path.relative_to(folder).as_posix() for path in (folder / "data").rglob("*"))
     named = (str(table.get("file", "")) for table in list_experiments(_read_document(folder)))
@@ -35,9 +36,10 @@ def stat_sources(folder: Path) -> dict[str, list[int]]:
 
 
 def find_state(folder: Path) -> str:
-    """Return "none", "current", "answered" or "older" than what it is made of.
+    """Return the state of the report: "none", "current", "answered" or "older".
 
-    "answered": only the answers in `notes.md` are newer, on which no number depends.
+    "answered" means that only the answers in `notes.md` have changed; no number depends on them.
+    "older" means that other sources have changed.
     """
     if outside(folder, "report/report.html") is not None:
         return "none"
@@ -50,14 +52,14 @@ def find_state(folder: Path) -> str:
 
 
 def plots_are_current(folder: Path) -> bool:
-    """Tell whether there are plots, made of the files as they are now."""
+    """Return whether there are plots and their sources have not changed."""
     if outside(folder, PLOTS) is not None:
         return False
     return _read_small(folder, PLOTS_OF).get("made_of") == stat_sources(folder)
 
 
 def read_told(folder: Path) -> dict[str, Any]:
-    """Return what the last report said, asked and assumed, as far as its file can be read."""
+    """Return what the last report assumed, asked and found wrong, if its file can be read."""
     read = _read_asked(folder)
     try:
         return {
@@ -73,7 +75,7 @@ def read_told(folder: Path) -> dict[str, Any]:
 
 
 def _pick_assumptions(found: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return what was taken of the bench: as texts, and its `value` as it is."""
+    """Return the assumptions about the bench, each as texts and with its `value`."""
     texts = _pick_texts(found, ("key", "about", "support", "taken", "why"))
     return [{**one, "value": raw.get("value")} for one, raw in zip(texts, found, strict=True)]
 
@@ -86,7 +88,7 @@ def list_unanswered(folder: Path) -> list[dict[str, str]]:
     """Return the questions of the last report that have no answer yet."""
     try:
         notes = read_notes(folder)
-    except SubmissionError:  # the report's page says what is wrong with them
+    except SubmissionError:  # the report's page says what is wrong
         notes = ""
     return [
         one
@@ -115,7 +117,7 @@ def _read_asked(folder: Path) -> dict[str, Any]:
 
 
 def _read_small(folder: Path, name: str) -> dict[str, Any]:
-    """Return what a JSON file of ours holds, {} where it cannot be read."""
+    """Return the content of a small JSON file that cartlab wrote; {} if it cannot be read."""
     if outside(folder, name) is None and (folder / name).stat().st_size <= 1_000_000:
         with suppress(ValueError, RecursionError):
             read = json.loads((folder / name).read_bytes())
@@ -125,6 +127,6 @@ def _read_small(folder: Path, name: str) -> dict[str, Any]:
 
 def _read_document(folder: Path) -> dict[str, Any]:
     if outside(folder, NAME) is None:
-        with suppress(ValueError, RecursionError):  # the page says what is wrong with it
+        with suppress(ValueError, RecursionError):  # the page shows what is wrong
             return tomllib.loads((folder / NAME).read_bytes().decode())
     return {}

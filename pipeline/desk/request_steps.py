@@ -1,4 +1,4 @@
-"""The steps of a request for another look, as students and TAs read them."""
+"""The events of a request for a review, as students and TAs read them."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ _HEADS = {
 
 @dataclass(frozen=True, kw_only=True)
 class ShownStep:
-    """One step: who did what, when, and in which words."""
+    """One event: who did what, when, and in which words."""
 
     head: str
     at: str
@@ -26,12 +26,12 @@ class ShownStep:
 def describe_steps(
     events: Iterable[RequestEvent], *, team: str = "", submission: str = ""
 ) -> list[ShownStep]:
-    """Return the steps of a request, oldest first.
+    """Return the events of a request, oldest first.
 
     Parameters
     ----------
-    team : the pseudonym of a submission whose students may not be named.
-    submission : the real name then, which is hidden as the students' are.
+    team : pseudonym, if the students must not be named.
+    submission : the real name of the submission, which is then hidden too.
     """
     shown = []
     for event in events:

@@ -1,22 +1,22 @@
-"""The line at the top of every page: the desk, what is open, and where one is."""
+"""The links at the top of every page: the desk, the open places, and the current one."""
 
 from dataclasses import dataclass
 
 from pipeline.desk.books import Books
 from pipeline.desk.users import Place, User, name_place
 
-_BESIDE = 3  # other open places that have a link on every page; the first page lists all
+_BESIDE = 3  # other open places that every page links; the first page lists all
 _OF_FOLDERS = ("student", "bench", "solution")
 _WHOLE = {"exercises": "Exercises", "rubric": "Rubric", "effects": "Effects"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """A link of the line.
+    """One of these links.
 
     Attributes
     ----------
-    beside : it is another place than the one shown; a phone has no space for it.
+    beside : it leads to another place than the current one; small screens hide it.
     """
 
     address: str
@@ -25,7 +25,7 @@ class Room:
 
 
 def list_rooms(user: User, path: str, books: Books) -> list[Room]:
-    """Return the links for somebody who looks at an address, of their own rooms only."""
+    """Return the links that a person sees on the page with this address."""
     room, _, rest = path.strip("/").partition("/")
     shown = rest.partition("/")[0]
     found = [Room(address="/", name="Desk")]
@@ -47,7 +47,7 @@ def list_rooms(user: User, path: str, books: Books) -> list[Room]:
 
 
 def list_feedback(user: User) -> list[Room]:
-    """Return the links to the grades that are a student's own."""
+    """Return links to the grades of a student."""
     if len(user.grades) == 1:
         return [Room(address="/feedback/0/", name="Feedback")]
     return [
@@ -60,6 +60,11 @@ def list_feedback(user: User) -> list[Room]:
 
 
 def _latest(places: list[Place] | list, shown: str) -> list[tuple[int, Place]]:
-    """Return the places that were opened last, and the one that is shown."""
+    """Return the last places opened and the current one, each with its number.
+
+    Parameters
+    ----------
+    shown : number of the current place, as text.
+    """
     last = len(places) - _BESIDE
     return [(n, place) for n, place in enumerate(places) if n >= last or str(n) == shown]

@@ -1,4 +1,4 @@
-"""Whether a student sees the report, or only the check of their own numbers."""
+"""Decide whether a student sees the report, or only the check of their own numbers."""
 
 from pathlib import Path
 
@@ -10,13 +10,13 @@ from pipeline.submission.edit import submission_text
 from pipeline.submission.load import NAME
 from pipeline.submission.toml_file import parse_toml
 
-# The parts of the student's room that show no computed number; a new part is refused until it is
-# named here.
+# The parts of the student's room that show no computed number. Any part that is not in this list is
+# refused.
 _SHOWS_NONE = frozenset(
     {"", "files", "fill", "aside", "save", "experiments", "check", "hand-in", "hand-in.zip",
      "events", "stop"}
 )  # fmt: skip
-_TELLS_NONE = frozenset({"check_numbers"})  # tasks whose stages and end show no computed number
+_TELLS_NONE = frozenset({"check_numbers"})  # tasks whose stages and result show no computed number
 REFUSED = (
     "in this lab you find the numbers yourself: the report is for your TA. "
     "The check shows which of your numbers disagree with your recordings"
@@ -24,10 +24,10 @@ REFUSED = (
 
 
 def sees_check(user: User, folder: Place | None) -> bool:
-    """Whether the room of a folder has the check in place of the report.
+    """Return whether the room of a folder shows the check instead of the report.
 
-    The rubric that a lab server's list of users names decides. Without one the submission's own
-    `[students] see` holds, which is an agreement: who has the folder can change it.
+    On a lab server, the rubric in the list of users decides. Without one, `[students] see` of the
+    submission does. That is only an agreement, because whoever has the folder can change it.
     """
     if user.role == "instructor" or not isinstance(folder, Path):
         return False
@@ -36,24 +36,28 @@ def sees_check(user: User, folder: Place | None) -> bool:
     try:
         text = submission_text(folder)
         students = parse_toml(text, where=NAME, error=SubmissionError).get("students")
-    except (SubmissionError, OSError):  # the page says what is wrong with it
+    except (SubmissionError, OSError):  # the page says what is wrong
         return False
     return isinstance(students, dict) and students.get("see") == "check"
 
 
 def hides_values(user: User, rubric: Rubric) -> bool:
-    """Whether a student reads their feedback without the numbers that they must find."""
+    """Return whether a student's feedback leaves out the numbers that they must find."""
     return (user.see or rubric.students.see) == "check"
 
 
 def is_refused(path: str, user: User, folder: Place | None) -> bool:
-    """Whether an address may show computed numbers to a student who must find them."""
+    """Return whether to refuse an address that could show numbers that the student must find."""
     parts = path.split("/")
     return parts[1] == "student" and parts[3] not in _SHOWS_NONE and sees_check(user, folder)
 
 
 def show_job(job: Job | None, user: User, folder: Path) -> Job | None:
-    """Return work in a folder as somebody may read of it: others may make a report there."""
+    """Return the job in a folder as the person may see it.
+
+    Its stages are hidden if they could show numbers, because others may make a report in the
+    folder.
+    """
     if job is None or job.asked[0] in _TELLS_NONE or not sees_check(user, folder):
         return job
     return job.without_talk()

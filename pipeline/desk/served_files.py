@@ -1,4 +1,4 @@
-"""Files that are shown as they lie in a folder, each under the strictest policy that shows it."""
+"""Files and pages that the desk serves, each under the strictest security policy that works."""
 
 from pathlib import Path, PurePosixPath
 
@@ -10,13 +10,13 @@ from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import outside
 
-# A page of a folder is a stranger's here: of an origin of its own, so that it sees no cookie and
-# asks nothing of the desk; it runs the scripts that the report brings, and no others.
+# A page from a submission's folder may come from a stranger. It gets an origin of its own, so that
+# it sees no cookie and sends nothing to the desk. It may run only the scripts of reports.
 _STRANGE_PAGE = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; "
     "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
-# Pages of our own making, whole: their one script is known by its hash.
+# For complete pages that cartlab made; their one script is allowed by its hash.
 _OWN_PAGE = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:; "
     "font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -42,7 +42,7 @@ _STATIC = {
 
 
 def serve_file(folder: Path, name: str) -> Response:
-    """Return a file that lies in a folder, not one that a link there leads to elsewhere."""
+    """Return a file in a folder; a link in the folder that leads out of it is refused."""
     kind = _KINDS.get(PurePosixPath(name).suffix)
     if kind is None or outside(folder, name) is not None:
         raise HTTPException(404, "there is no such file")
@@ -52,13 +52,13 @@ def serve_file(folder: Path, name: str) -> Response:
 
 
 def show_own_page(text: str) -> Response:
-    """Return a page of our own making."""
+    """Return a page that cartlab made."""
     headers = {"Content-Security-Policy": _allow_own_scripts(_OWN_PAGE)}
     return Response(text, media_type="text/html", headers=headers)
 
 
 def show_drawing(svg: str) -> Response:
-    """Return a drawing, which runs nothing wherever it is opened."""
+    """Return a drawing; it cannot run scripts, wherever it is opened."""
     return Response(svg, media_type="image/svg+xml", headers={"Content-Security-Policy": _INERT})
 
 

@@ -1,4 +1,4 @@
-"""Tasks that the desk runs in another process; only there are files of strangers read."""
+"""Tasks that the desk runs in another process; only there does it read files from other people."""
 
 import json
 import os
@@ -46,13 +46,18 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import leaves
 from pipeline.words.progress import Progress
 
-_ACROSS, _HIGH = 120, 32  # of a thumbnail
+_ACROSS, _HIGH = 120, 32  # width and height of a thumbnail
 
 
 def look_at_file(
     folder: str, file: str, columns: dict[str, str | int], *, progress: Progress
 ) -> dict[str, Any]:
-    """Return what a data file is, with a thumbnail; `columns` as `submission.toml` states them."""
+    """Return what a data file contains, with a thumbnail.
+
+    Parameters
+    ----------
+    columns : of the file, as `submission.toml` states them.
+    """
     if leaves(Path(folder), file):
         raise SubmissionError(f"{file}: is outside the folder")
     found = look_at(Path(folder), file, columns=columns)
@@ -60,21 +65,26 @@ def look_at_file(
 
 
 def list_files(folder: str, *, progress: Progress) -> list[str]:
-    """Return the existing data files."""
+    """Return the names of the existing data files."""
     return data_files(Path(folder))
 
 
 def list_not_read(folder: str, named: list[str], *, progress: Progress) -> list[dict[str, str]]:
-    """Return the files that are not looked into, with what to do; those `named` have a table."""
+    """Return the files that are not read, and what to do about each.
+
+    Parameters
+    ----------
+    named : files that have a table.
+    """
     found = passed_over(Path(folder), named=named)
     return [{"file": one.file, "reason": one.remarks[0], "advice": one.advice} for one in found]
 
 
 def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
-    """Return what stands marked as unsure in `submission.toml`, and the springs that nothing tells.
+    """Return what `submission.toml` marks as unsure, and springs that the data do not determine.
 
-    `system` : the doubt by key of `[system]`; `springs` : their numbers, from 1; `experiments` :
-    the doubts of each table.
+    The keys are `system` (the doubt for each key of `[system]`), `springs` (their numbers, from 1)
+    and `experiments` (the doubts of each table).
     """
     system = system_doubts(Path(folder))
     asked = "springs" in system
@@ -86,12 +96,12 @@ def list_doubts(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 
 def fill_tables(folder: str, *, progress: Progress) -> list[dict[str, Any]]:
-    """Write the tables of the files in `data/`."""
+    """Add tables for the files in `data/`; return messages."""
     return [_describe(found) for found in fill_folder(Path(folder)).files]
 
 
 def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
-    """Write the report into the submission's own folder, compared with the one that was there."""
+    """Write the report into the submission's folder, and compare it with the previous one."""
     from pipeline.report.draft.changes import changes_line, compare_drafts, read_results
     from pipeline.report.draft.write import make_report as write_report
     from pipeline.report.sections.housekeeping import taken_text
@@ -108,14 +118,15 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
             "why": with_symbols(one.reason),
         }
 
-    made_of = stat_sources(Path(folder))  # before it is read: what changes meanwhile is not in it
+    # Note the state before the files are read, so that a later change is noticed.
+    made_of = stat_sources(Path(folder))
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
 
     def compared(analysis: Analysis) -> Any:
         try:
             return compare_drafts(read_results(out / "results.json"), analysis)
-        except ConfigError:  # none, or of another bench
+        except ConfigError:  # there is no previous report, or it is of another bench
             return None
 
     with alone_in(out):
@@ -143,7 +154,7 @@ def make_report(folder: str, *, progress: Progress) -> dict[str, Any]:
 
 
 def make_gap(folder: str, *, progress: Progress) -> None:
-    """Write what the linear model leaves out into the submission's own folder."""
+    """Write the report on the gap into the submission's folder."""
     from pipeline.exchange.model.saved import clear_model
     from pipeline.experiments.discriminate import propose_for
     from pipeline.gap.explain import investigate
@@ -163,12 +174,12 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
 
 def make_plots(folder: str, *, progress: Progress) -> None:
-    """Write the page of plots into the submission's own folder, beside its report."""
+    """Write the page of plots into the submission's folder, next to its report."""
     from pipeline.report.gap.section import with_gap
     from pipeline.report.plots.page import write_plots
     from pipeline.workflow import analyse
 
-    made_of = stat_sources(Path(folder))  # before it is read, as for a report
+    made_of = stat_sources(Path(folder))  # before the files are read, as for a report
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
     with alone_in(out):
@@ -180,7 +191,7 @@ def make_plots(folder: str, *, progress: Progress) -> None:
 
 
 def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progress) -> None:
-    """Ask which numbers disagree, or where to look for some; the answer is in checks.jsonl."""
+    """Check the numbers, or find where to look for some; the answer is stored in checks.jsonl."""
     from pipeline.grading.rubric_file import load_rubric
     from pipeline.grading.self_check.check import check_numbers as check
 
@@ -189,7 +200,7 @@ def check_numbers(folder: str, rubric: str, where: list[str], *, progress: Progr
 
 
 def unpack_upload(archive: str, into: str, *, progress: Progress) -> list[str]:
-    """Unpack what was uploaded, by the limits of a hand-in; return the files."""
+    """Unpack an uploaded zip within the limits of a hand-in; return the names of its files."""
     from pipeline.grading.intake.unpack import HAND_IN, unpack
 
     target = Path(into)
@@ -200,7 +211,7 @@ def unpack_upload(archive: str, into: str, *, progress: Progress) -> list[str]:
 
 
 def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
-    """Write plan.toml, or add to it what the data allow; return why they allow nothing."""
+    """Write plan.toml, or add recordings to it; return the reason if nothing can be planned."""
     from pipeline.experiments.propose import make_plan
 
     made = make_plan(load_submission(Path(folder)), stock=stock, progress=progress)
@@ -210,7 +221,7 @@ def propose_recordings(folder: str, stock: bool, *, progress: Progress) -> str:
 def weigh_recording(
     folder: str, recording: dict[str, Any], goal: str, *, progress: Progress
 ) -> dict[str, Any]:
-    """Return what a recording would bring, beside the one that would be chosen."""
+    """Return what a recording would improve, and what the best choice would."""
     from pipeline.bench.host.raw import known_commands
     from pipeline.experiments.plan import Recording
     from pipeline.experiments.plan_words import what_words
@@ -233,7 +244,7 @@ def weigh_recording(
 def describe_exercise(
     bench: dict[str, str], hide: list[str], folder: str, *, progress: Progress
 ) -> dict[str, Any]:
-    """Return what an exercise is: what is hidden, its files, and the first record of each kind."""
+    """Return a finished exercise: what is hidden, its files, and the first record of each kind."""
     submission = load_submission(Path(folder))
     first = {record.kind: record for record in reversed(read_data(submission).records)}
     return {
@@ -247,7 +258,7 @@ def describe_exercise(
 
 
 def publish_grades(folder: str, *, progress: Progress) -> None:
-    """Write the class list of the gradebook in a folder."""
+    """Write the output files of the gradebook in a folder."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in
@@ -267,7 +278,7 @@ def regrade_class(
     *,
     progress: Progress,
 ) -> str:
-    """Grade a class into a folder; an anonymous one says nothing that could name a team."""
+    """Grade a class into a folder; for an anonymous class, progress messages name no team."""
     from pipeline.grading.batch.grade_class import Options, grade_class
 
     try:
@@ -292,7 +303,12 @@ def regrade_class(
 
 
 def preview_rubric(folder: str, text: str, *, progress: Progress) -> dict[str, Any]:
-    """Return what the text of a rubric would make of a graded class, see `RubricPreview`."""
+    """Return the points of a graded class under another rubric; see `RubricPreview`.
+
+    Parameters
+    ----------
+    text : of the rubric.
+    """
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.rubric_preview import preview_rubric as preview
     from pipeline.grading.rubric_file import parse_rubric
@@ -314,7 +330,12 @@ TASKS: Mapping[str, Callable[..., Any]] = {
 
 
 def do(asked: tuple[str, Mapping[str, Any]], tell: Progress) -> Any:
-    """Return the answer to a task, given by its name with what it is about."""
+    """Run a task and return its answer.
+
+    Parameters
+    ----------
+    asked : name and arguments of the task.
+    """
     name, given = asked
     return TASKS[name](**given, progress=tell)
 
@@ -343,7 +364,7 @@ def _describe(found: Found) -> dict[str, Any]:
 
 
 def draw_thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | int]) -> list[str]:
-    """Return the positions of a record as the points of SVG lines, one a cart."""
+    """Return the positions of a record as points of SVG lines, one line per cart."""
     if found.inspection is None or found.kind == "bode":
         return []
     table, _ = read_table(folder, found.file)
@@ -355,7 +376,7 @@ def draw_thumbnail(folder: Path, found: Found, *, columns: Mapping[str, str | in
 
 
 def _draw_lines(rows: Sequence[Array]) -> list[str]:
-    """Return rows on one scale as the points of SVG lines."""
+    """Return rows, all on the same scale, as points of SVG lines."""
     low = min((float(row.min()) for row in rows), default=0.0)
     high = max((float(row.max()) for row in rows), default=0.0)
     if not np.isfinite(high - low) or high == low:
@@ -364,7 +385,7 @@ def _draw_lines(rows: Sequence[Array]) -> list[str]:
 
 
 def _write_points(row: Array) -> str:
-    """Return a row between 0 and 1 as points: least and most of every stretch, in turn."""
+    """Return a row of values from 0 to 1 as points: the least and the largest of each stretch."""
     stretches = np.array_split(row, min(row.size, _ACROSS))
     heights = [(s.max(), s.min())[i % 2] for i, s in enumerate(stretches)]
     step = _ACROSS / max(len(heights) - 1, 1)

@@ -1,4 +1,4 @@
-"""What people type into a form, as what it says: a place on this computer, a whole number."""
+"""Read what people type into a form: a path on this computer, a whole number, a number."""
 
 import math
 from pathlib import Path
@@ -7,17 +7,17 @@ from pipeline.errors import ConfigError
 
 
 def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
-    """Return a path that was typed, from the root.
+    """Return a typed path as an absolute path.
 
     Parameters
     ----------
-    wanted : what to do where nothing was typed, in the words of the form.
-    inside : a folder that it may not lead out of, from which it is read; None: all of the computer.
+    wanted : message if nothing was typed.
+    inside : folder to which the path is relative and which it may not leave; None: any path.
 
     Raises
     ------
-    ConfigError : it is no path, leads out, is `~` of nobody whom this computer knows, or the
-        computer cannot look there.
+    ConfigError : the path is not valid, leaves the folder, begins with `~` of an unknown user, or
+        cannot be looked up on this computer.
     """
     if not typed or not typed.isprintable():
         raise ConfigError(wanted)
@@ -26,7 +26,7 @@ def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
         path.exists()
     except RuntimeError:
         raise ConfigError(f"{typed}: this computer has no such user") from None
-    except OSError as error:  # a name that is too long, or a folder without access
+    except OSError as error:  # the name is too long, or a folder may not be read
         raise ConfigError(f"{_clip(typed, most=60)}: {error.strerror}; {wanted}") from None
     if inside and not path.is_relative_to(inside):
         raise ConfigError(f"{typed}: is outside {inside.name}, where your files are written")
@@ -34,14 +34,18 @@ def read_path(typed: str, *, wanted: str, inside: Path | None = None) -> Path:
 
 
 def read_whole_number(typed: str, *, name: str, least: int, most: int) -> int:
-    """Return a whole number that was typed.
+    """Return a typed whole number.
+
+    Parameters
+    ----------
+    name : of the field, for the message.
 
     Raises
     ------
     ConfigError : it is not a whole number from `least` to `most`.
     """
     number = typed if typed.isascii() and typed.isdecimal() else ""
-    # However many digits it has, no more are read than the largest has.
+    # The length is checked first, because converting thousands of digits would take long.
     if number and len(number) <= len(str(most)) and least <= int(number) <= most:
         return int(number)
     found = _clip(typed, most=20)

@@ -1,4 +1,4 @@
-"""Who may see what: everything for the person at this computer, else what a file says."""
+"""Who may see what: the person at this computer sees everything, others what a file lists."""
 
 import os
 import stat
@@ -22,8 +22,8 @@ Place = Path | str  # a folder, or the address of a database
 Role = Literal["owner", "student", "ta", "instructor"]
 See = Literal["report", "check"]
 
-# The rooms that a role may enter, by the first part of their address. For who started the desk they
-# are about all of this computer, for others about what the key of the file lists, if anything.
+# The rooms that each role may enter, by the first part of their addresses. In them, the owner may
+# open everything on this computer, others only what the list of users gives them.
 _ALL = frozenset({"", "static"})
 _ROOMS: dict[Role, frozenset[str]] = {
     "student": _ALL | {"student", "feedback"},
@@ -39,13 +39,13 @@ _NEEDS = {"exercises": "workshop", "rubric": "workshop", "bench": "ports"}
 
 @dataclass(frozen=True, kw_only=True)
 class OwnGrade:
-    """Which grade is a student's.
+    """The place of a student's own grade.
 
     Attributes
     ----------
-    gradebook : the output of a grading, or the address of a database.
-    submission : its very name there.
-    assignment : whose class list it must be: a database may hold several; "": a folder's only one.
+    gradebook : the output folder of a grading, or the address of a database.
+    submission : its exact name in the gradebook.
+    assignment : that of the class list; needed if a database holds several; "" for a folder.
     """
 
     gradebook: Place
@@ -55,18 +55,18 @@ class OwnGrade:
 
 @dataclass(kw_only=True)
 class User:
-    """Somebody at the desk.
+    """A person at the desk.
 
     Attributes
     ----------
-    folders : the submissions that they see, addressed by their place in this list: of another's
-        there is no address. An owner's list grows as they open folders.
-    gradebooks : likewise, the outputs of gradings, or addresses of databases.
-    grades : likewise, the grades that are a student's own.
-    workshop : the folder in which they make exercises and rubrics; an owner makes them anywhere.
-    ports : the benches at which they acquire; an owner may name any.
-    rubric : of a student's lab, by whose tolerances the check judges.
-    see : what that rubric lets them see; None: what their submission says.
+    folders : the submissions that they may see. An address contains the index in this list, so no
+        address leads to those of others. An owner's list grows when they open a folder.
+    gradebooks : the output folders of gradings, or addresses of databases, that they may see.
+    grades : their own grades, if they are a student.
+    workshop : the folder in which they make exercises and rubrics; an owner may use any.
+    ports : the benches at which they may record; an owner may use any.
+    rubric : of a student's lab; the check uses its tolerances.
+    see : what this rubric lets them see; None: what their submission states.
     """
 
     name: str
@@ -80,18 +80,18 @@ class User:
     see: See | None = None
 
     def may(self, room: str) -> bool:
-        """Whether they may enter a room; which of its places, their lists say."""
+        """Return whether they may enter a room; their lists decide which places they see there."""
         needed = _NEEDS.get(room)
         listed = needed is None or self.owns or bool(getattr(self, needed))
         return room in _ROOMS[self.role] and listed
 
     @property
     def sees_places(self) -> bool:
-        """Return whether they may see the path of a folder on this computer."""
+        """Return whether they may see the paths of folders on this computer."""
         return self.role not in ("student", "ta")
 
     def told(self, text: str) -> str:
-        """Return a text as they may read it: students and TAs learn no folder of the server."""
+        """Return a text as they may read it; students and TAs see no folders of the server."""
         if self.sees_places:
             return text
         listed = (*self.folders, *self.gradebooks, *(own.gradebook for own in self.grades))
@@ -104,7 +104,7 @@ class User:
 
     @property
     def owns(self) -> bool:
-        """Whether they may open whatever this computer lets them."""
+        """Whether they may open everything on this computer that the system allows."""
         return self.role == "owner"
 
 
@@ -112,13 +112,14 @@ _HEADER = r"^[A-Za-z0-9-]+$"
 
 
 class Proxy(TomlTable):
-    """The reverse proxy in front, which knows who somebody is."""
+    """The reverse proxy of a lab server, which identifies each person."""
 
-    address: Annotated[str, Field(min_length=1)]  # of the proxy: nobody else may connect
-    header: Annotated[str, Field(pattern=_HEADER)]  # in which it says the name
-    secret_header: Annotated[str, Field(pattern=_HEADER)]  # in which it says the secret
-    secret: Annotated[str, Field(pattern=r"^[!-~]{24,200}$")]  # known to it and the desk only
-    # That browsers ask for, who write it in small letters.
+    address: Annotated[str, Field(min_length=1)]  # of the proxy; no other computer may connect
+    header: Annotated[str, Field(pattern=_HEADER)]  # of requests; it contains the person's name
+    secret_header: Annotated[str, Field(pattern=_HEADER)]  # of requests; it contains the secret
+    # Known only to the proxy and the desk.
+    secret: Annotated[str, Field(pattern=r"^[!-~]{24,200}$")]
+    # The address that browsers use; they write it in lower case.
     site: Annotated[
         str, StringConstraints(to_lower=True), Field(pattern=r"^(?i:https?)://[^/\s]+$")
     ]
@@ -133,7 +134,7 @@ class ListedGrade(TomlTable):
 
 
 class Listed(TomlTable):
-    """One user of the file."""
+    """One user in the list."""
 
     name: Annotated[str, Field(min_length=1)]
     role: Literal["student", "ta", "instructor"]
@@ -146,18 +147,18 @@ class Listed(TomlTable):
 
 
 class Users(TomlTable):
-    """The file that `--users` names."""
+    """The list of users, which `--users` names."""
 
     proxy: Proxy
     users: tuple[Listed, ...]
 
 
 def read_users(path: Path) -> tuple[Proxy, dict[str, User]]:
-    """Read who may see what; folders are relative to the file's own.
+    """Read the list of users; its folders are relative to the file's own folder.
 
     Raises
     ------
-    ConfigError : one line with the file, the key, what was expected, what was found.
+    ConfigError : one line with file, key, what was expected and what was found.
     """
     text = read_text(path, where=str(path), limit=1_000_000, error=ConfigError)
     document = parse_toml(text, where=str(path), error=ConfigError)
@@ -199,7 +200,7 @@ def _read_place(typed: str, root: Path) -> Place:
 
 
 def _refuse_open_to_all(path: Path) -> None:
-    """Refuse a file that everybody may read, or change, or put another in the place of."""
+    """Refuse a list that everybody on the computer can read, change or replace."""
     folder = path.resolve().parent
     mode, above = path.stat().st_mode, folder.stat().st_mode
     everybody = "everybody on this computer can"
@@ -209,12 +210,13 @@ def _refuse_open_to_all(path: Path) -> None:
         )
     if mode & stat.S_IWOTH:
         raise ConfigError(f"{path}: {everybody} write it and take any role: run chmod o-w on it")
-    if above & stat.S_IWOTH and not above & stat.S_ISVTX:  # in /tmp only the owner may
+    # In a folder with the sticky bit, such as /tmp, only the owner can replace the file.
+    if above & stat.S_IWOTH and not above & stat.S_ISVTX:
         raise ConfigError(f"{folder}: {everybody} replace {path.name} there: run chmod o-w on it")
 
 
 def _find_wrong(found: Users, root: Path) -> Iterator[str]:
-    """Yield what cannot be meant."""
+    """Yield each statement that cannot be right, as a message."""
     proxy, names = found.proxy, [user.name for user in found.users]
     try:
         ip_address(proxy.address)
@@ -226,7 +228,7 @@ def _find_wrong(found: Users, root: Path) -> Iterator[str]:
         where = f"users: {user.name!r}"
         if names.count(user.name) > 1:
             yield f"{where} is listed twice"
-        # A proxy may write a name in either; nobody is taken for another.
+        # A proxy may write names in UTF-8 or Latin-1; no name may be mistaken for another one.
         if (other := user.name.encode().decode("latin-1")) != user.name and other in names:
             yield f"{where} in UTF-8 equals {other!r} in Latin-1, which is also listed"
         for key, room in _ROOM_OF.items():
@@ -247,11 +249,11 @@ def _find_wrong(found: Users, root: Path) -> Iterator[str]:
 
 
 def name_place(place: Place) -> str:
-    """Return what to call a place: of a database its name, never who opens it with which word."""
+    """Return a name for a place; for a database only its own name, never the user or password."""
     if isinstance(place, str):
         try:
             parts = urlsplit(place)
-        except ValueError:  # a bracket that is not closed; to open it says what is wrong
+        except ValueError:  # an unclosed bracket; opening the database reports the error
             return place.partition("://")[0]
         return parts.path.strip("/") or parts.hostname or parts.scheme
     return place.name or str(place)

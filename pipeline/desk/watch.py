@@ -1,8 +1,8 @@
-"""The process that outlives a desk: it writes the log, and says so where the desk ended in silence.
+"""The process that outlives a desk: it writes the log, and reports a killed or crashed desk.
 
-Run as a file, `python watch.py LOG PID`, so that nothing is imported. Its stdin is a pipe from the
-desk. A line that begins with a tab goes to the log; any other, such as what Python writes where a
-library crashes, to stderr too. The pipe ends with the desk, whatever ended that.
+It runs as a file, `python watch.py LOG PID`, so that nothing is imported. Its stdin is a pipe from
+the desk. A line that begins with a tab goes to the log. Any other line, such as a message of Python
+when a library crashes, also goes to stderr. The pipe ends with the desk, whatever the cause.
 """
 
 import os
@@ -10,12 +10,13 @@ import signal
 import sys
 from datetime import UTC, datetime
 
-SAID = "ends: "  # begins the line of the desk's own about its end
+SAID = "ends: "  # precedes the reason when the desk itself reports its end
 
 
 def main() -> None:
-    """Write what comes, until the desk is gone."""
-    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):  # who stops the desk often stops all it began
+    """Write the lines of the desk until the desk has ended."""
+    # A terminal often sends these signals to all its processes; this one must outlive the desk.
+    for name in ("SIGINT", "SIGTERM", "SIGBREAK"):
         if (number := getattr(signal, name, None)) is not None:
             signal.signal(number, signal.SIG_IGN)
     path, process = sys.argv[1:]
@@ -43,7 +44,7 @@ def _log(path: str, process: str, line: str) -> None:
         with os.fdopen(descriptor, "a", encoding="utf-8") as file:
             file.write(f"{now} {process} {line}\n")
     except OSError:
-        pass  # a home that nobody may write to: stderr has what matters
+        pass  # the home folder is not writable: stderr has the most important lines
 
 
 def _say(line: str) -> None:

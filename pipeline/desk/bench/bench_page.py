@@ -38,19 +38,19 @@ _TYPED = ("kind", "amplitude", "frequency", "frequency_end", "seconds", "cart", 
 
 
 def show(ask: Ask) -> Response:
-    """Show the plan and the forms, or the session that is under way."""
+    """Show the plan and the forms, or the current session."""
     return _show_page(ask)
 
 
 def plan(ask: Ask) -> Response:
-    """Have a plan made, or added to."""
+    """Start the task that makes a plan or adds recordings to it."""
     _note_plan(ask)
     ask.start("propose_recordings", title="The plan", stock=bool(ask.text("stock")))
     return ask.back(ask.here)
 
 
 def acquire(ask: Ask) -> Response:
-    """Begin to acquire what is ticked; all of the plan where nothing is."""
+    """Start to acquire the recordings that are ticked, or the whole plan if none is ticked."""
     only = [value for value in ask.form.getlist("only") if isinstance(value, str)]
     port = read_port(ask)
     _note_plan(ask)
@@ -59,11 +59,11 @@ def acquire(ask: Ask) -> Response:
 
 
 def explore(ask: Ask) -> Response:
-    """Begin to explore."""
+    """Start an exploration."""
     error = read_number(ask.text("error"), name="to within ± %", above=0, below=100)
     minutes = read_number(ask.text("minutes"), name="minutes", above=0, below=10_000)
     until, limit = f"{ask.text('what')} {error!r}%", f"{minutes!r} min"
-    read_error_goal(until)  # refuse a bad goal before anything starts
+    read_error_goal(until)  # report an invalid goal before anything starts
     port = read_port(ask)
     _note_plan(ask)
     ask.desk.benches.start(ask.folder(), port=port, explore=(until, limit))
@@ -71,7 +71,7 @@ def explore(ask: Ask) -> Response:
 
 
 def add(ask: Ask) -> Response:
-    """Put a recording into the plan; an exploration that is under way makes it next."""
+    """Add a recording to the plan; if an exploration is running, it records this next."""
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         before = plan_ids(folder)
@@ -83,7 +83,7 @@ def add(ask: Ask) -> Response:
 
 
 def weigh(ask: Ask) -> Response:
-    """Show what a recording would bring, and what the program would choose."""
+    """Show what a recording would improve, next to the one that the program would choose."""
     folder, typed = ask.folder(), {name: ask.text(name) for name in _TYPED}
     try:
         wanted = _read_recording(typed, load_submission(folder)).model_dump(mode="json")
@@ -101,12 +101,12 @@ def weigh(ask: Ask) -> Response:
 
 
 def show_diary(ask: Ask) -> Response:
-    """Return the diary of the last exploration, which may run only its own script."""
+    """Return the diary of the last exploration; the browser may run only the diary's own script."""
     return serve_file(ask.folder(), DIARY)
 
 
 def press(ask: Ask) -> Response:
-    """Pass on a button; one of a page without scripts leads back to it."""
+    """Send a pressed button to the session; a page without scripts is then shown again."""
     session = _find_session(ask)
     if session.ended.is_set():
         raise HTTPException(404, "the session is over")
@@ -115,7 +115,7 @@ def press(ask: Ask) -> Response:
 
 
 async def stream(ask: Ask) -> Response:
-    """Pass on the news of the session; one that ended while its page was on the way says so."""
+    """Stream the news of the session; if it has ended already, say only that."""
     return _find_session(ask).stream()
 
 
@@ -132,7 +132,7 @@ def _show_page(
     Parameters
     ----------
     typed : the form of a custom recording.
-    refused : why it is not possible.
+    refused : why this recording is not possible.
     weighed : its predicted benefit.
     """
     folder = ask.folder()
@@ -160,12 +160,12 @@ def _show_page(
 
 
 def _note_plan(ask: Ask) -> None:
-    """Keep what the plan has now: what it has beyond that later is new."""
+    """Remember the recordings of the current plan; later ones are then shown as new."""
     ask.desk.benches.planned[ask.folder()] = plan_ids(ask.folder())
 
 
 def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recording:
-    """Return the recording that was typed."""
+    """Return the custom recording of the form."""
     if typed["kind"] not in KINDS:
         raise ConfigError(f"kind: expected {', '.join(KINDS)}, found {typed['kind']!r}")
     kind = KINDS[KINDS.index(typed["kind"])]
@@ -184,13 +184,13 @@ def _read_recording(typed: Mapping[str, str], submission: Submission) -> Recordi
 
 
 def _scale_bars(found: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the three errors as they are shown: in percent, as error bars on one scale."""
+    """Return the three errors in percent, with the lengths of their error bars on one scale."""
     rows = {
         "now": found["now"],
         "after yours": found["proposed"],
         "after the program's": found["best"],
     }
-    largest, half = max(rows.values()), 140.0  # of the largest bar's length, points
+    largest, half = max(rows.values()), 140.0  # length of the largest bar, in points
     return [
         {"of": of, "percent": f"{100 * error:.2g}", "half": round(half * error / largest, 1)}
         for of, error in rows.items()

@@ -1,4 +1,4 @@
-"""The plan of a folder as its page shows it: what is done, what is next, what is new, and why."""
+"""The plan of a folder as its page shows it: what is done, next or new, and why."""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from pipeline.submission.load import NAME, outside
 
 
 def plan_ids(folder: Path) -> frozenset[str] | None:
-    """Return the ids in the plan of a folder; None if there is no plan that can be read."""
+    """Return the ids of the recordings in a folder's plan; None without a readable plan."""
     try:
         submission = load_submission(folder)
         if plan_path(submission).exists():
@@ -28,12 +28,12 @@ def plan_ids(folder: Path) -> frozenset[str] | None:
 def read_plan(
     folder: Path, *, session: BenchSession | None, before: Collection[str] | None
 ) -> dict[str, Any]:
-    """Return the plan, the runs that may still be asked of it, and the faults of its rows.
+    """Return the plan for the page, the runs still to record, and the problems of its rows.
 
     Parameters
     ----------
-    session : the last one in the folder, which knows why a run ended early.
-    before : ids that the plan had before it last grew; None: all have been there.
+    session : the last session in the folder; it knows why a run ended early.
+    before : ids of the plan before recordings were last added; None: none is new.
     """
     found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
     found |= {"carts": 0, "recorded": 0}
@@ -66,7 +66,7 @@ def _describe(
     why: Mapping[str, str],
     before: Collection[str] | None,
 ) -> dict[str, Any]:
-    """Return a row for each recording, and how long those that are left take."""
+    """Return a row for each recording, and the total time of those still to record."""
     done = {experiment.id for experiment in submission.experiments}
     left = [recording for recording in plan.recordings if recording.id not in done]
     following = left[0].id if left else ""
@@ -85,13 +85,13 @@ def _describe(
 
 
 def _why_again(session: BenchSession | None) -> dict[str, str]:
-    """Return by id why a run of the last session is wanted again."""
+    """Return, by id, why a run of the last session must be repeated."""
     plan = session.snapshot().get("plan", ()) if session else ()
     return {entry["id"]: f"It ended early: {entry['why']}." for entry in plan if entry["why"]}
 
 
 def _find_partial(submission: Submission, name: str) -> str:
-    """Return that an earlier run ended early; "" if none did."""
+    """Return a note if an earlier run of this recording ended early, else ""."""
     file = f"data/{name}.partial.txt"
     is_there = outside(submission.folder, file) is None
     return f"An earlier run ended early; what it recorded is in {file}." if is_there else ""

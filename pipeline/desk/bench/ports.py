@@ -1,4 +1,4 @@
-"""The ports that a bench may be at: plugged in, virtual, and the one used last in a folder."""
+"""The ports to which a bench may be connected: real ones, virtual ones, and the last one used."""
 
 import json
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ class Port:
 
     Attributes
     ----------
-    name : what is there, as far as anybody knows.
+    name : the device at the port, as far as the system knows it.
     """
 
     address: str
@@ -30,10 +30,11 @@ class Port:
 
 
 def list_ports(ask: Ask) -> list[Port]:
-    """Return the ports that somebody may record at, the likeliest first.
+    """Return the ports at which a person may record, the likeliest first.
 
-    That is the one used last in this folder if it is still there, then what is plugged in, then
-    virtual benches of this computer. On a lab server it is only what the list of users names.
+    The last port used in this folder comes first if it still exists. Ports with a device follow,
+    and then the virtual benches on this computer. On a lab server, only the ports in the list of
+    users are returned.
     """
     used = _read_memory().get(str(ask.folder()), "")
     if ask.user.owns:
@@ -42,7 +43,7 @@ def list_ports(ask: Ask) -> list[Port]:
             Port(address=one.address, name=f"virtual bench {one.name} ({one.address})")
             for one in running_benches()
         ]
-        # A port of which the system knows nothing is seldom one with a bench.
+        # A port about which the system knows nothing seldom has a bench, so it comes last.
         unknown = [port for port in plugged if port.name == port.address]
         found = [port for port in plugged if port not in unknown] + virtual + unknown
     else:
@@ -54,7 +55,7 @@ def list_ports(ask: Ask) -> list[Port]:
 
 
 def read_port(ask: Ask) -> str:
-    """Return the port that was typed, else the one that was chosen; it is remembered.
+    """Return the port that was typed, or else the one that was chosen; remember it for this folder.
 
     Raises
     ------
@@ -74,12 +75,12 @@ def read_port(ask: Ask) -> str:
 def _remember(folder: Path, port: str) -> None:
     ports = {at: used for at, used in _read_memory().items() if at != str(folder)}
     kept = dict(list(ports.items())[1 - _KEPT :]) | {str(folder): port}
-    with suppress(OSError):  # a home that nobody may write to: it is chosen again next time
+    with suppress(OSError):  # the home folder is not writable: nothing is remembered
         write_file(_find_memory(), json.dumps(kept, indent=1), private=True)
 
 
 def _read_memory() -> dict[str, str]:
-    """Return the port used last in each folder, in the order of use."""
+    """Return the last port used in each folder, the folder used last at the end."""
     try:
         read = json.loads(_find_memory().read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
 """The process in which the desk acquires; it stops the bench even if the desk ends.
 
-The first line of JSON on stdin says what to record or explore; each further line is a pressed
-button. The end of stdin, because the desk is gone, counts as Stop. Stdout has one line for every
-event of the session, then one for its outcome.
+The first line of JSON on stdin says what to record or explore. Each further line is a pressed
+button. If stdin ends, the desk is gone; this counts as Stop. Stdout gets one line for every event
+of the session, then one line with its outcome.
 """
 
 import json
@@ -18,7 +18,7 @@ from pipeline.processes import answering, lines_sent
 
 
 def main() -> None:
-    """Acquire or explore, and tell."""
+    """Acquire or explore as stdin says, and write the events to stdout."""
     say = answering()
     sent = lines_sent()
     given = json.loads(next(sent))
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def _acquire(folder: Path, given: dict[str, Any], state: LiveState) -> str:
-    """Return what was recorded."""
+    """Acquire recordings; return a sentence on what was recorded."""
     outcomes = acquire(
         folder, port=given["port"], observers=[state], only=given["only"], buttons=state.buttons
     )
@@ -54,7 +54,7 @@ def _acquire(folder: Path, given: dict[str, Any], state: LiveState) -> str:
 
 
 def _explore(folder: Path, given: dict[str, Any], state: LiveState) -> str:
-    """Return what is known at the end."""
+    """Explore; return a sentence on what is known at the end."""
     from pipeline.experiments.exploring.at_bench import explore_bench
     from pipeline.experiments.exploring.error_goal import read_error_goal, read_time
     from pipeline.words.text import with_symbols
@@ -73,7 +73,12 @@ def _explore(folder: Path, given: dict[str, Any], state: LiveState) -> str:
 
 
 def _tell_news(state: LiveState, say: Callable[..., None], is_over: threading.Event) -> None:
-    """Tell what there is to see as it changes; of a session that never began, nothing."""
+    """Write the state of the session whenever it changes; nothing if the session never began.
+
+    Parameters
+    ----------
+    is_over : set when the session has ended.
+    """
     begun = last = False
     for news in state.follow(version=1):
         for kind, data in news:

@@ -1,1 +1,1 @@
-"""The TA's room: a class, a team's points beside the evidence, what several change at once."""
+"""The TA's room: a class, each team's points with the evidence, and changes to several teams."""

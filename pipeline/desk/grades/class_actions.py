@@ -1,4 +1,4 @@
-"""What is done with a whole class: graded again, written, changed from a table, exported."""
+"""Actions on a whole class: grade again, write files, change points from a table, export."""
 
 import zipfile
 from dataclasses import replace
@@ -22,7 +22,7 @@ from pipeline.words.numbers import count
 
 
 def take_table(ask: Ask) -> Response:
-    """Change points as a table says, all of it or nothing."""
+    """Change points from an uploaded table, either all of them or none."""
     shown = read_class(ask)
     by = sign(ask)
     with scratch_folder() as scratch:
@@ -44,7 +44,7 @@ def take_table(ask: Ask) -> Response:
 
 
 def release(ask: Ask) -> Response:
-    """Let students with accounts read their feedback, or no longer."""
+    """Let students with accounts read their feedback, or hide it again."""
     if not may_release(ask):
         raise HTTPException(
             403, "only the instructor decides when students can read their feedback"
@@ -56,7 +56,7 @@ def release(ask: Ask) -> Response:
 
 
 def export_class(ask: Ask) -> Response:
-    """Return the grades as a learning platform imports them: a table, or a zip with remarks."""
+    """Return the grades in the format of a learning platform: a table, or a zip with remarks."""
     platform = next((one for one in get_args(Platform) if one == ask.text("lms")), None)
     if platform is None:
         raise HTTPException(400, "there is no such platform")
@@ -70,7 +70,7 @@ def export_class(ask: Ask) -> Response:
         with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
             for file in done.files:
                 archive.write(file, file.relative_to(out).as_posix())
-            if done.remarks:  # they name students, which a page need not
+            if done.remarks:  # remarks may name students, so they go into the zip, not on a page
                 archive.writestr(
                     "remarks.txt", "".join(f"{remark.text}\n" for remark in done.remarks)
                 )
@@ -78,7 +78,7 @@ def export_class(ask: Ask) -> Response:
 
 
 def regrade(ask: Ask) -> Response:
-    """Have the class graded again: what is as it was is not."""
+    """Start the task that grades the class again; unchanged submissions keep their results."""
     shown = read_class(ask)
     if not ask.user.owns:
         raise HTTPException(403, "only the owner of this computer can enter folders")
@@ -99,11 +99,11 @@ def regrade(ask: Ask) -> Response:
 
 
 def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:
-    """Write an uploaded file to a path; None if nothing was uploaded."""
+    """Write an uploaded file to a path; return None if nothing was uploaded."""
     sent = ask.form.get(name)
     if not isinstance(sent, UploadFile) or not sent.filename:
         return None
-    path.write_bytes(sent.file.read())  # the guard let no more than a form's bytes pass
+    path.write_bytes(sent.file.read())  # small enough, because the size of requests is limited
     return path
 
 

@@ -1,4 +1,4 @@
-"""A class at the desk: the table, who changed what, what is drawn of it."""
+"""The page of a class: the table of teams, recent changes, and drawings."""
 
 from collections import Counter
 from collections.abc import Mapping
@@ -30,14 +30,14 @@ from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.report.render.html import render_drawing
 from pipeline.words.text import capital
 
-_ROWS = 50  # of a page
+_ROWS = 50  # rows of one page
 _MOST_NEWS = 8
 _MOST_SETS = 20
 
 
 @dataclass(frozen=True, kw_only=True)
 class Counted:
-    """A remark or a criterion, and how many teams have it or lost points there."""
+    """A flag or criterion, and the number of teams that have the flag or lost points there."""
 
     key: str
     title: str
@@ -45,17 +45,17 @@ class Counted:
 
 
 def read_class(ask: Ask) -> Class:
-    """Return the class that the address is about."""
+    """Return the class of the address."""
     return ask.desk.books.of(ask.place_or_404())
 
 
 def open_book(ask: Ask) -> RequestBook:
-    """Return the gradebook that the address is about."""
+    """Return the gradebook of the address."""
     return ask.desk.books.book(ask.place_or_404())
 
 
 def find_team(shown: Class, name: str) -> Listing:
-    """Return a team by the name that is shown."""
+    """Return a team by its name as pages show it."""
     team = shown.teams.get(name)
     if team is None:
         raise HTTPException(404, "no submission of this class has this name")
@@ -63,17 +63,17 @@ def find_team(shown: Class, name: str) -> Listing:
 
 
 def find_signature(ask: Ask) -> str:
-    """Return the name under which somebody changes points, "" where it is not known yet."""
+    """Return the name with which a person's changes are signed; "" if it is not known yet."""
     return ask.user.name or ask.desk.books.signed
 
 
 def may_release(ask: Ask) -> bool:
-    """Whether somebody decides when students read their feedback."""
+    """Return whether the person may decide when students read their feedback."""
     return ask.user.role in ("instructor", "owner")
 
 
 def show(ask: Ask) -> Response:
-    """Show the class, a page of it."""
+    """Show one page of the table of teams."""
     shown, wanted = read_class(ask), Filter.read(ask.request.query_params)
     chosen = wanted.chosen(shown)
     pages = max(1, -(-len(chosen) // _ROWS))
@@ -114,7 +114,7 @@ def show(ask: Ask) -> Response:
 
 
 def count_flags(shown: Class) -> list[Counted]:
-    """Return the remarks of a class, the most common first."""
+    """Return the flags of a class, the most common first."""
     found = Counter(code for team in shown.teams.values() for code in team.line.codes)
     common = sorted(found, key=lambda code: (-found[code], CODES.index(code)))
     titles = {code: capital(WORDS.text(f"title_{code}")) for code in common}
@@ -122,13 +122,13 @@ def count_flags(shown: Class) -> list[Counted]:
 
 
 def count_lost(shown: Class, titles: Mapping[str, str]) -> list[Counted]:
-    """Return the criteria in which points were lost, those of most teams first."""
+    """Return the criteria in which points were lost, those with most teams first."""
     found = [Counted(key=k, title=titles[k], many=len(v)) for k, v in shown.lost.items() if v]
     return sorted(found, key=lambda one: -one.many)
 
 
 def show_news(ask: Ask) -> Response:
-    """Tell which points were changed since a page was shown; nothing where nothing is new."""
+    """Show which points were changed since a page was loaded; empty if none were."""
     shown = read_class(ask)
     since, told = (_read_number(ask, name) for name in ("since", "told"))
     answer = ask.page("news", title="", news=list_news(ask, shown, since=since))
@@ -138,7 +138,12 @@ def show_news(ask: Ask) -> Response:
 
 
 def list_news(ask: Ask, shown: Class, *, since: int) -> dict[str, Any]:
-    """Return the changes after a given one, as a page shows them."""
+    """Return the changes after a given one, as a page shows them.
+
+    Parameters
+    ----------
+    since : number of the last change that the page knows.
+    """
     changes, told = [], shown.state[1]
     about = ask.query("of")
     if told != since:
@@ -166,7 +171,7 @@ def _read_number(ask: Ask, name: str) -> int:
 
 
 def draw_distribution(ask: Ask) -> Response:
-    """Draw how many submissions have how many points."""
+    """Draw the distribution of points."""
     return show_drawing(ask.desk.books.drawn(ask.place_or_404(), "distribution", _distribution))
 
 
@@ -179,7 +184,7 @@ def _distribution(shown: Class) -> str:
 
 
 def show_class_page(ask: Ask) -> Response:
-    """Show the class page as `cartlab grade` writes it, of the gradebook as it is now."""
+    """Show the class page of `cartlab grade`, made from the current gradebook."""
     book = open_book(ask)
 
     def draw(shown: Class) -> str:
@@ -202,7 +207,7 @@ def show_class_page(ask: Ask) -> Response:
 
 
 def show_feedback(ask: Ask) -> Response:
-    """Show what a team reads, as it is now."""
+    """Show the feedback that a team reads, in its current state."""
     shown = read_class(ask)
     team = find_team(shown, ask.request.path_params["name"])
     book = open_book(ask)

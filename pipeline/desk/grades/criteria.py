@@ -1,4 +1,4 @@
-"""The criteria of a team as its page shows them: in which order, with what evidence and steps."""
+"""The criteria on a team's page: their order, their evidence, and the points to choose from."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,20 +27,21 @@ from pipeline.set_up import Units
 from pipeline.words.numbers import NOTHING
 from pipeline.words.text import capital, name_span, with_symbols
 
-MOST_STEPS = 9  # a key each, from 1
+MOST_STEPS = 9  # one for each key, from 1 to 9
 _QUARTERS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
 class Item:
-    """A line of the list on a team's page: a criterion, or a remark that is about none of them.
+    """A row in the list on a team's page: a criterion, or a flag that concerns no criterion.
 
     Attributes
     ----------
-    id : Of the criterion, or the code of the remark.
-    lost : Points before those given by hand. So a decided criterion keeps its place in the list.
-    doubt : Whether a person should look, or did: points are lost, it was not judged, it has a
-        remark, or points by hand.
+    id : of the criterion, or the code of the flag.
+    lost : points lost before points by hand, so that a criterion keeps its row after a decision.
+    doubt : whether a person should look or has looked: points were lost, it was not judged, or it
+        has a
+        flag or points by hand.
     """
 
     id: str
@@ -55,7 +56,7 @@ class Item:
 
 
 def list_items(grade: Grade, now: TeamNow) -> list[Item]:
-    """Return the criteria and the remarks beside them, those to look at first, most lost first."""
+    """Return the rows for criteria and flags; those that need a look and lost most come first."""
     judged = {criterion.id: criterion for criterion in grade.criteria}
     items = [
         Item(id=flag.code, is_remark=True, title=capital(WORDS.text(f"title_{flag.code}")))
@@ -83,9 +84,9 @@ def list_items(grade: Grade, now: TeamNow) -> list[Item]:
 
 
 def point_steps(out_of: float, *, step: float) -> list[float]:
-    """Return the points that a criterion can be given by a key: at most nine, nothing and all too.
+    """Return at most nine points that a criterion can be given by a key, including none and all.
 
-    The rubric's own steps where they are few, else quarters, rounded to a step.
+    They are the steps of the rubric if these are few, otherwise quarters rounded to a step.
     """
     whole = exact(out_of)
     fine = [n * exact(step) for n in range(MOST_STEPS) if n * exact(step) < whole]
@@ -95,18 +96,18 @@ def point_steps(out_of: float, *, step: float) -> list[float]:
 
 
 def list_steps(out_of: float, rubric: Rubric) -> list[str]:
-    """Return these points as pages write them."""
+    """Return the points of `point_steps` as text."""
     return [points_text(points) for points in point_steps(out_of, step=rubric.step)]
 
 
 def describe_criterion(
     asked: Asked, grade: Grade, now: TeamNow, *, typed: Mapping[str, str]
 ) -> dict[str, Any]:
-    """Return what the page shows of the chosen criterion; it may never have been judged.
+    """Return what the page shows of a criterion, which may never have been judged.
 
     Parameters
     ----------
-    typed : what was typed in its form and refused, and why: points, other, why, wrong.
+    typed : fields of its form that were refused (points, other, why), and the reason (wrong).
     """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     given = now.entry.overrides.get(asked.id) or now.entry.comments.get(asked.id)
@@ -143,7 +144,7 @@ def _say_given(given: HandPoints) -> str:
 
 
 def describe_flag(flag: Flag, units: Units | None) -> dict[str, Any]:
-    """Return a remark in words, with the numbers it rests on."""
+    """Return a flag as text, with the numbers that support it."""
     table = evidence_table(flag, units=units, numbers=count(0))
     return {
         "code": flag.code,
@@ -157,14 +158,15 @@ def describe_flag(flag: Flag, units: Units | None) -> dict[str, Any]:
 def show_figures(
     drawn: Sequence[tuple[str, str]], asked: Asked | None, own: Criterion | None, *, first: str = ""
 ) -> list[dict[str, str]]:
-    """Return the figures of a criterion, the one with the number that is most off first.
+    """Return the figures of a criterion; the one with the largest relative error comes first.
 
-    Without a criterion: those that belong to none.
+    Without a criterion, the figures that belong to none are returned.
 
     Parameters
     ----------
     drawn : file names and SVG.
-    first : the file that somebody wants to see first.
+    own : the judged criterion, with its numbers.
+    first : file that the person wants to see first.
     """
     worst = _find_worst(own) if own else ""
     about = [(file, svg) for file, svg in drawn if _belongs(file, asked, own)]
@@ -173,7 +175,7 @@ def show_figures(
 
 
 def _belongs(file: str, asked: Asked | None, own: Criterion | None) -> bool:
-    """Tell whether a figure belongs beside a criterion: records by the numbers in them."""
+    """Return whether a figure belongs to a criterion; figures of recordings do by their numbers."""
     numbers = numbers_in(file)
     if asked is None:
         return not numbers and not is_response(file)
@@ -184,14 +186,14 @@ def _belongs(file: str, asked: Asked | None, own: Criterion | None) -> bool:
 
 
 def _shorten(file: str) -> str:
-    """Return what a button calls a figure."""
+    """Return the text of the button for a figure."""
     if is_response(file):
         return f"cart {file.removesuffix('.svg').rpartition('-')[2]}"
     return ", ".join(name_span(name).text for name in sorted(numbers_in(file))) or file
 
 
 def _find_worst(own: Criterion) -> str:
-    """Return the number that is most off, as a ratio; "" where no pair can be compared."""
+    """Return the number with the largest relative error; "" if none can be compared."""
     ratios = {}
     for name, expected in own.expected.items():
         found = own.found.get(name)
@@ -205,7 +207,7 @@ def _is_positive(value: Any) -> bool:
 
 
 def _shows(file: str, name: str) -> bool:
-    """Tell whether a figure shows a number: its record, or the response of its cart."""
+    """Return whether a figure shows a number: by its recording, or by the response of its cart."""
     if is_response(file):
         return bool(name) and file.endswith(f"-{read_name(name).cart}.svg")
     return name in numbers_in(file)

@@ -1,4 +1,4 @@
-"""Which teams of a class are shown, and in which order: all in the address of the page."""
+"""Which teams of a class a page shows, and in which order; all of it is in the page's address."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -22,15 +22,15 @@ _ORDERS = {"name": "name", "points": "points, lowest first", "late": "days late,
 
 @dataclass(frozen=True, kw_only=True)
 class Filter:
-    """The filter of a page; empty means everything.
+    """The filter and order of a page; an empty field has no effect.
 
     Attributes
     ----------
-    flag : a code that they have.
-    lost : a criterion of which they have not all points.
-    state : one of `_STATES`.
-    seen : "no", "yes".
-    q : letters of a name.
+    flag : only teams with this flag.
+    lost : only teams that lost points in this criterion.
+    state : only teams in one of the `_STATES`.
+    seen : "yes" for reviewed teams only, "no" for the others.
+    q : only teams with this text in their name or authors.
     """
 
     flag: str = ""
@@ -42,20 +42,23 @@ class Filter:
 
     @classmethod
     def read(cls, asked: Mapping[str, str]) -> "Filter":
-        """Return what an address asks for."""
+        """Return the filter that the query of an address contains."""
         return cls(**{name: asked.get(name, "").strip() for name in cls.__dataclass_fields__})
 
     @property
     def query(self) -> str:
-        """The address's end that asks for it."""
+        """The query of an address that contains this filter."""
         return urlencode({name: value for name, value in asdict(self).items() if value})
 
     def chosen(self, shown: Class) -> list[Listing]:
-        """Return the teams that it is about, in its order."""
+        """Return the teams that pass the filter, in its order."""
         return [team for team in self.ordered(shown) if self._takes(team, shown)]
 
     def beside(self, shown: Class, name: str) -> tuple[str, str]:
-        """Return who is before and after a team among the chosen, or ""; it may be none of them."""
+        """Return the names before and after a team among those that pass the filter, or "".
+
+        The team itself need not pass.
+        """
         before, after, passed = "", "", False
         for team in self.ordered(shown):
             if team.line.submission == name:
@@ -68,7 +71,7 @@ class Filter:
         return before, after
 
     def ordered(self, shown: Class) -> Sequence[Listing]:
-        """Return the whole class in its order."""
+        """Return the whole class in the order of the filter."""
         teams = list(shown.teams.values())
         if self.order == "points":
             teams.sort(key=lambda team: team.line.points)
@@ -92,7 +95,7 @@ class Filter:
         )
 
     def fields(self, shown: Class) -> list[dict]:
-        """Return the choices of a form, each with how many there are."""
+        """Return the fields of the form, each with its choices and the number of teams of each."""
         teams = list(shown.teams.values())
         flags = Counter(code for team in teams for code in team.line.codes)
         common = sorted(flags, key=lambda code: (-flags[code], CODES.index(code)))

@@ -1,4 +1,4 @@
-"""Where the recordings of a graded team lie on this computer: a gradebook keeps no folder."""
+"""Find the recordings of a graded team on this computer, because a gradebook stores no folder."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,15 +11,15 @@ from pipeline.grading.intake.files import digest
 from pipeline.output import LOCK
 from pipeline.submission.load import NAME
 
-# What making the plots adds to a folder.
+# Files that making the plots adds to a folder.
 _ADDED = (PLOTS, PLOTS_OF, f"{Path(PLOTS).parent.name}/{LOCK}")
 
 
 def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
-    """Return the folder that was graded, None where it is not found or not for this person.
+    """Return the folder that was graded; None if it is not found or not for this person.
 
-    It holds the very files of the grading: a later version would show other recordings. Plots
-    that were made there since do not count.
+    Its files must be those of the grading, because a later version would show other recordings.
+    Plots that were made there since do not count.
     """
     if not ask.user.owns or shown.names is not None:
         return None
@@ -33,7 +33,7 @@ def find_recordings(ask: Ask, shown: Class, entry: Entry) -> Path | None:
 
 
 def _list_candidates(ask: Ask, name: str) -> Iterator[Path]:
-    """Yield folders of this name: open at the desk, graded from here, or beside the gradebook."""
+    """Yield folders of this name: open at the desk, graded from here, or next to the gradebook."""
     place = ask.place_or_404()
     yield from (folder for folder in ask.user.folders if folder.name == name)
     for path in ask.desk.books.asked.get(place, {}).get("paths", "").splitlines():

@@ -1,4 +1,4 @@
-"""The requests of a class for another look: those that wait, with a form for the answer."""
+"""The requests of a class for a review: waiting ones with a form for the answer, then others."""
 
 from typing import Any
 from urllib.parse import urlencode
@@ -25,12 +25,12 @@ from pipeline.words.text import capital, with_symbols
 
 
 def show(ask: Ask) -> Response:
-    """Show the queue, of the class or of one team."""
+    """Show the requests, of the class or of one team."""
     return _show_page(ask)
 
 
 def act(ask: Ask) -> Response:
-    """Answer a request, or reopen it; what somebody else answered meanwhile is shown."""
+    """Answer a request or reopen it; if somebody else has answered it, show that answer."""
     shown = read_class(ask)
     team = find_team(shown, ask.text("team"))
     book, name, what = open_book(ask), team.submission, ask.text("do")
@@ -53,7 +53,7 @@ def act(ask: Ask) -> Response:
 
 
 def _read_points(typed: str) -> float | None:
-    """Return the points that were chosen, None where they stay."""
+    """Return the chosen points, None if they stay."""
     if not typed:
         return None
     points = read_points(typed)
@@ -88,7 +88,12 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
 
 
 def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) -> dict[str, Any]:
-    """Return a request as the page shows it."""
+    """Return a request as the page shows it.
+
+    Parameters
+    ----------
+    wrong : why its answer was refused, or "".
+    """
     rubric, request = shown.rubric, queued.request
     asked = next((c for c in rubric.criteria if c.id == request.criterion), None)
     own = next((c for c in queued.entry.grade.criteria if c.id == request.criterion), None)
@@ -114,13 +119,13 @@ def _describe(ask: Ask, queued: Queued, shown: Class, name: str, *, wrong: str) 
 
 
 def _find_title(rubric: Rubric, criterion: str) -> str:
-    """Return what a criterion is called, which the rubric may no longer have."""
+    """Return the title of a criterion; its id if the rubric no longer has it."""
     titles = {asked.id: asked.title for asked in rubric.criteria}
     return capital(titles.get(criterion) or criterion)
 
 
 def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
-    """Show what somebody wrote beside what it is now; nothing was changed."""
+    """Show the typed answer next to the current state; nothing was changed."""
     name, criterion = ask.text("team"), ask.text("criterion")
     queue = open_book(ask).queue(shown.teams[name].submission)
     queued = next(
@@ -145,5 +150,5 @@ def _show_conflict(ask: Ask, shown: Class, conflict: Conflict) -> Response:
 
 
 def _write_address(ask: Ask, of: str) -> str:
-    """Return the address of the queue, of the class or of one team."""
+    """Return the address of the requests, of the class or of one team."""
     return f"{ask.here}again" + (f"?{urlencode({'of': of})}" if of else "")

@@ -1,4 +1,4 @@
-"""A team at the desk: its points beside the evidence, and what a person decides about them."""
+"""The page of a team: its points with the evidence, and the decisions of a person."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -40,7 +40,7 @@ from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.html import render_drawing
 from pipeline.words.text import capital
 
-_POINTS = "points"  # the place of the page where points are changed
+_POINTS = "points"  # part of the page where points are changed
 
 
 def show(ask: Ask) -> Response:
@@ -49,7 +49,7 @@ def show(ask: Ask) -> Response:
 
 
 def act(ask: Ask) -> Response:
-    """Do what a button says: sign, accept, take the mark back, change points, undo."""
+    """Do what the pressed button says: sign, accept, unmark, change points, or undo."""
     shown = read_class(ask)
     team = find_team(shown, ask.query("of"))
     book, name, what = open_book(ask), team.submission, ask.text("do")
@@ -131,9 +131,9 @@ def _show_page(ask: Ask, *, wrong: str = "", status: int = 200) -> Response:
 
 
 def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
-    """Return the criterion or remark that the address or the form is about.
+    """Return the criterion or flag that the address or the form names.
 
-    Else the first to look at; of a team with none, the first that has a figure.
+    If they name none, return the first one to look at, or the first that has a figure.
     """
     criterion = ask.text("criterion") or ask.query("criterion")
     for wanted, is_remark in ((criterion, False), (ask.query("remark"), True)):
@@ -148,7 +148,7 @@ def _find_chosen(ask: Ask, items: Sequence[Item], rubric: Rubric) -> Item:
 def _link_items(
     ask: Ask, name: str, items: Sequence[Item], chosen: Item
 ) -> list[tuple[Item, str, str]]:
-    """Return each line of the list with its address and its key."""
+    """Return each row of the list with its address, and the key that opens it."""
     at = items.index(chosen)
     keys = {at - 1: "k", at + 1: "j"}
     return [
@@ -161,7 +161,7 @@ def _link_items(
 def _show_chosen(
     ask: Ask, shown: Class, grade: Grade, now: TeamNow, *, chosen: Item, wrong: str
 ) -> dict[str, Any]:
-    """Return what the page shows beside the list: the chosen criterion or remark, its evidence."""
+    """Return what the page shows beside the list: the chosen criterion or flag and its evidence."""
     name, drawn = grade.submission, open_book(ask).figures(now.entry)
     asked = next((c for c in now.rubric.criteria if c.id == chosen.id), None)
     if chosen.is_remark or asked is None:
@@ -191,7 +191,7 @@ def _show_chosen(
 def _link_figures(
     ask: Ask, name: str, figures: Sequence[dict[str, str]], chosen: Item
 ) -> list[dict[str, str]]:
-    """Return figures with their address, and that of the page with each first."""
+    """Return figures with two addresses: of the figure, and of the page with this figure first."""
     found = []
     for figure in figures:
         own = {"of": name, "figure": figure["file"]}
@@ -202,7 +202,7 @@ def _link_figures(
 
 
 def _link_others(ask: Ask, shown: Class, flag: Flag) -> list[tuple[str, str]]:
-    """Return who shares a recording, with the address of those that are in the class."""
+    """Return the submissions that share a recording, with addresses for those in the class."""
     names = flag.evidence.get("submissions", ()) if flag.code == "shared_data" else ()
     return [(name, write_address(ask, name) if name in shown.teams else "") for name in names]
 
@@ -210,7 +210,7 @@ def _link_others(ask: Ask, shown: Class, flag: Flag) -> list[tuple[str, str]]:
 def _link_together(
     ask: Ask, shown: Class, grade: Grade, one: dict[str, Any], flags: Sequence[Flag]
 ) -> list[tuple[str, str]]:
-    """Return where the same can be done for all who have the same remark, and what it is called."""
+    """Return links to apply the same points to all teams with the same flag, with their text."""
     lost = one["id"] if one["lost"] else ""
     codes = dict.fromkeys(flag.code for flag in flags)
     sets = [(Filter(flag=code, lost=lost), WORDS.text(f"title_{code}")) for code in codes]
@@ -221,7 +221,7 @@ def _link_together(
         many = len(wanted.chosen(shown))
         if many > 1:
             about = {"criterion": one["id"], "of": grade.submission}
-            if one["by_hand"]:  # what was decided for this team is offered for all
+            if one["by_hand"]:  # the decision for this team is offered for all
                 points = "same" if one["is_comment"] else one["points"]
                 about |= {"points": points, "why": one["own_reason"]}
             address = f"{ask.here}together?{urlencode(about)}&{wanted.query}"
@@ -230,7 +230,7 @@ def _link_together(
 
 
 def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) -> Response:
-    """Show what somebody typed beside what it is now; nothing was changed."""
+    """Show what a person typed next to the current state; nothing was changed."""
     now = open_book(ask).team(team.submission)
     criterion = ask.text("criterion")
     titles = {asked.id: asked.title for asked in now.rubric.criteria}
@@ -250,13 +250,18 @@ def _show_conflict(ask: Ask, shown: Class, team: Listing, conflict: Conflict) ->
             "why": conflict.now.why if conflict.now else "as graded",
             "by": conflict.now.by if conflict.now else "cartlab",
         },
-        # With a fragment it would be this page, not loaded.
+        # With a fragment, the browser would stay on this page without loading it again.
         back=write_address(ask, team.line.submission, criterion=criterion),
     )
 
 
 def sign(ask: Ask) -> str:
-    """Return who changes something: whom the proxy names, else what is typed, once."""
+    """Return the name that signs a change: from the proxy, or typed once by the person.
+
+    Raises
+    ------
+    ConfigError : no name is known.
+    """
     if ask.user.name:
         return ask.user.name
     typed = ask.text("by") or ask.desk.books.signed
@@ -267,6 +272,6 @@ def sign(ask: Ask) -> str:
 
 
 def write_address(ask: Ask, name: str, **more: str) -> str:
-    """Return the address of a team, from which next and previous go on as before."""
+    """Return the address of a team's page; it keeps the filter, so that next and previous work."""
     wanted = Filter.read(ask.request.query_params).query
     return f"{ask.here}team?{urlencode({'of': name, **more})}" + (f"&{wanted}" if wanted else "")

@@ -1,4 +1,4 @@
-"""The same points or comment for several teams: looked through first, then all of it or nothing."""
+"""Give several teams the same points or comment: preview first, then change all or none."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,19 +23,22 @@ from pipeline.grading.words import WORDS, points_text
 from pipeline.words.numbers import count
 from pipeline.words.text import capital, with_symbols
 
-_SAME = "same"  # points: as they are, with a comment
-_DONE = "together"  # the place of a page that tells what was done
+_SAME = "same"  # choice of points: unchanged, only a comment
+_DONE = "together"  # part of a page where the result is reported
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A team of the list: ticked or not, as it is and as it would be.
+    """A team in the list, now and after the change.
 
     Attributes
     ----------
-    version : of the criterion; moved: somebody changed it after the list was shown.
+    ticked : whether it will be changed.
+    version : of the criterion's points; sent along with the change.
+    moved : whether somebody changed it after the list was shown.
     now, after : points of the criterion.
-    said : the message of the criterion now.
+    total_now, total_after : points of the submission.
+    said : the current message of the criterion.
     """
 
     name: str
@@ -51,12 +54,12 @@ class Row:
 
 
 def show(ask: Ask) -> Response:
-    """Show the teams with their points now and after."""
+    """Show the teams with their points before and after the change."""
     return _show_page(ask)
 
 
 def apply(ask: Ask) -> Response:
-    """Change all ticked teams, or take back what was changed in one go."""
+    """Change all ticked teams, or undo a set of changes."""
     if ask.text("do") == "undo":
         return _undo(ask)
     shown, by = read_class(ask), sign(ask)
@@ -81,7 +84,7 @@ def apply(ask: Ask) -> Response:
 
 
 def _undo(ask: Ask) -> Response:
-    """Take back one go; what somebody changed since stays, and is named."""
+    """Undo a set of changes; teams that were changed again since are kept and named."""
     shown, book = read_class(ask), open_book(ask)
     if ask.text("set") not in [one.at for one in book.changed_together(least=1)]:
         raise HTTPException(404, "there is no such change in this class")
@@ -91,20 +94,25 @@ def _undo(ask: Ask) -> Response:
         names = {team.submission: name for name, team in shown.teams.items()}
         kept = ", ".join(sorted(names.get(one, STRANGER) for one in undone.kept))
         said += f" Kept, because changed since: {kept}."
-    if not ask.query("criterion"):  # from the list on the class page
+    if not ask.query("criterion"):  # the button was in the list on the class page
         return ask.back(f"{ask.here}#sets", said, place=_DONE)
     return ask.back(_address(ask, done=undone.at if undone.back else ""), said, place=_DONE)
 
 
 def _address(ask: Ask, *, done: str) -> str:
-    """Return the address of the page after something was done, which offers to undo that."""
+    """Return the address of the page after a change; the page then offers to undo it.
+
+    Parameters
+    ----------
+    done : time that identifies the set of changes.
+    """
     kept = {key: ask.query(key) for key in ("criterion", "of")} | {"done": done}
     wanted = Filter.read(ask.request.query_params).query
     return f"{ask.here}together?{urlencode({k: v for k, v in kept.items() if v})}&{wanted}"
 
 
 def _find_criterion(ask: Ask, shown: Class) -> Criterion:
-    """Return the criterion of the address."""
+    """Return the criterion that the address names."""
     for asked in shown.rubric.criteria:
         if asked.id == ask.query("criterion"):
             return asked
@@ -112,16 +120,16 @@ def _find_criterion(ask: Ask, shown: Class) -> Criterion:
 
 
 def _read_typed(ask: Ask) -> str:
-    """Return the points as typed or chosen."""
+    """Return the points that were typed or chosen, as text."""
     return ask.text("other") or ask.text("points") or _SAME
 
 
 def _wish(ask: Ask, shown: Class, asked: Criterion, name: str, *, typed: str) -> WantedPoints:
-    """Return what the form asks for one team.
+    """Return the change that the form requests for one team.
 
     Raises
     ------
-    ConfigError : the team is not in the class, or the points are not a number it can have.
+    ConfigError : the team is not in the class, or cannot have these points.
     """
     if name not in shown.teams:
         raise ConfigError("a team is no longer in the class")
@@ -181,14 +189,17 @@ def _back(ask: Ask, team: str, asked: Criterion) -> str:
 
 
 def _name_set(wanted: Filter) -> str:
-    """Return what a filtered list is called."""
+    """Return the title of the page, from its filter."""
     if wanted.flag:
         return capital(WORDS.text(f"title_{wanted.flag}"))
     return "Points lost" if wanted.lost else "Several teams"
 
 
 def _widen(ask: Ask, shown: Class, wanted: Filter) -> tuple[str, int] | None:
-    """Return where all with the remark are, and how many; None where they are here already."""
+    """Return a link to all teams with the flag, and their number.
+
+    Returns None if the page shows all of them already.
+    """
     if not (wanted.flag and wanted.lost):
         return None
     wide = Filter(flag=wanted.flag)
@@ -200,13 +211,13 @@ def _widen(ask: Ask, shown: Class, wanted: Filter) -> tuple[str, int] | None:
 
 
 def _list_rows(ask: Ask, shown: Class, asked: Criterion, *, typed: str) -> list[Row]:
-    """Return the teams of the list, those that the form names too, as they are and would be."""
+    """Return the teams of the filter and of the form, each with its points before and after."""
     sent = ask.sent.getlist("team")
     names = [team.line.submission for team in Filter.read(ask.request.query_params).chosen(shown)]
     names += [str(name) for name in sent if name in shown.teams and name not in names]
-    if ask.query("done"):  # nothing is wished any more
+    if ask.query("done"):  # the change is done, so nothing is left to preview
         names = []
-    if typed == _SAME:  # what was never judged has no points to keep
+    if typed == _SAME:  # a criterion that was never judged has no points to keep
         names = [name for name in names if asked.id in shown.teams[name].line.judged]
     wishes = [_wish(ask, shown, asked, name, typed=typed) for name in names]
     tried = {one.submission: one for one in open_book(ask).try_all(wishes)}

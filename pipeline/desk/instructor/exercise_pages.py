@@ -1,4 +1,4 @@
-"""The instructor's room: exercises with what is hidden in them, solutions, the catalogue."""
+"""The instructor's room: exercises with hidden effects, solutions, and the catalogue of effects."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -20,11 +20,11 @@ from pipeline.report.effects.catalogue import catalogue_data
 from pipeline.submission.load import NAME, outside
 from pipeline.words.math import to_text
 
-_SHOWN_ON = "throne-2dof"  # the smallest with a spring between two carts
+_SHOWN_ON = "throne-2dof"  # the smallest bench with a spring between two carts
 
 
 def show(ask: Ask) -> Response:
-    """Show the form as it is filled in, with a picture of every effect that is chosen."""
+    """Show the form as filled in, with a picture of every chosen effect."""
     sent = ask.request.query_params
     bench, found = _look_at_exercise(ask)
     pictures = [_write_picture_url(bench, one["hide"]) for one in found["effects"]]
@@ -52,7 +52,7 @@ def draw(ask: Ask) -> Response:
 
 
 def make(ask: Ask) -> Response:
-    """Have the exercise made, or a class of them."""
+    """Start the task that makes an exercise, or one for each team of a class."""
     bench, found = _look_at_exercise(ask)
     if found["wrong"]:
         raise ConfigError(found["wrong"])
@@ -75,13 +75,13 @@ def make(ask: Ask) -> Response:
 
 
 def show_made(ask: Ask) -> Response:
-    """Show how far an exercise is; once it is made, what was made."""
+    """Show the progress of an exercise, or the exercise when it is finished."""
     out = _read_folder(ask)
     job = ask.desk.jobs.of(out)
     if job is None or job.asked[0] != "make_exercises":
         raise HTTPException(404, "no exercise was made there")
     given = job.asked[1]
-    # Named as the job names them; one that was stopped has made the first few.
+    # Named as the job names them; a stopped job has made only the first ones.
     folders = [out] if len(given["seeds"]) == 1 else sorted(out.glob("*/"))
     made = [
         (folder, seed)
@@ -106,14 +106,14 @@ def show_made(ask: Ask) -> Response:
 
 
 def stop(ask: Ask) -> Response:
-    """Stop the making."""
+    """Stop making exercises."""
     out = _read_folder(ask)
     ask.stop(out)
     return RedirectResponse(f"/exercises/made?{urlencode({'out': out})}", status_code=303)
 
 
 def show_solution(ask: Ask) -> Response:
-    """Show the reference of a folder, or how far it is."""
+    """Show the solution of a folder, or the progress of making it."""
     folder = ask.folder()
     return ask.page(
         "solution",
@@ -123,7 +123,7 @@ def show_solution(ask: Ask) -> Response:
 
 
 def show_catalogue(ask: Ask) -> Response:
-    """Show what a bench may do beyond the linear chain."""
+    """Show the catalogue of effects."""
     bench = {"preset": _SHOWN_ON}
     entries = [
         entry
@@ -137,13 +137,13 @@ def show_catalogue(ask: Ask) -> Response:
 
 
 def _free_folder(root: Path) -> Path:
-    """Return a folder for an exercise that is not there yet."""
+    """Return the path of a new folder for an exercise."""
     names = ("exercise", *(f"exercise-{number}" for number in range(2, 1_000)))
     return next(root / name for name in names if not (root / name).exists())
 
 
 def _look_at_exercise(ask: Ask) -> tuple[dict[str, str], dict[str, Any]]:
-    """Return the bench of a form, and what its worker says of it and of the effects."""
+    """Return the bench of the form, and what the worker process finds about it and its effects."""
     bench = _read_bench(ask)
     known = {effect.key: effect for effect in CATALOGUE}
     chosen = [

@@ -1,4 +1,4 @@
-"""The rubric editor: the numbers as a form beside the text; what is wrong is not saved."""
+"""The rubric editor: a form for the numbers next to the text; an invalid rubric is not saved."""
 
 from pathlib import Path
 from urllib.parse import urlencode
@@ -24,11 +24,14 @@ from pipeline.output import write_file
 from pipeline.resources import RUBRICS
 from pipeline.submission.edit import text_digest
 
-_NEW = "new"  # what a form has seen of a file that is not there
+_NEW = "new"  # what a form states as the version of a file that does not exist yet
 
 
 def show(ask: Ask) -> Response:
-    """Show a rubric: a file, or a shipped one to begin with; or which there are."""
+    """Show a rubric in the editor, or the list of rubrics if none is named.
+
+    A file that does not exist begins with a shipped rubric, or empty.
+    """
     start = ask.text("start")
     if not start and not ask.text("file"):
         return ask.page(
@@ -47,12 +50,12 @@ def show(ask: Ask) -> Response:
 
 
 def check(ask: Ask) -> Response:
-    """Show what is wrong with what is typed; nothing is written."""
+    """Show what is wrong with the typed rubric; nothing is saved."""
     return show_editor(ask, read_rubric_path(ask), read_typed(ask.form), seen=ask.text("seen"))
 
 
 def save(ask: Ask) -> Response:
-    """Write a rubric that is valid over the file that was shown, and over no other."""
+    """Save a valid rubric, but only over the version of the file that was shown."""
     path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
     now = rubric_source(path) if path.exists() else None
     if seen != (_NEW if now is None else text_digest(now)):
@@ -73,7 +76,13 @@ def show_editor(
     now: str | None = None,
     status: int = 200,
 ) -> Response:
-    """Show the editor; where the file was changed meanwhile, with what it is `now`."""
+    """Show the editor.
+
+    Parameters
+    ----------
+    seen : version of the file on which the typed text is based.
+    now : current text of the file, if somebody has changed it since.
+    """
     saved = "saved" in ask.request.query_params
     return ask.page(
         "rubric",
@@ -95,12 +104,12 @@ def show_editor(
 
 
 def _classes_of(ask: Ask, path: Path) -> list[tuple[int, str, dict[str, str]]]:
-    """Return the open classes that a rubric's file is for, with what was graded again last."""
+    """Return the open classes graded by a rubric file, with the options of their last regrading."""
     found = []
     for n, place in enumerate(ask.user.gradebooks):
         try:
             assignment = ask.desk.books.book(place).assignment
-        except ConfigError:  # nothing is graded there yet, or it is gone
+        except ConfigError:  # nothing is graded there yet, or the gradebook is gone
             continue
         if assignment == path.stem and isinstance(place, Path):
             found.append((n, name_place(place), ask.desk.books.asked.get(place, {})))
@@ -108,11 +117,11 @@ def _classes_of(ask: Ask, path: Path) -> list[tuple[int, str, dict[str, str]]]:
 
 
 def read_rubric_path(ask: Ask) -> Path:
-    """Return the file that is named; where a page names none, one to begin with.
+    """Return the path of the rubric that the request names, or a free one for a new rubric.
 
     Raises
     ------
-    ConfigError : it is no TOML file of a folder that is there, or one that they may not enter.
+    ConfigError : it is not a TOML file in an existing folder that this person may use.
     """
     typed = ask.text("file")
     if not typed and ask.request.method == "GET":

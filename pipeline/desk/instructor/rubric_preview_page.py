@@ -1,4 +1,4 @@
-"""The preview page: a graded class under a rubric that is not saved yet."""
+"""The preview page: the points of a graded class under a rubric that is not saved yet."""
 
 import re
 from typing import Any
@@ -17,12 +17,12 @@ from pipeline.report.figures.style import drawing
 from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.report.render.html import render_drawing
 
-_BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # of an address: "0.2.5.1"
-_ROWS = 30  # that are not folded
+_BARS = re.compile(r"[0-9]{1,5}(\.[0-9]{1,5}){1,49}")  # the bars in an address: "0.2.5.1"
+_ROWS = 30  # rows shown at once; the others are folded
 
 
 def preview(ask: Ask) -> Response:
-    """Show what is typed on a class; nothing is written."""
+    """Show the points of a class under the typed rubric; nothing is saved."""
     path, typed, seen = read_rubric_path(ask), read_typed(ask.form), ask.text("seen")
     if typed.rubric is None:
         return show_editor(ask, path, typed, seen=seen, status=422)
@@ -55,7 +55,7 @@ def preview(ask: Ask) -> Response:
 
 
 def draw_preview(ask: Ask) -> Response:
-    """Draw two distributions, of which the address has the bars."""
+    """Draw two distributions, whose bars are in the address."""
     before, after = (_read_bars(ask.query(key)) for key in ("before", "after"))
     if len(before) != len(after):
         raise HTTPException(404, "there is no such drawing")
@@ -82,7 +82,7 @@ def _find_class(ask: Ask) -> tuple[int, Place]:
 
 
 def _named(ask: Ask, place: Place, teams: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the changes under the names that the class is shown by, the largest first."""
+    """Return the changes with the names that the class shows, the largest change first."""
     names = ask.desk.books.of(place).names
     shown = [
         team

@@ -1,4 +1,4 @@
-"""The rubrics that one may begin with: the shipped ones, and those that lie in a folder."""
+"""The rubrics to start from: the shipped ones, and those in the instructor's folders."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,15 +11,20 @@ from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import parse_rubric, rubric_source
 from pipeline.resources import RUBRICS
 
-_MOST = 40  # files that are listed
-_LOOKED_AT = 2_000  # TOML files of a folder
+_MOST = 40  # files listed
+_LOOKED_AT = 2_000  # TOML files of a folder that are checked
 _MARK = "[[criteria]]"
-_START = 200_000  # characters in which that must stand
+_START = 200_000  # characters of a file in which a key of rubrics must occur
 
 
 @dataclass(frozen=True, kw_only=True)
 class ShelvedRubric:
-    """A rubric to begin with or to open; `rubric` None: there is a mistake in it."""
+    """A rubric in the list.
+
+    Attributes
+    ----------
+    rubric : None if the file has mistakes.
+    """
 
     name: str
     path: Path
@@ -38,7 +43,7 @@ def shipped_rubrics() -> list[ShelvedRubric]:
 
 
 def own_rubrics(user: User) -> list[ShelvedRubric]:
-    """Return the rubrics that lie in a user's workshop, or where an owner works."""
+    """Return the rubrics in a user's workshop; for the owner, those where they work."""
     found: dict[Path, ShelvedRubric] = {}
     for root in _roots(user):
         for path in _toml_files(root):
@@ -49,13 +54,13 @@ def own_rubrics(user: User) -> list[ShelvedRubric]:
 
 
 def free_name(folder: Path) -> str:
-    """Return a name that no file of a folder has: `rubric.toml`, `rubric-2.toml`, …"""
+    """Return a file name that is still free in a folder: `rubric.toml`, `rubric-2.toml`, …"""
     names = ("rubric.toml", *(f"rubric-{n}.toml" for n in range(2, 1000)))
     return next((name for name in names if not (folder / name).exists()), "rubric.toml")
 
 
 def work_folder(user: User) -> Path:
-    """Return the folder in which a rubric without one is made."""
+    """Return the folder for a new rubric."""
     return user.workshop or find_root()
 
 
@@ -67,7 +72,7 @@ def _roots(user: User) -> Sequence[Path]:
 
 
 def _toml_files(root: Path) -> Iterator[Path]:
-    """Yield the TOML files of a folder and of those directly in it."""
+    """Yield the TOML files of a folder and of its direct subfolders."""
     for pattern in ("*.toml", "*/*.toml"):
         try:
             found = sorted(root.glob(pattern))[:_LOOKED_AT]
@@ -83,7 +88,7 @@ def _toml_files(root: Path) -> Iterator[Path]:
 
 
 def _shelved(path: Path, name: str) -> ShelvedRubric | None:
-    """Return a file as a rubric; None if it is not valid."""
+    """Return a file as an entry of the list; None if it is not a rubric."""
     try:
         text = rubric_source(path)
     except ConfigError:

@@ -1,4 +1,4 @@
-"""A rubric as it comes back from the page: its text, with the numbers of the form put in."""
+"""A rubric that a person typed: its text, with the numbers of the form inserted."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -17,12 +17,12 @@ from pipeline.grading.rubric_form import (
     with_values,
 )
 
-_AROUND = 2  # lines shown before and after one that is wrong
+_AROUND = 2  # lines shown before and after a wrong one
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mistake:
-    """What is wrong with a line of a rubric; line 0 is all of it."""
+    """What is wrong with a line of a rubric; line 0 means the whole file."""
 
     line: int
     what: str
@@ -30,14 +30,14 @@ class Mistake:
 
 @dataclass(frozen=True, kw_only=True)
 class TypedRubric:
-    """The typed rubric.
+    """A rubric as typed in the editor.
 
     Attributes
     ----------
-    text : as it would be saved, with the numbers of the form in it.
-    edited : as the editor shows it: without those numbers where they cannot be put in.
-    rubric : None where something is wrong.
-    form : the numbers of the edited text; None where that is wrong itself.
+    text : as it would be saved, with the numbers of the form inserted.
+    edited : as the editor shows it; without these numbers if they cannot be inserted.
+    rubric : None if something is wrong.
+    form : the numbers of the edited text; None if that text is wrong itself.
     typed : by name, the numbers of the form that are not in the edited text.
     wrong : by name, what is wrong with a number of the form.
     """
@@ -52,14 +52,17 @@ class TypedRubric:
 
     @property
     def shown(self) -> str:
-        """The numbers that the page shows, by which it tells later which of them were changed."""
+        """The numbers that the page shows, as JSON.
+
+        With them the next request finds the changed ones.
+        """
         if self.form is None:
             return json.dumps(dict.fromkeys(self.typed, ""))
         return json.dumps({field.name: field.value for field in self.form.fields()})
 
     @property
     def excerpts(self) -> list[list[tuple[int, str, list[str]]]]:
-        """The lines around each mistake: number, text, what is wrong with it."""
+        """The lines around each mistake: number, text, and what is wrong."""
         lines = self.text.split("\n")
         near = {
             n
@@ -77,13 +80,19 @@ class TypedRubric:
 
 
 def read_typed(sent: FormData) -> TypedRubric:
-    """Return what a page of the editor sent."""
+    """Return the rubric that the editor's page sent."""
     edited = _read_text(sent)
     return typed_rubric(edited, _changed(sent))
 
 
 def typed_rubric(edited: str, typed: Mapping[str, str]) -> TypedRubric:
-    """Return the text of a rubric with numbers of the form put in, as far as that can be done."""
+    """Return a rubric from its text and from changed numbers, which are inserted if possible.
+
+    Parameters
+    ----------
+    edited : the text.
+    typed : by name, the changed numbers of the form.
+    """
     rubric, mistakes = _parsed(edited)
     if rubric is None:
         return TypedRubric(text=edited, edited=edited, rubric=None, mistakes=mistakes, form=None,
@@ -117,7 +126,7 @@ def _parsed(text: str) -> tuple[Rubric | None, list[Mistake]]:
 
 
 def _by_field(text: str, mistakes: Sequence[Mistake], form: RubricForm) -> dict[str, str]:
-    """Return where to look, by the name of each field whose line is wrong."""
+    """Return "see line N" for each field whose line is wrong, by name."""
     at = {one.line for one in mistakes}
     lines = {path: line for line, path in key_lines(text) if line in at}
     known = {field.name: lines.get(field.key) for field in form.fields()}
@@ -125,7 +134,7 @@ def _by_field(text: str, mistakes: Sequence[Mistake], form: RubricForm) -> dict[
 
 
 def _changed(sent: FormData) -> dict[str, str]:
-    """Return the numbers of the form that are not as the page showed them."""
+    """Return the numbers of the form that differ from those the page showed, by name."""
     try:
         shown = json.loads(str(sent.get("shown") or "{}"))
     except ValueError:
@@ -139,7 +148,7 @@ def _changed(sent: FormData) -> dict[str, str]:
 
 
 def _read_text(sent: FormData) -> str:
-    """Return the text as a file has it: forms end lines in their own way."""
+    """Return the text with line ends as in a file, because forms send others."""
     text = sent.get("text")
     plain = text.replace("\r\n", "\n") if isinstance(text, str) else ""
     return plain.rstrip() + "\n"

@@ -1,4 +1,4 @@
-"""The check in the student's room: which numbers disagree, then where to look, never the value."""
+"""The check in the student's room: which numbers disagree and where to look, never a value."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -20,10 +20,11 @@ from pipeline.submission import Submission
 
 
 def show(ask: Ask) -> Response:
-    """Show the last answer, and what can be asked next."""
+    """Show the last answer, and what the student can ask next."""
     folder = ask.folder()
-    # Before the answers are read: a check that ends meanwhile is shown as under way, and the page
-    # then asks again. The other way round it would show the answers from before it.
+    # The job is read before the answers. If a check ends in between, the page shows it as running
+    # and asks again. The other way round, the page would show it as ended, but with the earlier
+    # answers.
     job = ask.desk.jobs.of(folder)
     busy = job is not None and not job.over
     submission, problems = load_if_sound(folder)
@@ -52,7 +53,7 @@ def show(ask: Ask) -> Response:
 
 
 def begin(ask: Ask) -> Response:
-    """Begin a check: of all numbers, or where to look for one."""
+    """Start a check of all numbers, or ask where to look for one number."""
     number, rubric = ask.text("number"), ask.user.rubric
     ask.start(
         "check_numbers",
@@ -66,7 +67,7 @@ def begin(ask: Ask) -> Response:
 def _describe_rows(
     current: CheckAnswer, answers: Sequence[CheckAnswer], submission: Submission
 ) -> list[dict[str, Any]]:
-    """Return a row for each number that disagrees, with its hint if one was given."""
+    """Return a row for each number that disagrees, with its hint if there is one."""
     told = {
         hint.number: hint_words(hint)
         for answer in answers
@@ -85,7 +86,7 @@ def _describe_rows(
 
 
 def _find_typed(number: str, submission: Submission) -> str:
-    """Return a number of the tables as it was typed; "" of others, which are many."""
+    """Return a number as typed; "" for numbers outside the tables, because these are many."""
     table, _, name = number.partition(".")
     typed = submission.typed.get(table, {}).get(name)
     return "" if typed is None else str(typed)

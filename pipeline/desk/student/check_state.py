@@ -1,4 +1,4 @@
-"""How the check of one's own numbers stands."""
+"""The state of the check of a student's own numbers."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ def tell_state(folder: Path) -> Stands:
 
 
 def load_if_sound(folder: Path) -> tuple[Submission | None, list[str]]:
-    """Return the submission, None with what is wrong with it where it is not valid."""
+    """Return the submission, or None with what is wrong with it."""
     try:
         return load_submission(folder), []
     except SubmissionError as error:

@@ -1,4 +1,4 @@
-"""Show doubts of the program as questions next to their fields, answered by one click."""
+"""Show doubts about the set-up as questions next to their fields, answered by one click."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -19,13 +19,13 @@ def ask_doubts(
     doubts: Mapping[str, Any],
     told: Mapping[str, Any],
 ) -> tuple[Field, ...]:
-    """Return the fields of the set-up, each with its doubt and possible answers.
+    """Return the fields of the set-up; each doubtful one has a question and possible answers.
 
     Parameters
     ----------
-    fractions : the files in which positions are no whole numbers.
-    doubts : what stands marked in the file; see `list_doubts` of the desk's tasks.
-    told : what a report of the files as they are now assumed and found contradicted.
+    fractions : files whose positions are not whole numbers.
+    doubts : what `submission.toml` marks as unsure; see `tasks.list_doubts`.
+    told : assumptions and contradictions of the current report.
     """
     return tuple(
         replace(field, asked=asked, answers=answers) if asked else field
@@ -59,7 +59,12 @@ def _name(one: Mapping[str, str], said: str) -> str:
 
 
 def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:
-    """Return every way in which the springs that nothing tells may be there (numbers from 1)."""
+    """Return an answer for every likely set of the springs that the data do not determine.
+
+    Parameters
+    ----------
+    unknown : numbers of these springs, from 1.
+    """
     if not unknown:
         return (Answer(label="The ticks are right", value=field.value),)
     places = [number - 1 for number in unknown]
@@ -84,7 +89,7 @@ def _list_springs(field: Field, unknown: Sequence[int]) -> tuple[Answer, ...]:
 
 
 def _contradict(field: Field, wrong: Sequence[Mapping[str, Any]]) -> tuple[Answer, ...]:
-    """Return how to take back what the data contradict."""
+    """Return answers that change what the data contradict."""
     if field.path == "system.springs":
         gone = {field.names.index(one["about"]): False for one in wrong if one["value"] is True
                 and one["about"] in field.names}  # fmt: skip
@@ -95,7 +100,7 @@ def _contradict(field: Field, wrong: Sequence[Mapping[str, Any]]) -> tuple[Answe
 
 
 def _confirm(field: Field, taken: Sequence[Mapping[str, Any]]) -> tuple[Answer, ...]:
-    """Return how to state what was taken."""
+    """Return answers that state what the report assumed."""
     if field.path == "system.springs":
         return (Answer(label="All are present", value=field.value),)
     if field.path == "system.input.sign":
@@ -112,17 +117,18 @@ def _turn(sign: float) -> Answer:
 
 
 def _with(field: Field, flags: Mapping[int, bool]) -> str:
-    """Return the flags of a field, as they are typed, with some of them set."""
+    """Return the value of a field of flags, with some flags changed."""
     every = [flags.get(place, on) for place, on in enumerate(field.on)]
     return " ".join("true" if on else "false" for on in every)
 
 
 def ask_held(field: Field, hardly: Sequence[int], carts: Sequence[int]) -> Field:
-    """Return the field of free carts with the question whether some were held.
+    """Return the field of free carts with the question whether some carts were held.
 
     Parameters
     ----------
-    hardly : the carts that hardly move; `carts` : those that are taken as free.
+    hardly : the carts that hardly move.
+    carts : all carts that count as free.
     """
     others = [cart for cart in carts if cart not in hardly]
     which = listing([str(cart) for cart in hardly])

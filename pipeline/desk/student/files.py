@@ -1,4 +1,4 @@
-"""What is uploaded, into `data/`: by the limits of a hand-in, over no other file."""
+"""Store uploaded files in `data/`, within the limits of a hand-in; never overwrite another file."""
 
 import re
 import shutil
@@ -28,7 +28,8 @@ from pipeline.submission.load import (
 )
 from pipeline.submission.toml_file import decoded, parse_toml
 
-# Texts that a packed submission brings, and their most bytes; what is there and sound stays.
+# Text files that an uploaded zip may contain, and their largest size in bytes. An existing valid
+# one is not overwritten.
 _TEXTS = {NAME: MAX_TOML_BYTES, "notes.md": MAX_NOTES_BYTES}
 _ASIDE = "set-aside"  # folder for recordings that are not part of the submission
 
@@ -36,7 +37,10 @@ _ASIDE = "set-aside"  # folder for recordings that are not part of the submissio
 def take_uploads(
     sent: Iterable[tuple[str, BinaryIO]], folder: Path, *, workers: WorkerPool
 ) -> list[Said]:
-    """Store uploaded files, and what is in archives; return what a person would not expect."""
+    """Store uploaded files and the content of zip files.
+
+    Return messages about unexpected results.
+    """
     said: list[Said | None] = []
     with scratch_folder() as scratch:
         files: list[tuple[str, BinaryIO | Path]] = []
@@ -77,9 +81,10 @@ def _unpack(content: BinaryIO, scratch: Path, *, workers: WorkerPool) -> list[tu
 
 
 class _Room:
-    """The remaining room within the limits of a submission, counted once per upload.
+    """The files and bytes that a submission may still get, counted once per upload.
 
-    What was set aside or made by a command lies in the same folder and is no part of a hand-in.
+    Files that were set aside, or that a command made, are not part of the submission and do not
+    count.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -89,7 +94,7 @@ class _Room:
         self._files, self._bytes = len(sizes), sum(sizes)
 
     def check(self, raw: bytes) -> None:
-        """Refuse what there is no room for; what is not refused is stored."""
+        """Refuse a file for which there is no room; count one that is not refused."""
         if len(raw) > MAX_DATA_BYTES:
             raise SubmissionError(f"larger than {MAX_DATA_BYTES:,} bytes")
         if self._files >= HAND_IN.members or self._bytes + len(raw) > HAND_IN.total:
@@ -100,7 +105,7 @@ class _Room:
 
 
 def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
-    """Store a file, under another name where its own is of something else; say if so."""
+    """Store a file, under another name if its own is taken or not valid; return a message if so."""
     last = PurePosixPath(given.replace("\\", "/")).name
     if last in _TEXTS:
         _check_text(raw, last)
@@ -111,10 +116,11 @@ def _take(given: str, raw: bytes, folder: Path, *, room: _Room) -> Said | None:
         return None
     if PurePosixPath(last).suffix.casefold() not in ENDINGS:
         raise SubmissionError(f"the name of a recording ends in {', '.join(ENDINGS)}")
-    seen = "".join(c if c.isprintable() else "-" for c in last)  # blanks of all sorts, marks
-    # Bytes, whatever letters it has: systems take 255, some fewer.
+    # Replace invisible marks and unusual spaces.
+    seen = "".join(c if c.isprintable() else "-" for c in last)
+    # Bytes count, not characters: most systems allow 255, some fewer.
     name = seen.encode(errors="ignore")[-120:].decode(errors="ignore")
-    # Characters that some systems refuse, and names that Windows reserves.
+    # Replace characters that some systems refuse, and names that Windows reserves.
     name = re.sub(r'[<>:"/\\|?*\x00-\x1f\x7f]|^[. ~]+|[. ]+$', "-", name)
     if re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name):
         name = f"data-{name}"
@@ -140,18 +146,20 @@ def _holds(path: Path, raw: bytes) -> bool:
 
 
 def _list_names(path: Path) -> Iterator[Path]:
-    """Yield a path, then those beside it that it may have instead."""
+    """Yield a path, then further ones with a number added to the name."""
     yield path
     for number in count(2):
         yield path.with_name(f"{path.stem}-{number}{path.suffix}")
 
 
 def put_aside(file: str, folder: Path) -> str:
-    """Move a recording out of `data/`, over nothing; say where it is. The caller has the turn.
+    """Move a recording from `data/` to the folder for other files; return a message.
+
+    No file is overwritten. The caller must hold the lock of the folder.
 
     Raises
     ------
-    SubmissionError : it is not there any more.
+    SubmissionError : the recording does not exist any more.
     """
     aside = own_folder(folder, _ASIDE)
     aside.mkdir(exist_ok=True)
@@ -165,14 +173,14 @@ def put_aside(file: str, folder: Path) -> str:
 
 
 def _check_text(raw: bytes, name: str) -> None:
-    """Refuse what nothing could be read from."""
+    """Refuse a text file that cannot be read."""
     text = decoded(raw, where=name, limit=_TEXTS[name], error=SubmissionError)
     if name == NAME:
         parse_toml(text, where=name, error=SubmissionError)
 
 
 def _is_sound(folder: Path, name: str) -> bool:
-    """Return whether there is such a text that can be read."""
+    """Return whether the folder has a text file of this name that can be read."""
     if outside(folder, name) is not None:
         return False
     try:

@@ -1,8 +1,8 @@
-"""The form of `submission.toml`: its keys as fields, and what was typed back into the file.
+"""The form of `submission.toml`: show its keys as fields, and write typed values back.
 
-Typed values go into the file unchanged, with all digits. The submission's own check then reports
-mistakes, so nothing is checked twice. The submission's model supplies the help and type of each
-field.
+Typed values are written into the file unchanged, with all their digits. The usual check of a
+submission then reports mistakes, so nothing is checked twice. The model of a submission also
+supplies help and type of each field.
 """
 
 import re
@@ -25,8 +25,8 @@ from pipeline.submission.load import InvalidSubmission, list_experiments, spring
 from pipeline.submission.models import MOST_CARTS
 from pipeline.words.text import symbol_text
 
-# The groups of the form: key, title, keys of the file. Between the last two stand the parameters,
-# whose names depend on the number of carts.
+# The groups of the form: key, title, keys of the file. Before the last group comes one for the
+# parameters, whose names depend on the number of carts.
 _GROUPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ("who", "Who and what", ("title", "section", "authors")),
     (
@@ -61,7 +61,7 @@ _OF_CONTROLLER = {
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """A way to answer what is asked about a field: the words of a button, and what it types."""
+    """A possible answer to a question about a field: the text of its button, and the new value."""
 
     label: str
     value: str
@@ -69,16 +69,21 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Field:
-    """One key of the file; `value` is the stored or typed one, `wrong` its problem.
+    """One key of the file.
 
     Attributes
     ----------
-    kind : text, number, numbers, rows (of numbers, a line each), flags, authors, columns, or words
-        (a text of several lines).
-    choices : to choose from; "": left out.
-    asked : what speaks against the value, though it can be used; `answers` to it.
+    path : of the key in the file.
+    kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, or words
+        (a
+        text of several lines).
+    choices : the possible values; "" means that the key is left out.
     names : of the flags.
-    symbol : of the parameter whose value it is.
+    value : as stored or typed.
+    wrong : what is wrong with the value.
+    asked : question about a value that is doubtful but possible.
+    answers : to this question.
+    symbol : of the parameter, if the value is one.
     """
 
     path: str
@@ -95,13 +100,19 @@ class Field:
 
     @property
     def on(self) -> list[bool]:
-        """The flags."""
+        """The flags as booleans."""
         return [word == "true" for word in self.value.split()]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Group:
-    """Fields that belong together; `summary` says them in a line, `missing` what they lack."""
+    """Fields that belong together.
+
+    Attributes
+    ----------
+    summary : the fields in one line.
+    missing : what still has to be filled in.
+    """
 
     key: str
     title: str
@@ -111,12 +122,12 @@ class Group:
 
     @property
     def open(self) -> bool:
-        """Whether to show it at once: something in it needs a person."""
+        """Whether the group is shown unfolded, because something in it needs a person."""
         return bool(self.missing) or any(field.wrong for field in self.fields)
 
 
 def read_document(text: str) -> dict[str, Any]:
-    """Return the tables of a file as they were typed: numbers as text; {} where it is no TOML."""
+    """Return the tables of a file with numbers as typed text; {} if it is not valid TOML."""
     try:
         return tomllib.loads(text, parse_float=str)  # type: ignore[arg-type]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
@@ -153,7 +164,7 @@ def fill_form(document: Mapping[str, Any]) -> list[Group]:
 def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...]:
     """Return the fields of one experiment, filled in from its table.
 
-    They are those of its kind and its controller; others only where the file states them.
+    Only fields for its kind and controller are returned, and others that the table contains.
     """
     table = f"experiments.{index}"
     kind = _find(document, f"{table}.kind")
@@ -167,7 +178,12 @@ def fill_experiment(document: Mapping[str, Any], index: int) -> tuple[Field, ...
 
 
 def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[Field]:
-    """Return the signs of the input, by experiment, that its table does not state, as typed."""
+    """Return the fields of input signs that tables do not state, filled in.
+
+    Parameters
+    ----------
+    signs : by experiment, the sign.
+    """
     return [
         replace(_describe_field(path), value=f"{signs[table['id']]:d}")
         for index, table in enumerate(list_experiments(document))
@@ -177,18 +193,19 @@ def sign_fields(document: Mapping[str, Any], signs: Mapping[str, int]) -> list[F
 
 
 def is_of_loop(field: Field) -> bool:
-    """Return whether a field of an experiment says what controller ran."""
+    """Return whether a field of an experiment describes the controller that ran."""
     return field.path.split(".", 2)[2] in _OF_LOOP
 
 
 def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) -> list[Field]:
-    """Return the fields whose value was changed or answered, with what was typed.
+    """Return the fields that were changed or answered, with their new values.
 
     Parameters
     ----------
-    form : by path, what was typed; a field that is not in it was not shown.
-    values : likewise, of flags: the numbers of those that are on; and of `answer`: the path of a
-        field that was asked about, "=" and the value that was chosen, perhaps the old one.
+    form : typed text by path; a field without an entry was not shown.
+    values : function that returns all values of a form field. For a field of flags they are the
+        numbers
+        of those that are on. For `answer` they are "path=value", one for each question answered.
     """
     changed = []
     answered = dict(one.partition("=")[::2] for one in values("answer"))
@@ -211,7 +228,7 @@ def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) 
 def mark_errors(
     fields: Sequence[Field], changed: Sequence[Field], error: SubmissionError | None
 ) -> tuple[tuple[Field, ...], list[str]]:
-    """Return the fields as typed, each with what is wrong with it, and what belongs to none."""
+    """Return the fields with typed values and problems, and the problems that have no field."""
     now = {field.path: field for field in changed}
     shown = [now.get(field.path, field) for field in fields]
     left: list[str] = []
@@ -237,7 +254,7 @@ def _schema() -> dict[str, Any]:
 
 
 def _variants(node: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the JSON Schemas that a value may be of, without that of nothing."""
+    """Return the JSON Schemas of the types that a value may have, without null."""
     for key in ("anyOf", "oneOf"):
         if key in node:
             return [found for one in node[key] for found in _variants(one)]
@@ -247,7 +264,7 @@ def _variants(node: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def _describe_field(path: str) -> Field:
-    """Return the empty field of a key, by what the submission's model says of it."""
+    """Return the empty field of a key, as described by the submission's model."""
     tables, keys, required = [_schema()], [], True
     for part in path.split("."):
         tables = [variant for key in keys for variant in _variants(key)] or tables
@@ -268,7 +285,7 @@ def _describe_field(path: str) -> Field:
 
 
 def _find_kind(value: Mapping[str, Any]) -> str:
-    """Return how a value is typed; see `Field`."""
+    """Return the kind of a field; see `Field`."""
     kind = value["type"]
     if kind == "array":
         inner = _variants(value.get("items") or value["prefixItems"][0])[0]["type"]
@@ -279,7 +296,12 @@ def _find_kind(value: Mapping[str, Any]) -> str:
 
 
 def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) -> tuple[str, ...]:
-    """Return what can be chosen, () where anything can be typed; that which is `first` first."""
+    """Return the possible values of a field, or () if any text can be typed.
+
+    Parameters
+    ----------
+    first : values to list first.
+    """
     every = [
         choice
         for value in values
@@ -295,7 +317,7 @@ def _list_choices(values: Sequence[Mapping[str, Any]], *, first: Sequence[Any]) 
 
 
 def count_carts(document: Mapping[str, Any]) -> int:
-    """Return how many carts a file says there are; 1 where it says nothing that can be."""
+    """Return the number of carts in a file; 1 if the file states no valid number."""
     carts = _find(document, "system.carts")
     return carts if isinstance(carts, int) and 1 <= carts <= MOST_CARTS else 1
 
@@ -323,7 +345,7 @@ def _find(document: Any, path: str) -> Any:
 
 
 def read_value(document: Mapping[str, Any], field: Field) -> str:
-    """Return the value of a field in some state of the file, as it is typed."""
+    """Return the value of a field in a document, as a person would type it."""
     value = _find(document, field.path)
     if field.kind == "flags":
         every = [True] * (count_carts(document) + 1)
@@ -350,7 +372,7 @@ def _write_value(value: Any) -> str:
         return ", ".join(map(_write_value, value))
     try:
         return str(value)
-    except ValueError:  # a whole number of thousands of digits, which only fits one typed in hex
+    except ValueError:  # a number with thousands of digits, which can only have been typed in hex
         return hex(value)
 
 
@@ -358,21 +380,22 @@ def _write_value(value: Any) -> str:
 
 
 def write_fields(document: tomlkit.TOMLDocument, changed: Iterable[Field]) -> None:
-    """Write what was typed into a document; an emptied field takes its key away."""
+    """Write typed values into a document; an empty field removes its key."""
     for field in changed:
         if field.path == "authors":
             _set_authors(document, field.value)
         else:
-            # Two keys stay without a value, because of their comments.
+            # These two keys stay without a value, because they have comments in a new file.
             empty = not field.value and field.path not in ("title", "section")
             _set(document, field.path.split("."), None if empty else _make_item(field))
             _settle(document, field.path)
-        if field.path == "system.carts":  # springs for another number of carts: all are there
+        # With another number of carts, the default is that all springs are present.
+        if field.path == "system.carts":
             _set(document, ["system", "springs"], None)
 
 
 def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
-    """Take the mark of a doubt from a key of `[system]`: who wrote the key has answered it."""
+    """Remove the mark of a doubt from a key of `[system]`, because a person has now set the key."""
     table, key, *_ = [*path.split("."), ""]
     item: Any = document.get("system", {}).get(key) if table == "system" else None
     if item is not None and item.trivia.comment.startswith(f"# {UNSURE}"):
@@ -380,7 +403,7 @@ def _settle(document: tomlkit.TOMLDocument, path: str) -> None:
 
 
 def clear_marks(document: tomlkit.TOMLDocument, index: int, doubts: Iterable[str]) -> None:
-    """Take the comments that mark these doubts from the table of an experiment."""
+    """Remove the comments that mark these doubts from the table of an experiment."""
     texts = {f"# {_mark(doubt)}" for doubt in doubts}
     body: Any = document.get("experiments")
     if isinstance(body, AoT) and index < len(body):
@@ -391,24 +414,24 @@ def clear_marks(document: tomlkit.TOMLDocument, index: int, doubts: Iterable[str
 
 
 def is_marked(doubt: str, marks: Sequence[str]) -> bool:
-    """Return whether a doubt is among those that stand marked in a table."""
+    """Return whether a table marks a doubt as unsure."""
     return _mark(doubt) in [UNSURE + mark for mark in marks]
 
 
 def _mark(doubt: str) -> str:
-    """Return the comment that marks a doubt, as it was written: cut where it is long."""
+    """Return the comment that marks a doubt, shortened as in the file."""
     return comment_text(UNSURE + doubt)
 
 
 def remove_experiment(document: tomlkit.TOMLDocument, index: int) -> None:
-    """Take the table of one experiment away; its file stays."""
+    """Remove the table of one experiment; its data file stays."""
     tables: Any = document["experiments"]
     if index < len(tables):
         del tables[index]
 
 
 def _make_item(field: Field) -> Any:
-    """Return what was typed as an item of the file."""
+    """Return a typed value as a TOML item."""
     match field.kind:
         case "number":
             return _make_number(field.value)
@@ -433,7 +456,10 @@ def _make_item(field: Field) -> Any:
 
 
 def _make_number(text: str) -> Any:
-    """Return a number with its typed digits; other text stays text, and is refused later."""
+    """Return a number with its digits as typed.
+
+    Other text stays text, which the check then refuses.
+    """
     if re.fullmatch(r"[-+]?(0|[1-9]\d*)(\.\d+)?([eE][-+]?\d+)?", text):
         return tomlkit.parse(f"x = {text}\n")["x"]
     return tomlkit.item(text)
@@ -448,7 +474,7 @@ def _make_numbers(text: str) -> Any:
 
 
 def _set(document: Any, parts: Sequence[str], item: Any) -> None:
-    """Put an item at its place, or take the key there away, and tables left empty with it."""
+    """Set the item at a path; None removes the key, and tables that become empty."""
     part, *rest = parts
     if isinstance(document, list):
         return _set(document[int(part)], rest, item)
@@ -470,7 +496,7 @@ def _set(document: Any, parts: Sequence[str], item: Any) -> None:
 
 
 def _set_authors(document: tomlkit.TOMLDocument, text: str) -> None:
-    """Write the people, one a line; of a table that stays only what was changed is."""
+    """Write the authors, one per line; a table that stays keeps everything that was not changed."""
     lines = [line.partition(",")[::2] for line in text.splitlines() if line.strip()]
     people = [(id_.strip(), name.strip()) for id_, name in lines]
     if not people:

@@ -1,4 +1,4 @@
-"""The zip that is handed in: what the submission names, and nothing else."""
+"""Make the zip to hand in: the files that the submission names, and nothing else."""
 
 import io
 import os
@@ -13,26 +13,31 @@ from pipeline.submission.load import NAME, outside
 
 _REPORT = "report/report.pdf"
 BESIDE = (NOTES, CHECKS, _REPORT)
-_MADE = ("report", "gap", "solution")  # folders of what is computed: no recording lies there
+_MADE = ("report", "gap", "solution")  # folders of computed results, which contain no recordings
 
 
 def pack(folder: Path, *, report: bool = True) -> bytes:
-    """Return the zip of a submission; `report`: with its report, if that is up to date.
+    """Return the zip of a submission.
+
+    Parameters
+    ----------
+    report : include the report if it is up to date.
 
     Raises
     ------
-    SubmissionError : it is not valid, or a file that it names is not there.
+    SubmissionError : the submission is not valid, or lacks a file that it names.
     """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name in list_held(folder, report=report):
-            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))  # same files, same bytes
+            # A fixed date, so that the same files give the same bytes.
+            info = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
             archive.writestr(info, (folder / name).read_bytes(), zipfile.ZIP_DEFLATED)
     return buffer.getvalue()
 
 
 def list_held(folder: Path, *, report: bool = True) -> list[str]:
-    """Return the files that the zip holds.
+    """Return the names of the files in the zip.
 
     Raises
     ------
@@ -44,13 +49,13 @@ def list_held(folder: Path, *, report: bool = True) -> list[str]:
 
 
 def list_beside(folder: Path, *, report: bool = True) -> list[str]:
-    """Return what goes with it: of `BESIDE`, what is there; no report of what was changed since."""
+    """Return the existing files of `BESIDE` for the zip, without a report that is out of date."""
     left_out = "" if report and find_state(folder) == "current" else _REPORT
     return [name for name in BESIDE if name != left_out and outside(folder, name) is None]
 
 
 def list_missing(folder: Path) -> list[str]:
-    """Return what keeps a submission from being handed in, each in a line."""
+    """Return what prevents a submission from being handed in, one reason each."""
     try:
         submission = load_submission(folder)
     except SubmissionError as error:
@@ -66,7 +71,7 @@ def list_missing(folder: Path) -> list[str]:
 
 
 def _is_made(folder: Path, name: str) -> bool:
-    """Whether a file is in a folder of computed results, by its name or by a link."""
+    """Return whether a file is in a folder of computed results, by its name or through a link."""
     root = folder.resolve()
     places = (Path(os.path.normpath(root / name)), (folder / name).resolve())
     return any(place.is_relative_to(root / made) for place in places for made in _MADE)

@@ -1,4 +1,4 @@
-"""A student's own feedback at the desk, and what they ask to have looked at again."""
+"""A student's own feedback at the desk, and their requests for a review."""
 
 from typing import Any
 
@@ -27,12 +27,12 @@ from pipeline.words.text import capital, rich
 
 
 def show(ask: Ask) -> Response:
-    """Show the points, then each criterion with what became of the requests."""
+    """Show the points, then each criterion with its requests."""
     return _show_page(ask)
 
 
 def send(ask: Ask) -> Response:
-    """Ask for another look at a criterion; a reason that is refused stays as typed."""
+    """Ask for a review of a criterion; a reason that is refused is shown again as typed."""
     own, criterion, why = _find_own(ask), ask.text("criterion"), ask.text("why")
     try:
         book = _open_book(ask)
@@ -45,7 +45,7 @@ def send(ask: Ask) -> Response:
 
 
 def show_whole(ask: Ask) -> Response:
-    """Show the page that the team reads, with its figures."""
+    """Show the complete feedback page of the team, with its figures."""
     own, found = _find_own(ask), _read(ask)
     if found is None:
         raise HTTPException(404, "your feedback is not published yet")
@@ -61,7 +61,7 @@ _UNREADABLE = "your grade cannot be read at the moment; tell your instructor"
 
 
 def _find_own(ask: Ask) -> OwnGrade:
-    """Return the grade of the address, if it is the user's own."""
+    """Return the grade of the address, if it belongs to the user."""
     number = ask.request.path_params["n"]
     if number >= len(ask.user.grades):
         raise HTTPException(404, "you have no access to anything here")
@@ -73,11 +73,13 @@ def _open_book(ask: Ask) -> RequestBook:
 
 
 def _read(ask: Ask) -> OwnFeedback | None:
-    """Return the feedback, None while it is not out.
+    """Return the feedback; None before it is released.
 
     Raises
     ------
-    ConfigError : it cannot be read; why is not for students, as it may name places of the server.
+    ConfigError : it cannot be read. The message gives no reason, because the reason may contain
+        paths of
+        the server.
     """
     own = _find_own(ask)
     try:
@@ -87,7 +89,7 @@ def _read(ask: Ask) -> OwnFeedback | None:
 
 
 def _hide_others(found: OwnFeedback, own: OwnGrade) -> Grade:
-    """Return the grade; that of an anonymous class names nobody else."""
+    """Return the grade; in an anonymous class it names no other submission."""
     grade = found.entry.grade
     return anonymise(grade, {own.submission: own.submission}) if found.rubric.anonymous else grade
 
@@ -123,11 +125,12 @@ def _show_page(
 def _describe_criteria(
     found: OwnFeedback, grade: Grade, *, refused: dict[str, tuple[str, str]], hidden: bool
 ) -> list[dict[str, Any]]:
-    """Return every criterion of the rubric, those that were never judged too.
+    """Return every criterion of the rubric, including those that were never judged.
 
     Parameters
     ----------
-    hidden : no number is shown that a student must find.
+    refused : by criterion, a reason as typed and why it was refused.
+    hidden : show no number that the student must find.
     """
     judged = {criterion.id: criterion for criterion in grade.criteria}
     lost = points_lost(grade, found.rubric)
@@ -164,7 +167,12 @@ def _describe_judged(own: Criterion | None) -> dict[str, Any]:
 
 
 def _show_why(asked: Asked, grade: Grade, found: OwnFeedback, *, hidden: bool) -> str:
-    """Return what decided a criterion; hidden: only what the remarks are called, and reasons."""
+    """Return the evidence for a criterion as HTML.
+
+    Parameters
+    ----------
+    hidden : show only the titles of flags, and reasons for points by hand.
+    """
     own = next((c for c in grade.criteria if c.id == asked.id), None)
     if own is None or not hidden:
         return show_evidence(own, asked.check, grade.units) if own else ""

@@ -1,4 +1,4 @@
-"""The plots to look through, in the student's room: made once, kept until a source changes."""
+"""The page with plots of all recordings, made again only if a source has changed."""
 
 from starlette.responses import RedirectResponse, Response
 
@@ -9,7 +9,7 @@ TASK = "make_plots"
 
 
 def show(ask: Ask) -> Response:
-    """Show the plots; where they are missing or out of date, the work on them or how to begin."""
+    """Show the plots; if they are missing or out of date, show the job or a button to start it."""
     if not _is_busy(ask) and plots_are_current(ask.folder()):
         return _lead_to(ask, f"{ask.here}{PLOTS}")
     job = ask.desk.jobs.of(ask.folder())
@@ -18,7 +18,7 @@ def show(ask: Ask) -> Response:
 
 
 def make(ask: Ask) -> Response:
-    """Have the plots made, where they are not there already."""
+    """Start the task that makes the plots, unless they are up to date."""
     if not _is_busy(ask) and not plots_are_current(ask.folder()):
         ask.start(TASK, title="The plots")
     return ask.back(f"{ask.here}compare")
@@ -30,7 +30,7 @@ def _is_busy(ask: Ask) -> bool:
 
 
 def _lead_to(ask: Ask, address: str) -> Response:
-    """Lead to a page of another frame: htmx, which fetches pages by itself, opens it whole."""
+    """Return an answer that opens an address in the whole window, also after a request by htmx."""
     if ask.request.headers.get("hx-request"):
         return ask.go(address)
     return RedirectResponse(address, status_code=303)

@@ -1,4 +1,4 @@
-"""The report in the student's room, on a page; and its questions, answered in `notes.md`."""
+"""The report in the student's room, and its questions, which are answered in `notes.md`."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ from pipeline.words.numbers import abridge
 
 
 def show(ask: Ask) -> Response:
-    """Show the report, which fills the window below the way."""
+    """Show the report in a window below the steps."""
     folder = ask.folder()
     return ask.page(
         "report",
@@ -35,7 +35,7 @@ def show_questions(ask: Ask) -> Response:
 
 
 def answer(ask: Ask) -> Response:
-    """Write the answer to a question into `notes.md`; what cannot be is shown as typed."""
+    """Write the answer to a question into `notes.md`; if it is refused, show it again as typed."""
     folder, id_, words = ask.folder(), ask.text("id"), ask.text("answer")
     try:
         with turn_in(folder):
@@ -64,7 +64,7 @@ def answer(ask: Ask) -> Response:
 
 
 def state_signs(ask: Ask) -> Response:
-    """Write into the tables of the runs that were turned which sign their input has."""
+    """Write the sign of the input into the tables of runs whose sign the report reversed."""
     signs = read_told(ask.folder())["turned"]
 
     def change(document: tomlkit.TOMLDocument) -> None:
@@ -88,7 +88,7 @@ def _show_questions(
 
     Parameters
     ----------
-    refused : by question, an answer as it was typed, and why it was not written.
+    refused : by question, an answer as typed and why it was refused.
     said : why a sign was not written.
     """
     folder, room = ask.folder(), look_around(ask)
@@ -120,7 +120,7 @@ def _show_questions(
 
 
 def _list_signs(room: Room) -> str:
-    """Return the signs that one click states, with their runs; "" if there are none to state."""
+    """Return the signs that one click writes, with their runs; "" if there are none to write."""
     document, signs = read_document(room.text), room.told["turned"]
     tables = list_experiments(document)
     open_: dict[str, list[str]] = {}

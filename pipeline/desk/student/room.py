@@ -1,4 +1,4 @@
-"""The student's room as its folder is now: what every page of it shows, and the way through it."""
+"""The data of the student's room: all that its pages show, and the steps to the hand-in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,13 +23,16 @@ from pipeline.submission.load import NAME, parse_submission
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """The content of the folder, with typed values in place of stored ones.
+    """The content of a submission's folder, with typed values instead of stored ones.
 
     Attributes
     ----------
-    text : of `submission.toml`, "" without one; `seen` identifies this state.
-    groups : the set-up, [] if it cannot be read.
+    text : of `submission.toml`; "" without the file.
+    rows : one for each recording.
+    groups : of the set-up; empty if the file cannot be read.
     wrong : problems of the file that belong to no field.
+    told : what the last report asked, assumed and found.
+    facts : what decides the state of the steps.
     """
 
     text: str
@@ -41,28 +44,29 @@ class Room:
 
     @property
     def seen(self) -> str:
-        """The digest of the text."""
+        """The digest of the text, which identifies this version."""
         return text_digest(self.text)
 
     @property
     def steps(self) -> tuple[Step, ...]:
-        """The way."""
+        """The steps from dropped files to the hand-in, with their states."""
         return find_steps(self.facts)
 
     @property
     def next(self) -> Step:
-        """The step to take next."""
+        """The step to do next."""
         return next_step(self.steps)
 
 
 def look_around(
     ask: Ask, *, changed: Sequence[Field] = (), error: SubmissionError | None = None
 ) -> Room:
-    """Return the room of the address; a form that it fills in can come back.
+    """Return the data of the room that the address names.
 
     Parameters
     ----------
-    changed : what was typed and could not be written; `error` : why.
+    changed : fields that could not be written, as typed.
+    error : why they could not be written.
     """
     folder, text = ask.folder(), ""
     try:
@@ -121,7 +125,7 @@ def _list_doubts(ask: Ask, folder: Path) -> Mapping[str, Any]:
 
 
 def _find_error(text: str, folder: Path) -> SubmissionError | None:
-    """Return what is wrong with the file as it stands."""
+    """Return what is wrong with the stored file, or None."""
     try:
         parse_submission(text, folder=folder)
     except SubmissionError as error:

@@ -1,4 +1,4 @@
-"""The recordings of a submission as rows, grouped by kind: each with what needs a person."""
+"""The recordings of a submission as rows, grouped by kind, with what needs a person."""
 
 import re
 from collections import Counter
@@ -22,7 +22,7 @@ from pipeline.submission.load import list_experiments, posix, stated_columns
 from pipeline.submission.models import MOST_EXPERIMENTS
 from pipeline.words.numbers import by_note
 
-# In the order in which a bench is worked through; what has no table stands first, to be seen.
+# In the order of work at a bench. Files without a table come first, so that they are seen.
 _KINDS = (
     ("", "Not understood"),
     ("decay", "Decays"),
@@ -33,19 +33,21 @@ _KINDS = (
     ("bode", "Tables of ratios"),
 )
 
-# What differs from file to file in remarks that say the same.
+# The numbers in which otherwise equal remarks differ.
 _MEASURED = re.compile(r"\d+(?:\.\d+)?(?= (?:ms|pieces)\b)")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """A data file, or a table whose file is not there.
+    """A data file, or a table whose file is missing.
 
     Attributes
     ----------
-    look : what the file is; see `look_at_file` of the desk's tasks.
-    index : of its table; None without one. `id` : of the experiment.
-    problems : why it needs a person; `remarks` : what is worth knowing.
+    look : what the file contains; see `tasks.look_at_file`.
+    index : of its table; None without one.
+    id : of the experiment.
+    problems : why it needs a person.
+    remarks : things worth knowing.
     """
 
     file: str
@@ -58,35 +60,35 @@ class Row:
 
     @property
     def kind(self) -> str:
-        """The kind of its table, "" without a known one."""
+        """The kind in its table; "" without a valid one."""
         kind = next((f.value for f in self.fields if f.path.endswith(".kind")), "")
         return kind if kind in dict(_KINDS) else ""
 
     @property
     def frequency(self) -> str:
-        """Of a dwell: as stated, else as found; Hz."""
+        """The frequency of a dwell in Hz: as stated, or else as found in the data."""
         stated = next((f.value for f in self.fields if f.path.endswith(".frequency")), "")
         found = self.look["frequency"]
         return stated or (f"{found:.3g}" if found and self.kind == "sine" else "")
 
     @property
     def of_loop(self) -> list[Field]:
-        """The fields that say what controller ran."""
+        """The fields that describe the controller."""
         return [field for field in self.fields if is_of_loop(field)]
 
     @property
     def lacks_controller(self) -> bool:
-        """Whether it is a closed loop, and what controller ran is not said."""
+        """Whether it is a closed loop without a stated controller."""
         return _lacks_controller(self.fields)
 
     @property
     def is_recording(self) -> bool:
-        """Whether the file is a recording; an essay or an empty file is not."""
+        """Whether the file is a recording, not for example a text or an empty file."""
         return self.index is not None or bool(self.look["format"])
 
     @property
     def needs_a_person(self) -> bool:
-        """Whether somebody has to look at it."""
+        """Whether a person must look at it."""
         return bool(self.problems) or any(f.wrong or f.asked for f in self.fields)
 
 
@@ -100,12 +102,12 @@ class FileGroup:
 
     @property
     def to_look_at(self) -> int:
-        """How many need a person."""
+        """How many rows need a person."""
         return sum(row.needs_a_person for row in self.rows)
 
     @property
     def common(self) -> list[tuple[Field, list[int]]]:
-        """The questions that several recordings have, with the numbers of their tables."""
+        """The questions that several recordings share, with the indices of their tables."""
         same: dict[tuple[str, tuple[Answer, ...]], tuple[Field, list[int]]] = {}
         for row in self.rows:
             for field in row.fields:
@@ -116,7 +118,7 @@ class FileGroup:
 
 
 def group_rows(rows: Sequence[Row]) -> list[FileGroup]:
-    """Return the rows by kind."""
+    """Return the rows grouped by kind."""
     groups = [
         FileGroup(key=kind or "unknown", title=title, rows=tuple(r for r in rows if r.kind == kind))
         for kind, title in _KINDS
@@ -127,13 +129,13 @@ def group_rows(rows: Sequence[Row]) -> list[FileGroup]:
 def list_rows(
     ask: Ask, folder: Path, document: Mapping[str, Any], *, doubts: Sequence[Sequence[str]]
 ) -> list[Row]:
-    """Return a row for every data file, and for every table whose file is not there.
+    """Return a row for every data file, and for every table whose file is missing.
 
     Parameters
     ----------
-    doubts : what stands marked as unsure in each table.
+    doubts : for each table, what it marks as unsure.
     """
-    # Further ones are what is wrong with the file.
+    # Further tables are not shown; their number is a problem that the page reports.
     listed = list_experiments(document)[:MOST_EXPERIMENTS]
     places: dict[str, list[int]] = {}
     for index, table in enumerate(listed):
@@ -154,7 +156,7 @@ def list_rows(
 
 
 def look_at_all(ask: Ask, folder: Path, document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return what each data file is, by name."""
+    """Return what each data file contains, by name."""
     known = {**document, "experiments": list_experiments(document)[:MOST_EXPERIMENTS]}
     return ask.desk.looks(folder, lambda file: stated_columns(known, file))
 
@@ -208,7 +210,7 @@ def _lacks_controller(fields: Sequence[Field]) -> bool:
 
 
 def _free_carts(document: Mapping[str, Any], table: Mapping[str, Any]) -> list[int]:
-    """Return the carts that a table says are free: all where it does not say."""
+    """Return the free carts that a table states; all carts if it states none."""
     stated = table.get("carts")
     if isinstance(stated, list):
         return [cart for cart in stated if isinstance(cart, int)]
@@ -223,7 +225,10 @@ def _question(
     carts: Sequence[int],
     marked: Sequence[str],
 ) -> Field:
-    """Return a field with the question whether a cart was held, until the table says."""
+    """Return a field; that of free carts has a question if a cart hardly moves.
+
+    The question is not asked once the table states the free carts.
+    """
     if not field.path.endswith(".carts"):
         return field
     open_ = "carts" not in table or any(is_marked(said, marked) for said in look["unsure"])
@@ -232,9 +237,10 @@ def _question(
 
 
 def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
-    """Return what there is to say of many files, each with its sentence that names them.
+    """Return each remark that many files have, with a sentence that names these files.
 
-    Remarks that differ only in their numbers of ms or pieces share a sentence, with least and most.
+    Remarks that differ only in numbers of ms or pieces share a sentence with the range of these
+    numbers.
     """
     told = [(row.file.removeprefix("data/"), said) for row in rows for said in row.remarks]
     times = Counter(_MEASURED.sub("#", said) for _, said in told)
@@ -248,7 +254,7 @@ def gather_remarks(rows: Sequence[Row]) -> dict[str, str]:
 
 
 def _span_numbers(said: Sequence[str]) -> str:
-    """Return remarks that differ only in numbers as one."""
+    """Return remarks that differ only in numbers as one, with the range of each number."""
     columns = zip(*(_MEASURED.findall(one) for one in said), strict=True)
     ends = [(min(column, key=float), max(column, key=float)) for column in columns]
     spans = iter([low if low == high else f"{low} to {high}" for low, high in ends])

@@ -1,4 +1,4 @@
-"""The student's room: files, form, the zip. The folder on disk is the truth."""
+"""The student's room: files, form, zip. The files in the folder are the only stored state."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -38,16 +38,16 @@ from pipeline.submission.edit import Outdated, edit_submission, submission_text
 from pipeline.submission.load import NAME, list_experiments, outside, posix
 from pipeline.words.numbers import by_note, count
 
-_FILES, _SET_UP = "files", "details"  # parts of pages, by their ids
+_FILES, _SET_UP = "files", "details"  # parts of pages, by their HTML ids
 
 
 def show(ask: Ask) -> Response:
-    """Show the room as the folder is now."""
+    """Show the room in its current state."""
     return _show_page(ask)
 
 
 def upload(ask: Ask) -> Response:
-    """Take files, and write down what they are."""
+    """Store uploaded files, and add tables for them to the file."""
     folder, items = ask.folder(), ask.form.getlist("files")
     sent = [(i.filename, i.file) for i in items if isinstance(i, UploadFile) and i.filename]
     said = take_uploads(sent, folder, workers=ask.desk.workers)
@@ -55,7 +55,7 @@ def upload(ask: Ask) -> Response:
 
 
 def set_aside(ask: Ask) -> Response:
-    """Move a recording out of `data/` that no table names."""
+    """Move a recording that no table names out of `data/`."""
     folder, file = ask.folder(), ask.text("file")
     if file not in ask.desk.workers.do("list_files", folder=str(folder)):
         raise HTTPException(404, "there is no such recording")
@@ -68,7 +68,7 @@ def set_aside(ask: Ask) -> Response:
 
 
 def fill(ask: Ask) -> Response:
-    """Add entries for files without one."""
+    """Add tables for data files that have none."""
     return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
 
 
@@ -80,7 +80,7 @@ def save(ask: Ask) -> Response:
 
 
 def save_experiment(ask: Ask) -> Response:
-    """Write one row of the table of files into its table, or take the table away."""
+    """Write one row of the table of recordings into the file, or remove its table."""
     index = ask.request.path_params["index"]
     if ask.text("remove"):
         return _edit(ask, lambda document: remove_experiment(document, index), (), place=_FILES)
@@ -97,7 +97,7 @@ def save_experiment(ask: Ask) -> Response:
 
 
 def answer_together(ask: Ask) -> Response:
-    """Write one answer about held carts into the tables of several recordings."""
+    """Write the same answer about held carts into the tables of several recordings."""
     shown, carts = _read_shown(ask), ask.text("carts")
     most = len(list_experiments(shown)) - 1
     numbers = [
@@ -121,14 +121,14 @@ def answer_together(ask: Ask) -> Response:
 
 
 def start_hand_in(ask: Ask) -> Response:
-    """Make the report again if anything has changed; show the content of the zip."""
+    """Make the report again if a source has changed; then show the hand-in page."""
     if not sees_check(ask.user, ask.folder()) and last_report.find_state(ask.folder()) != "current":
         ask.start("make_report", title="The report")
     return ask.back(f"{ask.here}hand-in")
 
 
 def show_hand_in(ask: Ask) -> Response:
-    """Show what is done and what is not, what was assumed, and what the zip holds."""
+    """Show what is done, what is missing, what was assumed, and the content of the zip."""
     folder, room = ask.folder(), look_around(ask)
     keeps = list_missing(folder)
     names = [] if keeps else list_held(folder, report=not sees_check(ask.user, ask.folder()))
@@ -146,7 +146,8 @@ def show_hand_in(ask: Ask) -> Response:
 def download_hand_in(ask: Ask) -> Response:
     """Return the zip."""
     name = f"{ask.folder().name}.zip"
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "-", name)  # other letters by RFC 5987, beside this
+    # A name in plain letters; the real name follows in the form of RFC 5987.
+    plain = re.sub(r"[^A-Za-z0-9_.-]", "-", name)
     disposition = f"attachment; filename=\"{plain}\"; filename*=UTF-8''{quote(name, safe='')}"
     headers = {"Content-Disposition": disposition}
     made_of = last_report.stat_sources(ask.folder())
@@ -159,7 +160,7 @@ def download_hand_in(ask: Ask) -> Response:
 
 
 def _read_shown(ask: Ask) -> dict[str, Any]:
-    """Return the file that a form was filled in for: what differs from that was typed."""
+    """Return the version of the file that the form was filled in from; differences were typed."""
     text = ask.desk.shown(ask.text("seen"), to=ask.user.name)
     return read_document(submission_text(ask.folder()) if text is None else text)
 
@@ -171,14 +172,14 @@ def _list_authors(room: Room) -> list[str]:
 
 
 def _list_doubts(ask: Ask, document: Mapping[str, Any], index: int) -> Sequence[str]:
-    """Return what is not sure of the carts of an experiment."""
+    """Return the doubts about the carts of an experiment."""
     files = [posix(str(table.get("file", ""))) for table in list_experiments(document)]
     looks = look_at_all(ask, ask.folder(), document)
     return looks[files[index]]["unsure"] if index < len(files) and files[index] in looks else ()
 
 
 def _fill_tables(ask: Ask, folder: Path) -> list[Said]:
-    """Write the entries of new files; return the messages."""
+    """Add tables for new files; return messages."""
     try:
         rows = ask.desk.workers.do("fill_tables", folder=str(folder))
     except Failed as error:
@@ -191,7 +192,7 @@ def _fill_tables(ask: Ask, folder: Path) -> list[Said]:
 
 
 def _go_back(ask: Ask, said: Iterable[Said], place: str) -> Response:
-    """Return to where it was asked, and say there what was done."""
+    """Return to the page from which the request came, and show messages at the same part of it."""
     return ask.back(f"{ask.here}#{place}", *said, place=place)
 
 
@@ -202,7 +203,7 @@ def _show_page(
     changed: Sequence[Field] = (),
     error: SubmissionError | None = None,
 ) -> Response:
-    """Show the room, with typed values in place of stored ones if they are wrong."""
+    """Show the room; fields with errors show what was typed."""
     folder, room = ask.folder(), look_around(ask, changed=changed, error=error)
     named = [row.file for row in room.rows if row.index is not None]
     return ask.page(
@@ -225,11 +226,13 @@ def _edit(
     *,
     place: str,
 ) -> Response:
-    """Change the file; what would not be valid is shown as typed, what is outdated is refused.
+    """Change the file; show typed values again if they are not valid or the page is out of date.
 
     Parameters
     ----------
-    place : the part of the page where it was asked.
+    change : changes the document.
+    changed : the fields that it writes.
+    place : part of the page from which the request came.
     """
     folder = ask.folder()
     try:
@@ -242,9 +245,9 @@ def _edit(
 
 
 def _show_outdated(ask: Ask, text: str, changed: Sequence[Field]) -> Response:
-    """Show both versions: the file as it is now, and what was typed."""
+    """Show both versions: the current file, and what was typed."""
     now = read_document(text)
-    # Of a page older than all that is known, nobody can say what was typed in it.
+    # If the page is too old, nobody can tell which of its values were typed.
     known = ask.desk.shown(ask.text("seen"), to=ask.user.name) is not None
     return ask.page(
         "outdated",

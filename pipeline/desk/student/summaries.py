@@ -1,4 +1,4 @@
-"""What a group of the set-up says, in a line, and what it lacks."""
+"""Summarise a group of the set-up in one line, and list what is missing in it."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -8,7 +8,7 @@ from pipeline.words.numbers import count
 
 
 def summarise(group: Group) -> Group:
-    """Return the group with its line, and what it lacks."""
+    """Return the group with its summary and with what is missing."""
     values = {field.path: field.value for field in group.fields}
     said, missing = _SAY[group.key](group, values)
     return replace(group, summary=", ".join(filter(None, said)), missing=missing)

@@ -1,27 +1,28 @@
-"""The way from dropped files to the zip: its steps, and how each stands."""
+"""The steps from dropped files to the zip, and the state of each."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-State = Literal["done", "needs", "old", "none"]  # as chips have them; none: not yet
-Stands = tuple[State, str]  # a state, and its word
+State = Literal["done", "needs", "old", "none"]  # as the page shows them; none means not yet
+Stands = tuple[State, str]  # a state, and the word shown for it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Facts:
-    """The facts behind the states of the steps.
+    """The facts that decide the state of each step.
 
     Attributes
     ----------
-    recordings : how many there are; to_look_at : how many files need a person.
-    missing : groups of the set-up that lack something.
-    sound : whether `submission.toml` is there and valid.
-    report : "none", "current", "answered" or "older"; see `find_state` of the last report.
-    making : whether it is being made.
-    questions, unanswered : of the last report.
-    handed : whether the zip, as it is now, was downloaded.
-    check : how the check stands, in a lab that has it in place of the report.
+    recordings : number of recordings.
+    to_look_at : number of files that need a person.
+    missing : groups of the set-up in which something is missing.
+    sound : whether `submission.toml` exists and is valid.
+    report : state of the report: "none", "current", "answered" or "older"; see `find_state`.
+    making : whether the report is being made.
+    questions, unanswered : numbers of questions in the last report.
+    handed : whether the zip was downloaded in its current state.
+    check : state of the check, in a lab that has it instead of the report.
     """
 
     recordings: int = 0
@@ -38,7 +39,13 @@ class Facts:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """A step, where it is taken (an address within the room), and how it stands."""
+    """A step with its state.
+
+    Attributes
+    ----------
+    address : of its page, relative to the room.
+    word : text shown for the state.
+    """
 
     key: str
     title: str
@@ -85,7 +92,10 @@ def _check(facts: Facts) -> Stands:
 
 
 def _has_result(facts: Facts) -> bool:
-    """Return whether the files as they are gave a report or agree: doubts then hold up nobody."""
+    """Return whether the current files gave a report, or a check that agrees.
+
+    Doubts then no longer block the next steps.
+    """
     return (_check if facts.check else _report)(facts)[0] == "done"
 
 
@@ -96,7 +106,7 @@ def _hand_in(facts: Facts) -> Stands:
     return ("done", "downloaded") if facts.handed else ("needs", "ready")
 
 
-# Key, title, address within the room, and what finds how it stands.
+# Key, title, address relative to the room, and a function that returns the state.
 _STEPS: tuple[tuple[str, str, str, Callable[[Facts], Stands]], ...] = (
     ("files", "Files", "#files", _files),
     ("set-up", "Set-up", "#details", _set_up),
@@ -122,9 +132,9 @@ def find_steps(facts: Facts) -> tuple[Step, ...]:
 
 
 def next_step(steps: Sequence[Step]) -> Step:
-    """Return the first step that is not done; the last where all are.
+    """Return the first step that is not done, or the last step.
 
-    Files that need a person hold up nobody once there is a report of them, or a check that agrees.
+    Files that need a person are passed over once there is a report of them, or a check that agrees.
     """
     has_result = any(s.state == "done" for s in steps if s.key in ("report", "check"))
     open_ = [s for s in steps if s.state != "done" and not (has_result and s.key == "files")]
