@@ -1,12 +1,12 @@
-"""The `cartlab` command: parse, call one function, write, exit code.
+"""The `cartlab` command: parse, call one function, write, return an exit status.
 
-The commands are loaded when one is run, so that Ctrl-C during loading ends the program quietly.
-Only what is imported here loads before that.
+The commands are loaded inside `main`, so that Ctrl-C during loading ends the program without a
+traceback. Only the imports of this file come earlier.
 """
 
 import sys
 
-TYPE_CHECKING = False  # like typing's, which is slow to import
+TYPE_CHECKING = False  # as in typing, which is slow to import
 if TYPE_CHECKING:
     from pipeline.cli.common import app as app
 
@@ -14,7 +14,7 @@ INTERRUPTED = 130  # exit status, as usual after Ctrl-C
 
 
 def __getattr__(name: str) -> object:
-    """Load the application on first use."""
+    """Load the application when it is first used."""
     if name == "app":
         from pipeline.cli.commands import app
 
@@ -33,5 +33,5 @@ def main() -> None:
         from pipeline.cli.commands import run
 
         run()
-    except KeyboardInterrupt:  # nothing has started, or the message is printed already
+    except KeyboardInterrupt:  # either nothing has started, or the message is already printed
         sys.exit(INTERRUPTED)

@@ -1,4 +1,4 @@
-"""The command `acquire`: fill a submission from a bench or from files as they appear."""
+"""The command `acquire`: fill a submission from a bench, or from files as they appear."""
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
@@ -77,7 +77,10 @@ def saying_where(folder: Path) -> Iterator[None]:
 def watching(
     folder: Path, terminal: "Terminal", *, web: bool, yes: bool
 ) -> Iterator[tuple[list["Observer"], "Buttons | None"]]:
-    """Yield the observers and the page's buttons; the first observer asks for confirmations."""
+    """Yield the observers, and the buttons of the page.
+
+    The first observer asks for confirmations.
+    """
     if not web:
         yield [terminal], None
         return
@@ -124,7 +127,7 @@ def _import(folder: Path, source: Path, terminal: "Terminal", *, once: bool) -> 
     from pipeline.bench.host.importing import Importer
     from pipeline.lock import alone_in
 
-    if not folder.exists():  # the files do not say how many carts there are
+    if not folder.exists():  # the imported files do not state the number of carts
         raise ConfigError(f"{folder}: no such folder; run `cartlab new {folder} --carts N`")
     taken = 0
     try:

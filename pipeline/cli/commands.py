@@ -1,4 +1,4 @@
-"""Load all commands."""
+"""Load all commands, in the order of `cartlab --help`."""
 
 # isort: off
 # `cartlab --help` lists the commands in this order: as a lab needs them.

@@ -32,7 +32,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s between messages, at first and at most
+FIRST_WORD, _LAST_PAUSE = 2.0, 60.0  # s between messages: the first pause, and the longest
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="A submission folder.")]
 Preset = Annotated[str | None, typer.Option(help="throne-1dof, throne-2dof or throne-3dof.")]
@@ -49,9 +49,12 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 
 
 def run() -> None:
-    """Run the command line. An error that the user can fix is one line and exit status 2."""
+    """Run the command line.
+
+    Print an error that the user can fix as one line, with exit status 2.
+    """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a limited console shows other characters as \u…
+        if isinstance(stream, TextIOWrapper):  # a console with few characters shows others as \u…
             stream.reconfigure(errors="backslashreplace")
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))
@@ -67,7 +70,7 @@ def run() -> None:
 
 
 def _misuse(error: TyperException) -> str:
-    """Return what is wrong with an option or an argument, and where to look."""
+    """Return what is wrong with an option or an argument, and which help to read."""
     from pydantic import ValidationError
 
     from pipeline.submission.complaints import refusal
@@ -85,13 +88,13 @@ def _fail(message: str) -> None:
 
 
 def say(text: str) -> None:
-    """Print a message to stderr, without control characters that a name might contain."""
+    """Print a message to stderr without control characters, which a file name might contain."""
     typer.echo("".join(c if c.isprintable() or c == "\n" else " " for c in text), err=True)
 
 
 @contextmanager
 def progress_line() -> Iterator[Progress]:
-    """Show progress, and a message if Ctrl-C ends the work."""
+    """Show progress; print a message if Ctrl-C ends the work."""
     with ctrl_c_says(lambda: say("stopped; repeat the command to start again")) as look:
         with _shown_line() as show:
 
@@ -123,7 +126,8 @@ def _shown_line() -> Iterator[Progress]:
 def said_now_and_then() -> Iterator[Progress]:
     """Print progress after 2 s, then at doubling intervals of at most a minute.
 
-    For a log, whose lines cannot change: short work prints nothing, long work keeps printing.
+    This is for a log, whose lines cannot be overwritten: short work prints nothing, long work
+    prints a few lines.
     """
     now, over, began = ["starting"], threading.Event(), time.monotonic()
 

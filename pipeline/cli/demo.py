@@ -36,7 +36,7 @@ def demo(
             write_class(teams)
             for mistake in PLANTED:
                 say(f"planted: {mistake}")
-        jobs = max(1, (os.cpu_count() or 1) - 1)  # one core is busy with the search
+        jobs = max(1, (os.cpu_count() or 1) - 1)  # leave one core for the search
         grade([teams], rubric=Path(PRESET), out=out / "grades", jobs=jobs)
         say("3 of 3: the hidden effect of a bench")
         for line in found_beside(beside, out):
@@ -45,18 +45,18 @@ def demo(
 
 @contextmanager
 def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
-    """Search for a hidden effect in a second process; it takes as long as the rest together."""
+    """Search for a hidden effect in a second process; it takes as long as all other parts."""
     command = [sys.executable, "-P", "-m", "pipeline.cli.hidden_bench", str(out)]
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=none, text=True) as beside:
         try:
             yield beside
         finally:
-            beside.kill()  # if it is still running
+            beside.kill()  # if it still runs, after an error here
 
 
 def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:
-    """Return the messages about the bench; if the second process failed, search here."""
+    """Return the messages of the second process; if it failed, search again in this process."""
     with progress_line() as progress:
         progress("looking for the hidden effect")
         assert beside.stdout is not None

@@ -1,4 +1,4 @@
-"""The command `doctor`: what is installed, what is missing, and where things are."""
+"""The command `doctor`: what is installed, what is missing, and where files are."""
 
 import json
 import platform
@@ -14,7 +14,7 @@ import typer
 from pipeline import __version__
 from pipeline.cli.common import AsJson, app
 
-# The extras that give a user something, and what.
+# The extras that matter to a user, and what each one adds.
 _EXTRAS = {
     "cluster": "grade on several computers",
     "postgresql": "a gradebook in PostgreSQL",
@@ -25,7 +25,7 @@ _PROGRAMS = {
     "C compiler": ("cc", "gcc", "clang", "cl"),
     "browser": ("chromium", "google-chrome", "chrome", "firefox", "msedge", "safari"),
 }
-_MODULES = {  # that are not called like their package
+_MODULES = {  # modules whose names differ from those of their packages
     "markdown-it-py": "markdown_it", "pyserial": "serial", "python-multipart": "python_multipart",
     "pyyaml": "yaml", "psycopg": "psycopg",
 }  # fmt: skip
@@ -33,13 +33,13 @@ _MODULES = {  # that are not called like their package
 
 @dataclass(frozen=True, kw_only=True)
 class Package:
-    """A package that cartlab needs, or that an extra adds.
+    """A package that cartlab needs or that an extra adds.
 
     Attributes
     ----------
-    wanted : versions that are allowed.
-    found : the installed version; "", not installed.
-    problem : why it cannot be used; "", it can.
+    wanted : allowed versions.
+    found : the installed version; "" if it is not installed.
+    problem : why it cannot be used; "" if it can.
     """
 
     name: str
@@ -50,16 +50,17 @@ class Package:
 
 @dataclass(frozen=True, kw_only=True)
 class Health:
-    """What is installed.
+    """The state of the installation.
 
     Attributes
     ----------
     package : the folder of the code.
-    extras : by name; a package with a problem means that the extra is missing.
-    programs : the path of each program of the system; "", not found.
-    compiled : the folder of the compiled simulator; "", no folder can be written.
-    fresh : whether it is compiled for this version; else the first simulation does it.
-    log : where it is noted what ended a desk.
+    extras : the packages of each extra, by name; one with a problem means that the extra is
+        missing.
+    programs : the path of each program of the system; "" if it was not found.
+    compiled : the folder of the compiled simulator; "" if no folder can be written.
+    fresh : whether it is compiled for this version; otherwise the first simulation compiles it.
+    log : the file in which the desk notes why it ended.
     """
 
     cartlab: str
@@ -89,7 +90,7 @@ def doctor(as_json: AsJson = False) -> None:
 
 
 def examine() -> Health:
-    """Look at the installation."""
+    """Return the state of the installation."""
     from pipeline.desk.ending import find_log
 
     needed, extras = _packages()
@@ -118,7 +119,7 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
 
     try:
         asked = [Requirement(text) for text in installed.requires("cartlab") or ()]
-    except installed.PackageNotFoundError:  # its code is on the path, and pip does not know it
+    except installed.PackageNotFoundError:  # the code is on the path, but pip did not install it
         return [_look("cartlab", "")], {}
     offered = installed.metadata("cartlab").get_all("Provides-Extra") or ()
     applies = {
@@ -137,7 +138,7 @@ def _packages() -> tuple[list[Package], dict[str, list[Package]]]:
 
 
 def _look(name: str, wanted: str) -> Package:
-    """Return whether a package can be used: it is there, new enough, and loads."""
+    """Return a package with its problem, if it is missing, too old, or does not load."""
     from packaging.specifiers import SpecifierSet
 
     found = problem = ""
@@ -157,7 +158,7 @@ def _loading(module: str) -> str:
     """Return why a module does not load; "" if it does."""
     try:
         import_module(module)
-    except Exception as error:  # whatever a broken installation raises
+    except Exception as error:  # a broken installation can raise any error
         return f"it does not load: {type(error).__name__}: {error}"
     return ""
 

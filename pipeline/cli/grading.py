@@ -101,7 +101,7 @@ def _say_what_came_of_it(done: "Summary", *, out: Path, rubric: Path) -> None:
 
 @contextmanager
 def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
-    """Show how many are done and, on a terminal, the remaining time."""
+    """Show how many submissions are graded and, on a terminal, the remaining time."""
     if not sys.stderr.isatty():
         with said_now_and_then() as show:
             yield lambda done, total, last: show(f"{done} of {total}: {last}".rstrip(": "))
@@ -114,7 +114,7 @@ def _batch_progress() -> Iterator[Callable[[int, int, str], None]]:
 
 
 def columns() -> "tuple[ProgressColumn, ...]":
-    """Return the parts of a progress line: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
+    """Return the columns of a progress line: "3/40 ━━━ 0:00:06 so far, 0:01:05 to go, team-3"."""
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -135,7 +135,10 @@ def columns() -> "tuple[ProgressColumn, ...]":
 
 
 def counting(shown: "Progress") -> Callable[[int, int, str], None]:
-    """Return the function that updates a progress bar; known grades do not count as speed."""
+    """Return a function that updates a progress bar.
+
+    Submissions whose grades are already known do not count towards the speed.
+    """
     task = shown.add_task("opening", total=None)
 
     def show(done: int, total: int, last: str) -> None:
@@ -211,7 +214,11 @@ def remove(
 
 
 def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
-    """Delete submissions; the pages follow, and exports, which had them, are deleted."""
+    """Delete submissions for good.
+
+    The pages are written again without them. Earlier exports contain their names, so they are
+    deleted.
+    """
     from pipeline.grading.publish.export import remove_exports
 
     with _changing(grades, assignment) as book:
@@ -224,7 +231,7 @@ def _erase(grades: str, teams: list[str], assignment: str | None) -> None:
 
 @contextmanager
 def _changing(grades: str, assignment: str | None) -> Iterator["Gradebook"]:
-    """Open a gradebook for a change; if it is a folder, update its pages afterwards."""
+    """Open a gradebook to change it; if it is in a folder, update the pages there afterwards."""
     from pipeline.grading.gradebook.book import Gradebook
     from pipeline.grading.publish.outputs import write_outputs
     from pipeline.lock import alone_in

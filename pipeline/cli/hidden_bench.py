@@ -1,4 +1,4 @@
-"""The bench of `demo`: hide friction and find it; run with `python -m` in a second process."""
+"""The bench of `demo`, run with `python -m` in a second process: hide friction, then find it."""
 
 import json
 import os
@@ -23,8 +23,8 @@ def find_hidden(out: Path, *, progress: Progress) -> list[str]:
 
 
 def _end_with_the_first() -> None:
-    os.read(0, 1)  # returns when the process that started this one is gone
-    os._exit(1)  # safe at any time: files are written whole or not at all
+    os.read(0, 1)  # returns when the process that started this one has ended
+    os._exit(1)  # safe at any time, because files are written whole or not at all
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""The desk for JupyterLab: an entry of its launcher, and the process that the entry starts.
+"""The desk in JupyterLab: an entry in its launcher, and the process that the entry starts.
 
-Jupyter passes on what the person who is logged in asks, and a secret that only it and the process
-know. Other people on the same computer can reach the port, but not the desk.
+Jupyter forwards the requests of the person who is logged in, and adds a secret. Other people on the
+same computer can reach the port, but they do not know the secret.
 """
 
 import os
@@ -9,12 +9,13 @@ import secrets
 import sys
 from typing import Any
 
-SECRET = "CARTLAB_JUPYTER_SECRET"  # a variable of the process, which only its owner can read
+# Environment variable, which only the owner of the process can read.
+SECRET = "CARTLAB_JUPYTER_SECRET"
 _START_LIMIT = 60.0  # s
 
 
 def launcher() -> dict[str, Any]:
-    """Return how jupyter-server-proxy starts the desk; its entry point."""
+    """Return how jupyter-server-proxy starts the desk; this function is its entry point."""
     from pipeline.desk.doors import JUPYTER_SECRET
     from pipeline.resources import TEMPLATES
 
@@ -29,7 +30,7 @@ def launcher() -> dict[str, Any]:
 
 
 def main() -> None:
-    """Serve the desk at a port until Jupyter ends it."""
+    """Serve the desk until Jupyter ends the process."""
     from pipeline.cli.common import say
     from pipeline.desk.app import DeskServer
     from pipeline.desk.ending import Ending

@@ -1,4 +1,4 @@
-"""Commands from raw data to a report: new, inspect, report, solution, gap."""
+"""Commands from raw data to a report: new, inspect, fill, report, check, solution, gap."""
 
 import json
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def inspect(
         if not found:
             unreadable.append(f"{folder}: contains no data files")
     with progress_line() as progress:
-        for file in listed:  # one broken file must not hide the others
+        for file in listed:  # a broken file must not hide the others
             progress(f"reading {file.name}")
             try:
                 inspections.append(inspect_file(file))
@@ -186,7 +186,7 @@ def _comparison(
 ) -> "Callable[[Analysis], DraftChanges | None]":
     """Return a function that compares an analysis with an earlier draft.
 
-    The draft is read at once: if it cannot be compared, it is refused before the analysis.
+    The draft is read before the long analysis, so that an unusable one is refused at once.
     """
     if earlier is None:
         return lambda analysis: None
@@ -252,7 +252,7 @@ def solution(
     with progress_line() as progress:
         analysis, text = make_solution(submission, out, rubric=asked, pdf=pdf, progress=progress)
     failed = [f"cartlab: {with_symbols(check.message)}" for check in analysis.failed_checks]
-    for line in failed:  # unreadable files are among them
+    for line in failed:  # unreadable files are among these lines
         say(line)
     doubtful = ", doubtful because the checks above failed" if analysis.failed_checks else ""
     say(_wrote(out, "solution", pdf=pdf) + doubtful)
@@ -304,7 +304,7 @@ def explain(
     model: bool = False,
     progress: Progress,
 ) -> tuple[str, list[str]]:
-    """Write the gap analysis of a submission; return gap.json and the messages."""
+    """Write the gap analysis of a submission; return the text of gap.json and the messages."""
     from pipeline.json_files import json_text
     from pipeline.output import named_folder, own_folder, write_file
     from pipeline.report.gap.story import render_gap
@@ -315,9 +315,10 @@ def explain(
     submission = load_submission(folder)
     out = named_folder(out) if out else own_folder(submission.folder, "gap")
     analysis = analyse(submission, design=False, progress=progress)
-    from pipeline.exchange.model.saved import clear_model, save_model  # load the …
-    from pipeline.experiments.discriminate import propose_for  # … compiled …
-    from pipeline.gap.explain import investigate  # … simulator
+    # These three imports load the compiled simulator.
+    from pipeline.exchange.model.saved import clear_model, save_model
+    from pipeline.experiments.discriminate import propose_for
+    from pipeline.gap.explain import investigate
 
     found = investigate(analysis, budget=budget, progress=progress)
     progress("choosing the next recording")

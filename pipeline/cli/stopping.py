@@ -1,4 +1,4 @@
-"""Make Ctrl-C end a command, even inside libraries that handle it badly."""
+"""Make Ctrl-C end a command, even if a library does not pass it on."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -11,11 +11,11 @@ from pipeline.cli import INTERRUPTED
 
 @contextmanager
 def ctrl_c_says(say: Callable[[], None]) -> Iterator[Callable[[], None]]:
-    """Yield `look`, which ends the work if Ctrl-C was pressed; call `say` when that happens.
+    """Call `say` when Ctrl-C is pressed; yield a function that ends the work if it was pressed.
 
-    An interrupted library may raise its own error. Python itself drops an interrupt that arrives
-    in the callback of a weak reference, as can happen during any import. Then the next call of
-    `look` ends the work.
+    A library may turn an interrupt into an error of its own. Python itself drops one that arrives
+    in the callback of a weak reference, as can happen during any import. Then the next call of the
+    function ends the work.
     """
     pressed = False
 

@@ -1,4 +1,4 @@
-"""Carry out the plan of a submission on a bench, continuing where it was left."""
+"""Record the plan of a submission on a bench; a later session continues where this one ended."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -30,7 +30,7 @@ from pipeline.submission.load import NAME
 from pipeline.submission.toml_file import Value
 
 _USUAL_BAUD = 115_200
-_TRIES = 3  # of one recording; a fault that occurs three times is not chance
+_TRIES = 3  # tries of one recording; a fault that occurs three times is no accident
 
 
 def acquire(
@@ -41,24 +41,27 @@ def acquire(
     only: Collection[str] = (),
     buttons: Buttons | None = None,
 ) -> tuple[RunOutcome, ...]:
-    """Record what the plan still lacks; return how each run ended.
+    """Record what is missing from the plan; return how each run ended.
 
-    Every complete run is entered in submission.toml at once, so an interrupted session continues
-    where it was. Partial data are kept beside the others, and the run is recorded again.
+    Every complete run is entered in submission.toml at once. So a session that is interrupted can
+    continue. Data of a run that ended early are saved separately, and it is recorded again.
 
     Parameters
     ----------
     port : of the bench, as pyserial names it.
-    observers : they watch; the first one asks a person to confirm what hands must do.
-    only : the ids to record; () for the whole plan, which then grows by what the new data allow.
-    buttons : what a person wants done with the present run.
+    observers : they show the session; the first one asks a person for work at the bench.
+    only : ids to record; () for the whole plan, to which recordings are added if new data allow
+        them.
+    buttons : what a person wants to do with the current run.
 
     Raises
     ------
-    Stopped : a signal or a button ended the session; the same call continues it.
-    HardwareError : there is no bench; Runaway : its motor was on between runs.
-    ConfigError : another session writes there; or plan or submission as a whole do not fit the
-        bench. If a single recording does not fit, its outcome says why, and the others go on.
+    Stopped : a signal or a button ended the session; call again to continue it.
+    HardwareError : no bench answers.
+    Runaway : the motor of the bench was on between runs.
+    ConfigError : another session writes to the folder, or plan or submission do not fit the bench.
+        If
+        only one recording does not fit, its outcome says why, and the session continues.
     """
     with stopping_on_signals(), alone_in(folder):
         work = _Acquisition(
@@ -76,7 +79,7 @@ def ensure_plan(folder: Path, *, port: str) -> None:
 
     Raises
     ------
-    HardwareError : there is no bench.
+    HardwareError : no bench answers.
     """
     submission = load_submission(folder)
     if not plan_path(submission).exists():
@@ -99,10 +102,10 @@ class _Acquisition:
         self._observer = observer
         self._only = frozenset(only)
         self._buttons = buttons
-        self._failed: dict[str, int] = {}  # tries of each recording that has not succeeded yet
+        self._failed: dict[str, int] = {}  # number of failed tries of each recording
 
     def outcomes(self) -> Iterator[RunOutcome]:
-        """Record until nothing is left; a line that was lost is opened again."""
+        """Record until nothing is left; yield how each run ended. A lost line is opened again."""
         lost = True
         while lost:
             with open_line(self._port, baud=self._baud()) as line:
@@ -116,7 +119,7 @@ class _Acquisition:
         return load_plan(submission).baud if plan_path(submission).exists() else _USUAL_BAUD
 
     def _on_line(self, line: SerialLine) -> Generator[RunOutcome, None, bool]:
-        """Record over one line; return whether it was lost."""
+        """Record over one line; return whether the line was lost."""
         bench = line.bench
         new = not (self._folder / NAME).exists()
         submission = prepare_submission(self._folder, bench, stock=not bench.commands)
@@ -180,12 +183,16 @@ class _Acquisition:
             raise Stopped("by hand")
 
     def _wish(self, run: "_Run") -> Wish:
-        """Return what to do with a run that ended early: a limit decides, a button, an answer."""
+        """Return what to do with a run that ended early.
+
+        After an unsafe run it is to skip the recording. Otherwise a button or the answer of a
+        person decides.
+        """
         name, partial = run.outcome.recording.id, run.outcome.partial
         unsafe = run.outcome.is_unsafe
         if run.file and (unsafe or self._buttons.pressed != "keep"):
             self._observer.remark(f"{run.file} is partial ({partial}); it is not in {NAME}")
-        if unsafe:  # the same again would do the same harm
+        if unsafe:  # another try would be just as unsafe
             self._failed[name] = _TRIES
             less = (
                 "divide its amplitude in plan.toml by four"
@@ -205,7 +212,7 @@ class _Acquisition:
         return wish
 
     def _answer(self, run: "_Run") -> Wish:
-        """Ask whether to record it again, unless the fault occurred too often."""
+        """Ask a person whether to record it again, unless it has failed too often."""
         name = run.outcome.recording.id
         self._failed[name] = self._failed.get(name, 0) + 1
         if self._failed[name] >= _TRIES:
@@ -216,22 +223,22 @@ class _Acquisition:
             self._observer.confirm(
                 f"{name} ended early: {run.outcome.partial}. Record {name} again"
             )
-        except ConfigError:  # nobody is there to decide: the rest of the plan goes on
+        except ConfigError:  # nobody answers: continue with the other recordings
             return "skip"
         return self._buttons.pressed or "repeat"
 
     def _keep(self, run: "_Run") -> RunOutcome:
-        """Enter a run that ended early as an experiment, with a note on its end."""
+        """Enter a run that ended early as an experiment, with a note on why it ended."""
         remark = f"partial, kept by hand: {run.outcome.partial}"
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
         with signals_held():
             self._note(replace(run, outcome=outcome))
-            (self._folder / run.file).unlink()  # the same lines as those that were kept
+            (self._folder / run.file).unlink()  # the kept file has the same lines
         self._observer.finished(outcome)
         return outcome
 
     def _note(self, run: "_Run") -> None:
-        """Write the data file of a run, and its table."""
+        """Write the data file of a run, and its table in submission.toml."""
         submission = load_submission(self._folder)
         file = save_record(run.path, folder=self._folder, carts=submission.system.carts)
         outcome = run.outcome
@@ -286,19 +293,20 @@ class _Acquisition:
         session: Session,
         line: SerialLine,
     ) -> "_Run":
-        """Record one experiment and enter it."""
+        """Record one experiment and enter it in submission.toml."""
         path = free_raw_path(self._folder, recording)
         try:
             order, table = order_on(recording, plan, submission, line.bench)
-        except PipelineError as error:  # this bench cannot, or must not, do it: nothing is sent
+        except PipelineError as error:  # the bench cannot or must not do this: send nothing
             self._failed[recording.id] = _TRIES
             return self._refused(RunOutcome(recording=recording, lines=0, partial=str(error)), path)
         try:
             restless = session.prepare(order)
-            with signals_held() as let_in:  # a complete run is entered before the program ends
+            # No signal ends the program before a complete run is entered.
+            with signals_held() as let_in:
                 outcome = self._run(session, order, path, submission, let_in)
                 remarks = [restless] if restless else []
-                # Late lines have their stamps, so a reader of the data need not know.
+                # Late lines have right time stamps, so they do not matter to a reader of the data.
                 if (spoilt := str(replace(outcome.anomalies, late=0))) != "none":
                     remarks.append(spoilt)
                 run = _Run(
@@ -336,14 +344,14 @@ class _Acquisition:
             raise
 
     def _refused(self, outcome: RunOutcome, path: Path) -> "_Run":
-        """Report a recording that did not begin."""
+        """Report a recording that was not started."""
         self._observer.finished(outcome)
         return _Run(outcome=outcome, path=path)
 
     def _saved_partial(self, path: Path, submission: Submission) -> str:
-        """Save the data of a run that ended early, where no report takes them for a whole run.
+        """Save the data of a run that ended early, in a file that no report uses.
 
-        Return the name of the file, or "" without any data.
+        Returns the name of the file, or "" if there are no data.
         """
         if not path.exists():
             return ""
@@ -362,7 +370,7 @@ class _Run:
     Attributes
     ----------
     path : of its raw file, which exists if the run began.
-    file : the data of a run that ended early; "": none.
+    file : name of the data file, if the run ended early and has one; or "".
     controller : of a closed loop, as written in submission.toml.
     """
 
@@ -381,7 +389,7 @@ def _is_lost(line: SerialLine) -> bool:
         line.stop()
         line.clear()
     except Runaway:
-        raise  # a line opened again would restart it
+        raise  # opening the line again would start the bench again
     except HardwareError:
         return True
     return False

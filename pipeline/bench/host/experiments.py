@@ -1,4 +1,4 @@
-"""Additions to submission.toml: an experiment, a scale, a new file; existing text is kept."""
+"""Add an experiment, a scale or a new file to submission.toml; existing text is kept."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,11 +30,11 @@ _TO_ADD = """\
 
 
 def add_experiment(submission: Submission, entry: Mapping[str, Value]) -> Submission:
-    """Add an `[[experiments]]` table; existing text and comments are kept.
+    """Add an `[[experiments]]` table to the file; existing text and comments are kept.
 
     Raises
     ------
-    SubmissionError : the file cannot take it, or the result would be invalid.
+    SubmissionError : the file cannot be changed, or the result would be invalid.
     """
     return edit_submission(submission.folder, lambda document: append_experiment(document, entry))
 
@@ -74,13 +74,13 @@ def check_files(plan: Plan, submission: Submission) -> None:
 
 
 def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Submission:
-    """Return the submission with its scales, as stated in it or by the bench.
+    """Return the submission with its scales, either its own or those that the bench states.
 
-    A folder without a submission gets one from the bench's description.
+    If the folder has no submission, one is made from the bench's description.
 
     Raises
     ------
-    ConfigError : a missing scale, units that differ, or too few carts on the bench.
+    ConfigError : a scale is missing, units differ, or the bench has too few carts.
     """
     if not (folder / NAME).exists():
         if stock:
@@ -120,7 +120,7 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
         "input": (system.input, bench.input_unit, bench.input_per_count),
         "position": (system.position, bench.position_unit, bench.position_per_count),
     }
-    # A smaller difference means the same number typed with fewer digits.
+    # A smaller difference can come from a number typed with fewer digits.
     return [
         f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
         f"that of {NAME} is used"
@@ -142,16 +142,18 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
 
 
 def limit_words(limits: PlanLimits, submission: Submission, bench: Description) -> str:
-    """Return the limits of a plan beside counts and full scale of the bench.
+    """Return the limits of a plan as text, next to encoder counts and full scale of the bench.
 
     Raises
     ------
-    ConfigError : the input limit exceeds full scale, so shares of it would be too large.
+    ConfigError : the input limit is above full scale, so that amplitudes given as its shares would
+        be
+        too large.
     """
     system = submission.system
     unit, position = system.input.unit, system.position.unit
     full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
-    if limits.input > 1.01 * full:  # it may be typed with fewer digits
+    if limits.input > 1.01 * full:  # the limit may be typed with fewer digits
         raise ConfigError(
             f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
             f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "
@@ -179,7 +181,7 @@ def _scale(folder: Path, name: str, unit: str, stated: tuple[str, float]) -> flo
 
 
 def _add_scales(path: Path, scales: Mapping[str, float]) -> None:
-    import tomlkit  # costs 50 ms, and only a first session needs it
+    import tomlkit  # imported late: it takes 50 ms, and only a first session needs it
 
     document = tomlkit.parse(path.read_bytes().decode("utf-8-sig"))
     system = document["system"]

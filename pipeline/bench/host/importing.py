@@ -1,4 +1,4 @@
-"""Import files recorded by other programs as they appear in a folder."""
+"""Import files that other programs record, as they appear in a folder."""
 
 import filecmp
 import shutil
@@ -22,17 +22,18 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import MAX_DATA_BYTES
 from pipeline.submission.toml_file import Value
 
-LOOK_EVERY = 0.5  # s
+LOOK_EVERY = 0.5  # s between two looks at the folder
 
 
 @dataclass(frozen=True, kw_only=True)
 class Imported:
-    """A file that was imported.
+    """An imported file.
 
     Attributes
     ----------
-    file : its original name; `experiment`: the id it has now.
-    planned : it is the next recording of the plan.
+    file : its original name.
+    experiment : its id in the submission.
+    planned : whether it is the next recording of the plan.
     remarks : what to check before a report is made.
     """
 
@@ -44,10 +45,10 @@ class Imported:
 
 
 class Importer:
-    """Watches a folder for a submission.
+    """Watch a folder and import its files into a submission.
 
-    Files that are there at the start are imported too, the oldest first. A file is imported once,
-    also over several sessions, as the submission keeps a copy.
+    Files that exist at the start are imported too, the oldest first. Each file is imported only
+    once, even over several sessions, because the submission has a copy of it.
     """
 
     def __init__(self, folder: Path, source: Path, *, observer: Observer) -> None:
@@ -62,15 +63,20 @@ class Importer:
         )
         self._seen: dict[Path, tuple[int, int]] = {}  # size and time at the last look
         self._looks: dict[Path, int] = {}
-        self._over: set[Path] = set()  # imported, refused or there before
-        self._locked: set[Path] = set()  # already reported
+        self._over: set[Path] = set()  # imported, refused, or already there
+        self._locked: set[Path] = set()  # locked files that were reported
         if self._plan:
             self._observer.planned(self._plan, self._done)
 
     def watch(
         self, *, once: bool, wait: Callable[[float], None] = time.sleep
     ) -> Iterator[Imported]:
-        """Yield each imported file; end when the plan is done, or nothing is left."""
+        """Yield each imported file; end when the plan is done.
+
+        Parameters
+        ----------
+        once : import only the files that are there now.
+        """
         self._ask()
         while True:
             for path in self._complete(at_once=once):
@@ -97,25 +103,26 @@ class Importer:
             self._observer.remark(f"next: {recording.id}, a {recording.kind}{hertz}; {held}")
 
     def _complete(self, *, at_once: bool) -> list[Path]:
-        """Return the files that no longer change, the oldest first."""
+        """Return the files that are complete because they no longer change, the oldest first."""
         ready = []
         for path in self._source.iterdir():
-            hidden = path.name.startswith((".", "~"))  # or of a running program
+            # Hidden, or temporary files of a running program.
+            hidden = path.name.startswith((".", "~"))
             if path in self._over or hidden or self._is_other(path) or not self._opens(path):
                 continue
             try:
                 info = path.stat()
-            except OSError:  # gone meanwhile
+            except OSError:  # removed in the meantime
                 continue
             state = info.st_size, info.st_mtime_ns
             self._looks[path] = self._looks.get(path, 0) + 1 if self._seen.get(path) == state else 0
             self._seen[path] = state
-            if info.st_size and (at_once or self._looks[path] >= 2):  # nobody writes it any more
+            if info.st_size and (at_once or self._looks[path] >= 2):  # it no longer changes
                 ready.append(path)
         return sorted(ready, key=lambda path: (self._seen[path][1], path.name))
 
     def _is_other(self, path: Path) -> bool:
-        """Return whether this cannot be a data file, and report that."""
+        """Return whether a path cannot be a data file, and report that."""
         if path.is_dir():
             why = "a folder"
         elif path.suffix.casefold() not in ENDINGS:
@@ -127,7 +134,7 @@ class Importer:
         return True
 
     def _opens(self, path: Path) -> bool:
-        """Return whether a file can be read; one locked by its program can be read later."""
+        """Return whether a file can be read; a file that its program locks is tried again later."""
         try:
             path.open("rb").close()
         except OSError as error:
@@ -138,12 +145,12 @@ class Importer:
         return True
 
     def _try(self, path: Path, *, final: bool) -> Imported | None:
-        """Import a file; one that vanishes or is locked meanwhile is tried again."""
+        """Import a file; one that is locked or vanishes is tried again later."""
         try:
             return self._take(path, final=final)
         except OSError:
             if path.exists() and self._opens(path):
-                raise  # the failure is in the submission's folder
+                raise  # the cause is in the submission's folder
             self._over.discard(path)
             self._looks[path] = 0
             return None
@@ -151,7 +158,11 @@ class Importer:
     def _take(self, path: Path, *, final: bool) -> Imported | None:
         """Copy a file into the submission and enter it; None if it is refused or known.
 
-        A file that ends within a line may still grow, unless this is the `final` look.
+        A file whose last line is not complete may still grow.
+
+        Parameters
+        ----------
+        final : this is the last look, so the file will not grow.
         """
         self._over.add(path)
         if path.stat().st_size > MAX_DATA_BYTES:
@@ -167,7 +178,7 @@ class Importer:
             self._observer.remark(f"not imported: {error}")
             return None
         if inspection.cut_short:
-            if not final and self._looks[path] < 20:  # its last line may still come
+            if not final and self._looks[path] < 20:  # its last line may still be written
                 self._over.discard(path)
             else:
                 self._observer.remark(f"{path.name}: not imported, {inspection.problems[0]}")
@@ -208,7 +219,7 @@ class Importer:
         return any(copy.is_file() and filecmp.cmp(copy, path, shallow=False) for copy in copies)
 
     def _match(self, inspection: Inspection) -> Recording | None:
-        """Return the next recording of the plan if the file resembles it."""
+        """Return the next recording of the plan, if the file can be of this recording."""
         recording = self._next
         if recording is None:
             return None
@@ -216,7 +227,7 @@ class Importer:
             found = inspection.frequency
             near = found and abs(found / recording.frequency - 1) < 0.05
             return recording if inspection.kind == "sine" and near else None
-        # A swept or switched input may resemble either.
+        # Steps and sweeps can look the same, for example if a sweep switches its input.
         alike = {"sweep": ("sweep", "step"), "step": ("step", "sweep")}
         return (
             recording if inspection.kind in alike.get(recording.kind, (recording.kind,)) else None

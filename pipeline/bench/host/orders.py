@@ -1,4 +1,4 @@
-"""A recording as orders to the bench: commands and limits in the bench's own counts."""
+"""Turn a recording into orders to the bench: commands and limits in the bench's own counts."""
 
 from dataclasses import dataclass, replace
 
@@ -34,9 +34,11 @@ class Order:
 
     Attributes
     ----------
-    commands : to send, the start last.
-    scales : of the counts; `input_unit`, `position_unit` are their units.
-    most_duty, most_counts : limits for every line, in duty and encoder counts.
+    commands : to send in this order; the last one starts the run.
+    scales : from counts to units.
+    input_unit, position_unit : these units.
+    most_duty : limit for every line, in duty counts.
+    most_counts : limit for every line, in encoder counts.
     """
 
     recording: Recording
@@ -48,7 +50,7 @@ class Order:
     most_counts: float
 
     def rest(self) -> "Order":
-        """Return the order to rest while the carts settle, with the same limits."""
+        """Return an order in which nothing moves while the carts settle; it has the same limits."""
         settle = self.recording.settle
         return replace(
             self,
@@ -57,9 +59,9 @@ class Order:
         )
 
     def strays(self, reading: Reading, *, period: float) -> bool:
-        """Return whether the bench follows another target than ordered, as after a changed digit.
+        """Return whether a line has another target than ordered, as after a digit was changed.
 
-        An edge may come a `period` (ms) early or late; a target may be rounded either way.
+        A jump may come one `period` (in ms) early or late, and a target may be rounded up or down.
         """
         start = self.commands[-1]
         assert isinstance(start, Start)
@@ -75,9 +77,9 @@ class Order:
         return not min(near) - 1 <= reading.target <= max(near) + 1
 
     def drives_off(self, reading: Reading, *, before: Reading) -> bool:
-        """Return whether the motor's duty differs from the target, which it equals in open loop.
+        """Return whether the motor's duty differs from the target; in open loop they are equal.
 
-        An edge may act a line later.
+        A jump may take effect one line later.
         """
         if self.recording.controller is not None:
             return False
@@ -85,14 +87,14 @@ class Order:
         return not min(near) - 1 <= reading.duty <= max(near) + 1
 
     def passed(self, reading: Reading, *, carts: int) -> str:
-        """Return the limit that a line passes, or ""."""
+        """Return a message about the limit that a line exceeds, or ""."""
         if abs(reading.duty) > self.most_duty:
             found, most = (abs(self.scales.input) * n for n in (reading.duty, self.most_duty))
             return f"the input was {found:.4g} {self.input_unit}, the limit is {most:.4g}"
         return self.too_far(reading, carts=carts)
 
     def too_far(self, reading: Reading, *, carts: int) -> str:
-        """Return the cart that is further from its zero than the limit, or ""."""
+        """Return a message about a cart that is farther from its zero than the limit, or ""."""
         for cart, count in enumerate(reading.counts[:carts], start=1):
             if abs(count) > self.most_counts:
                 found, most = (self.scales.position * n for n in (count, self.most_counts))
@@ -106,7 +108,10 @@ class Order:
 def order_on(
     recording: Recording, plan: Plan, submission: Submission, bench: Description
 ) -> tuple[Order, Table | None]:
-    """Return the order and, for a closed loop, the controller as written in submission.toml."""
+    """Return the order of a recording, and its controller as written in submission.toml.
+
+    The controller is None for an open loop.
+    """
     system = submission.system
     scales = CountScales(
         input=system.input.per_count or bench.input_per_count,
@@ -137,7 +142,11 @@ def make_order(
     bench: Description,
     gains: PidGains | StateGains | None = None,
 ) -> Order:
-    """Turn a recording into commands, its amplitude into counts; `gains` close its loop.
+    """Return the order of a recording: its commands, with amplitudes in counts.
+
+    Parameters
+    ----------
+    gains : of the controller, for a closed loop.
 
     Raises
     ------
@@ -152,7 +161,8 @@ def make_order(
         scales=scales,
         input_unit=system.input.unit,
         position_unit=system.position.unit,
-        most_duty=limits.input / abs(scales.input) + 0.5,  # amplitudes are rounded
+        # The half allows for rounding of the amplitude.
+        most_duty=limits.input / abs(scales.input) + 0.5,
         most_counts=limits.travel / abs(scales.position),
     )
 
@@ -160,7 +170,7 @@ def make_order(
 def _count_amplitude(
     recording: Recording, *, limits: PlanLimits, scales: CountScales, system: System
 ) -> int:
-    """Return the amplitude in counts: of the duty, or in closed loop of the encoder."""
+    """Return the amplitude in counts: of the duty in open loop, of the encoder in closed loop."""
     closed = recording.controller is not None
     limit, unit, per_count = (
         (limits.travel, system.position.unit, scales.position)
@@ -193,8 +203,8 @@ def _list_commands(
     if gains is not None:
         if isinstance(gains, StateGains):
             _check_known("f", "state feedback", bench)
-        # A lost byte takes the gains with it; then no gains act, rather than those of an earlier
-        # run.
+        # If a byte of the gains is lost, the bench drops them. The zeros before then act, not the
+        # gains of an earlier run.
         commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
         _check_known("c", "chirp", bench)

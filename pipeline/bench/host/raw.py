@@ -1,8 +1,8 @@
-"""The raw file of a run: a descriptive line, then the bytes exactly as they came.
+"""The raw file of a run: one line of description, then the bytes exactly as they arrived.
 
-`<name>.raw` holds one line of JSON and the bytes of the port. `<name>.times` beside it has sixteen
-bytes for each chunk: the end of the chunk in the stream, and its time. Both are written as the
-bytes arrive and only grow, so they stay readable whatever kills the program.
+`<name>.raw` contains one line of JSON and the bytes of the port. `<name>.times` next to it has
+sixteen bytes for each chunk: the position of its end, and its time. Both files are written as the
+bytes arrive and only grow. So they can be read even if the program is killed.
 """
 
 import json
@@ -20,8 +20,8 @@ from pipeline.output import own_folder
 
 FOLDER = "raw"
 _VERSION = "cartlab-raw/1"
-_TIME = struct.Struct("<Qd")  # end of the chunk in the stream, s since the run began
-_LINE = ("target", "duty", "milliseconds")  # the fields behind the encoders
+_TIME = struct.Struct("<Qd")  # position of the chunk's end in the stream, s since the run began
+_LINE = ("target", "duty", "milliseconds")  # the fields of a line after the encoders
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,9 @@ class RawHeader:
     Attributes
     ----------
     recording, limits : as in the plan.
-    commands : what was sent to the bench to begin the run, in order.
+    commands : sent to the bench to start the run, in order.
     bench : its own description; for a stock bench only the known facts.
-    begun : local time with its offset.
+    begun : local time with its offset from UTC.
     """
 
     recording: Recording
@@ -43,7 +43,7 @@ class RawHeader:
     begun: str
 
     def to_json(self) -> str:
-        """Return the header as one line."""
+        """Return the description as one line of JSON."""
         bench = {**asdict(self.bench), "commands": "".join(sorted(self.bench.commands))}
         content = {
             "schema": _VERSION,
@@ -58,19 +58,20 @@ class RawHeader:
 
 
 class RawWriter:
-    """Writes arriving bytes at once, so that they survive the program.
+    """Write arriving bytes to disk at once, so that they are kept if the program is killed.
 
     Raises
     ------
-    FileExistsError : a raw file is never overwritten.
+    FileExistsError : the file exists; a raw file is never overwritten.
     """
 
     def __init__(self, path: Path, header: RawHeader) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Unbuffered: each write is in the hands of the system when it returns.
+        # Without a buffer, the system has the bytes when each write returns.
         self._bytes = path.open("xb", buffering=0)
         times = path.with_suffix(".times")
-        times.unlink(missing_ok=True)  # of a raw file that is gone; a link is not followed
+        # The times of a deleted raw file; if it is a link, its target stays.
+        times.unlink(missing_ok=True)
         self._times = times.open("xb", buffering=0)
         self._bytes.write(header.to_json().encode() + b"\n")
         self._length = 0
@@ -84,7 +85,7 @@ class RawWriter:
         self._times.close()
 
     def write(self, data: bytes) -> None:
-        """Append bytes that arrived just now."""
+        """Append bytes that have just arrived."""
         self._bytes.write(data)
         self._length += len(data)
         self._times.write(_TIME.pack(self._length, time.monotonic() - self._began))
@@ -92,11 +93,11 @@ class RawWriter:
 
 @dataclass(frozen=True, kw_only=True)
 class RawRun:
-    """A raw file that was read.
+    """The content of a raw file.
 
     Attributes
     ----------
-    content : the bytes as they came; the last line may be cut.
+    content : the bytes as they arrived; the last line may be incomplete.
     arrivals : (end of the chunk in `content`, s since the run began), ascending.
     """
 
@@ -105,7 +106,7 @@ class RawRun:
     arrivals: tuple[tuple[int, float], ...]
 
     def lumps(self) -> Iterator[tuple[bytes, float]]:
-        """Yield the bytes of each chunk and their time; those without a time come last."""
+        """Yield each chunk of bytes with its time; bytes without a time come last."""
         start, at = 0, 0.0
         for end, at in self.arrivals:
             yield self.content[start:end], at
@@ -115,7 +116,7 @@ class RawRun:
 
 
 def read_raw(path: Path) -> RawRun:
-    """Read a raw file, also one that was cut off anywhere.
+    """Read a raw file, even if it ends at an arbitrary byte.
 
     Raises
     ------
@@ -151,7 +152,7 @@ def _header(line: bytes, *, name: str) -> RawHeader:
 
 
 def free_raw_path(folder: Path, recording: Recording) -> Path:
-    """Return a free name, as each try of a recording has its own raw file."""
+    """Return a name that is still free; each try of a recording has its own raw file."""
     parent = own_folder(folder, FOLDER)
     number = 1
     while (path := parent / f"{recording.id}-{number}.raw").exists():
@@ -160,7 +161,10 @@ def free_raw_path(folder: Path, recording: Recording) -> Path:
 
 
 def known_commands(folder: Path) -> frozenset[str]:
-    """Return the bench's extensions at the latest recording; the chirp for a stock bench."""
+    """Return the extensions of the bench that made the latest recording.
+
+    For a stock bench it is only the chirp.
+    """
     for path in sorted((folder / FOLDER).glob("*.raw"), key=lambda p: p.stat().st_mtime)[::-1]:
         try:
             return read_raw(path).header.bench.commands

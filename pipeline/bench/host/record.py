@@ -1,4 +1,4 @@
-"""From a raw file to the data file of an experiment: an ordinary bench log."""
+"""Write the data file of an experiment, an ordinary bench log, from a raw file."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,12 +14,15 @@ DATA = "data"
 
 
 def data_file(recording: Recording, *, partial: bool = False) -> str:
-    """Return the name of a recording's data file inside the submission, with forward slashes."""
+    """Return the path of a recording's data file, relative to the submission, with `/`."""
     return f"{DATA}/{recording.id}{'.partial' if partial else ''}.txt"
 
 
 def readings_of(run: RawRun) -> tuple[Reading, ...]:
-    """Return the valid lines of a run, in order, judged as during the run."""
+    """Return the valid lines of a run in order.
+
+    They are judged in the same way as during the run.
+    """
     stream = Stream(
         encoders=run.header.bench.encoders,
         period=1e3 * run.header.bench.period,
@@ -31,15 +34,15 @@ def readings_of(run: RawRun) -> tuple[Reading, ...]:
 
 
 def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = False) -> str:
-    """Write the data file of a raw file; return its name inside the submission `folder`.
+    """Write the data file of a raw file; return its path relative to the submission `folder`.
 
     Raises
     ------
-    DataError : the raw file holds too few lines.
+    DataError : the raw file has too few lines.
     """
     run = read_raw(raw_path)
     readings = readings_of(run)
-    if len(readings) < 8:  # the least that a record needs
+    if len(readings) < 8:  # the smallest number that a record needs
         raise DataError(f"{raw_path.name}: holds {len(readings)} lines, too few for a record")
     name = data_file(run.header.recording, partial=partial)
     own_folder(folder, DATA).mkdir(exist_ok=True)
@@ -49,9 +52,11 @@ def save_record(raw_path: Path, *, folder: Path, carts: int, partial: bool = Fal
 
 
 def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str:
-    """Return the bench log: counts and stamps in s as they came (rounded to ms).
+    """Return a bench log with counts and time stamps (in s, rounded to ms) as they arrived.
 
-    With `reference` the target is also a column, in encoder counts.
+    Parameters
+    ----------
+    reference : add the target as a column, in encoder counts.
     """
     encoders = min(carts, len(readings[0].counts))
     heading = ["Sample", "Time", *(f"Encoder {i + 1} Pos" for i in range(encoders))]
@@ -65,16 +70,17 @@ def log_text(readings: Sequence[Reading], *, carts: int, reference: bool) -> str
 
 
 def save_left_over(folder: Path, *, carts: int) -> list[str]:
-    """Save partial records of raw files without a data file; return their names."""
+    """Save partial records of raw files that have no data file; return their names."""
     saved = []
     for path in sorted((folder / FOLDER).glob("*.raw")):
         try:
             recording = read_raw(path).header.recording
-            if path.stem.rpartition("-")[0] != recording.id:  # renamed, or a path to another place
+            # The file was renamed, or the id is a path to another folder.
+            if path.stem.rpartition("-")[0] != recording.id:
                 continue
             made = [folder / data_file(recording, partial=partial) for partial in (False, True)]
             if not any(file.exists() for file in made):
                 saved.append(save_record(path, folder=folder, carts=carts, partial=True))
-        except DataError:  # cut within its first lines
+        except DataError:  # cut off within its first lines
             continue
     return saved

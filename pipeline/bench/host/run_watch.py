@@ -1,4 +1,4 @@
-"""Checks on arriving lines: limits and wave, during a run and in the rest before it."""
+"""Check arriving lines against limits and wave, during a run and during the rest before it."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -10,18 +10,18 @@ from pipeline.bench.protocol.messages import Reading
 
 
 class LineWatch:
-    """Checks each line against the limits and the wave of an order.
+    """Check each line against the limits and the wave of an order.
 
     Parameters
     ----------
-    carts : the carts whose travel is watched; 0 without a true zero.
-    period : ms between lines; None for a stock bench, whose waves are not known to the ms.
+    carts : number of carts whose travel is watched; 0 if they have no true zero.
+    period : ms between lines; None for a stock bench, because its wave is not known to the ms.
 
     Attributes
     ----------
     is_astray : the motor's duty was not as ordered.
-    is_too_far : a cart was further from its zero than its limit.
-    is_unsafe : it was stopped because going on was not safe.
+    is_too_far : a cart was farther from its zero than its limit.
+    is_unsafe : the run was stopped because it was not safe to continue.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None) -> None:
@@ -40,7 +40,7 @@ class LineWatch:
         return ""
 
     def stop(self, why: str) -> str:
-        """Return why the run must stop for safety."""
+        """Mark the run as unsafe; return the message for its end."""
         self.is_unsafe = True
         return f"stopped: {why}"
 
@@ -69,24 +69,30 @@ class LineWatch:
 
 
 class _InARow:
-    """Distinguishes a condition that lasts two or more lines from a single garbled line."""
+    """Tell a condition that lasts two or more lines from a single garbled line."""
 
     def __init__(self) -> None:
-        self._since: int | None = None  # ms of the first of these lines
+        self._since: int | None = None  # ms of the first line with the condition
 
     def lasts(self, shows: bool, *, ms: int) -> bool:
-        """Return whether the condition has lasted; `ms`: the stamp of this line."""
+        """Return whether the condition has lasted.
+
+        Parameters
+        ----------
+        shows : whether this line shows it.
+        ms : stamp of this line.
+        """
         if not shows:
             self._since = None
         elif self._since is None:
             self._since = ms
         else:
-            return ms - self._since >= 4  # five lines at 1 kHz, else two at least
+            return ms - self._since >= 4  # at least two lines; at 1 kHz five
         return False
 
 
 class RunWatch(LineWatch):
-    """Checks the lines of a run, and passes them on in batches."""
+    """Check the lines of a run, and pass them to the observer in batches."""
 
     def __init__(
         self,
@@ -110,7 +116,7 @@ class RunWatch(LineWatch):
         self._let_in()
         self._batch += batch
         if trouble := super().check(batch):
-            return trouble  # before any observer hears of it: the stop goes out first
+            return trouble  # the stop is sent first, before any observer is informed
         now = time.monotonic()
         if now - self._forwarded > 0.05:
             self._forwarded = now
@@ -118,18 +124,18 @@ class RunWatch(LineWatch):
         return ""
 
     def forward(self, batch: Sequence[Reading]) -> None:
-        """Pass on the waiting lines, and this one."""
+        """Pass the waiting lines and these lines to the observer."""
         waiting, self._batch = [*self._batch, *batch], []
         if waiting:
             self._observer.readings(waiting, self._stream.anomalies())
 
 
 class RestWatch(LineWatch):
-    """Checks the lines of a rest, and keeps the last ones.
+    """Check the lines of a rest, and keep the last ones.
 
     Parameters
     ----------
-    since : ms from which lines are kept.
+    since : time in ms from which lines are kept.
     """
 
     def __init__(self, order: Order, *, carts: int, period: float | None, since: float) -> None:
@@ -149,6 +155,6 @@ class RestWatch(LineWatch):
 
     @property
     def swings(self) -> list[int]:
-        """The range of each encoder, counts."""
+        """The range of each encoder in the kept lines, in counts."""
         columns = zip(*(reading.counts for reading in self._readings), strict=True)
         return [max(column) - min(column) for column in columns]

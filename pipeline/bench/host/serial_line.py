@@ -1,7 +1,7 @@
-"""The serial line to a bench: open, shake hands, send, receive. No other module uses a port.
+"""The serial line to a bench: open it, identify the bench, send, receive.
 
-Every arriving line is checked. During a run the session does it. At any other time the line does it
-in `overhear`, since the motor must then be off.
+No other module uses a port. Every arriving line is checked: by the session during a run, and at any
+other time by `overhear` here, because the motor must then be off.
 """
 
 import re
@@ -27,13 +27,15 @@ from pipeline.bench.protocol.messages import (
 )
 from pipeline.errors import DataError, HardwareError
 
-_TRIES, _BETWEEN = 5, 0.4  # s; a bench just plugged in does not appear at once
-LUMP = 8192  # largest number of bytes read at once: many times those of one heartbeat
-_QUERIES, _ANSWER = 4, 0.6  # s; some boards boot for two seconds when the port is opened
-_LOOK = 0.005  # s between looks at the port
-FIRST_LINE = 2.0  # s a bench may take to begin
-_NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or a port, alone
-_QUIET = 0.05  # s without a byte, after which everything has arrived
+# Tries, and s between them; a bench just plugged in takes a moment to appear.
+_TRIES, _BETWEEN = 5, 0.4
+LUMP = 8192  # largest number of bytes read at once; many times those between two heartbeats
+# Queries, and s to wait for each answer; some boards restart for two seconds when opened.
+_QUERIES, _ANSWER = 4, 0.6
+_LOOK = 0.005  # s between two looks at the port
+FIRST_LINE = 2.0  # s that a bench may take to send the first line
+_NETWORK = re.compile(r"[\w.-]+:\d+|\d+|\[.*\]:\d+")  # a host and a port, or only a port
+_QUIET = 0.05  # s without a byte, after which all bytes have arrived
 
 
 class Runaway(HardwareError):
@@ -41,24 +43,24 @@ class Runaway(HardwareError):
 
 
 class SerialLine:
-    """An open serial line with a bench at its other end.
+    """An open serial line to a bench.
 
     Attributes
     ----------
-    bench : its own description, or a stock bench.
-    resets : number sent; each sets the present counts to zero.
+    bench : its description; for a bench that sends none, that of a stock bench.
+    resets : number of resets sent; each sets all counts to zero.
     """
 
     def __init__(self, port: "serial.SerialBase", *, name: str) -> None:
         self._port = port
         self._name = name
         self.bench = Description(name="stock", encoders=2, carts=2)
-        self._described = b""  # its description; b"": a stock bench gives none
-        self._asked = 0  # queries whose answers may still be under way
+        self._described = b""  # the bench's description; b"" for a stock bench, which sends none
+        self._asked = 0  # queries whose answers may still arrive
         self.resets = 0
-        self._lock = threading.RLock()  # of the port; `watched` looks at it in a thread
+        self._lock = threading.RLock()  # for the port, which `watched` also reads, in a thread
         self._in_run = False
-        self._is_cleared = False  # lines arriving now were sent while no run was on
+        self._is_cleared = False  # whether all arriving lines were sent after the last run
         self._ear = _Ear()
         self._runaway: Runaway | None = None
 
@@ -72,7 +74,7 @@ class SerialLine:
         """Close the port."""
         socket = getattr(self._port, "_socket", None)
         self._port.close()
-        if socket is not None:  # which pyserial forgets if the other end has hung up
+        if socket is not None:  # pyserial forgets it if the other end has closed the connection
             socket.close()
 
     def knows(self, letter: str) -> bool:
@@ -80,12 +82,12 @@ class SerialLine:
         return letter in self.bench.commands
 
     def send(self, *commands: Command) -> None:
-        """Send commands, in order.
+        """Send commands in order.
 
         Raises
         ------
         HardwareError : the line is gone.
-        Runaway : a run is to start, but the bench has run away before.
+        Runaway : a run is to start, but the bench has acted without an order before.
         """
         if self._runaway is not None and any(isinstance(c, Start) for c in commands):
             raise self._runaway
@@ -117,14 +119,14 @@ class SerialLine:
             try:
                 return self._port.read(LUMP)
             except (serial.SerialException, OSError, TypeError) as error:
-                # pyserial's POSIX port, closed under a read, raises a TypeError.
+                # pyserial raises a TypeError on POSIX if the port is closed during a read.
                 raise self._gone(error) from None
 
     def overhear(self) -> bytes:
-        """Return the bytes that have arrived between runs; if the motor is on, stop it.
+        """Return the bytes that arrived between runs; if the motor is on, stop it.
 
-        Lines of the last run may still be under way, and a stop may have been lost. Until `clear`,
-        the bench is only told to stop again.
+        Until `clear` is called, the motor may be on for harmless reasons: lines of the last run may
+        still arrive, and a stop may have been lost. So the bench is only stopped again.
 
         Raises
         ------
@@ -142,20 +144,20 @@ class SerialLine:
             return data
 
     def _run_away(self, why: str) -> None:
-        """Remember, and raise, that the bench acted without an order."""
+        """Raise an error because the bench acted without an order, and keep it for later starts."""
         self._runaway = Runaway(f"stopped: the bench {why}; switch its motor off and find out why")
         raise self._runaway
 
     @contextmanager
     def watched(self, tell: Callable[[str], None]) -> Iterator[None]:
-        """Watch the line in a thread between runs, during slow work of people and programs.
+        """Watch the line in a thread between runs, while a person or the program is busy.
 
-        The thread sends no heartbeat, so a run that hangs is still cut by the bench. At the end the
-        bench is told to stop once more.
+        The thread sends no heartbeat. So if a run hangs, the bench still cuts the motor. At the end
+        the bench is stopped once more.
 
         Parameters
         ----------
-        tell : called from the thread, once, if the bench runs away.
+        tell : called once from the thread, with a message, if the bench acts without an order.
         """
         over = threading.Event()
 
@@ -170,7 +172,7 @@ class SerialLine:
                     if not told:
                         tell(str(runaway))
                     told = True
-                except HardwareError:  # the next use of the line reports it
+                except HardwareError:  # the next use of the line reports the error
                     return
 
         thread = threading.Thread(target=watch, daemon=True)
@@ -184,12 +186,12 @@ class SerialLine:
                 self.stop()
 
     def part(self) -> None:
-        """Stop the bench for good, and check that it does.
+        """Stop the bench at the end of a session, and check that the motor is off.
 
         Raises
         ------
         HardwareError : the bench is gone.
-        Runaway : it drives its motor, or has done so since its last run.
+        Runaway : the motor is on, or has been on since the last run.
         """
         self.stop()
         self.clear()
@@ -198,7 +200,7 @@ class SerialLine:
             raise self._runaway
 
     def stop(self) -> None:
-        """Stop whatever the bench does.
+        """Stop the motor and the stream of lines.
 
         Raises
         ------
@@ -207,7 +209,12 @@ class SerialLine:
         self._write([Signal.STOP] if self.knows("s") else STOCK_STOP)
 
     def drain(self, *, longest: float = 1.0) -> bytes:
-        """Return the bytes that arrive until the line is quiet for this time, s."""
+        """Return the bytes that arrive until the line is quiet.
+
+        Parameters
+        ----------
+        longest : longest time to wait, in s.
+        """
         heard, end = bytearray(), time.monotonic() + longest
         quiet_at = time.monotonic() + _QUIET
         while True:
@@ -215,15 +222,16 @@ class SerialLine:
             if data:
                 heard += data
                 quiet_at = now + _QUIET
-            if now > min(end, quiet_at):  # seen after a look at the port: this computer may pause
+            # Checked after a look at the port, because this computer may pause.
+            if now > min(end, quiet_at):
                 return bytes(heard)
             time.sleep(_LOOK)
 
     def clear(self, *, queries: int = _QUERIES) -> None:
-        """Read away everything the bench has sent, so that the next bytes answer the next command.
+        """Discard all that the bench has sent, so that the next bytes answer the next command.
 
-        Silence proves nothing, as a busy computer may hold bytes back. But bytes behind the answer
-        to a query were sent after it. A stock bench gives no answer.
+        Silence is no proof, because a busy computer may hold bytes back. But bytes that follow the
+        answer to a query were sent after it. A stock bench does not answer queries.
 
         Raises
         ------
@@ -241,11 +249,11 @@ class SerialLine:
             self._is_cleared = True
 
     def shake_hands(self) -> None:
-        """Stop and zero the bench, and find out what it is.
+        """Stop the bench, set its counts to zero, and find out what bench it is.
 
         Raises
         ------
-        HardwareError : nothing there speaks this protocol.
+        HardwareError : nothing at the port speaks this protocol.
         Runaway : the motor is on between runs.
         """
         self.send(*STOCK_STOP)
@@ -255,7 +263,8 @@ class SerialLine:
             if (answer := self._answer()) is None:
                 continue
             self._is_cleared = True
-            if answer == before:  # a changed digit of a scale would move every limit
+            # Asked twice, because a changed digit of a scale would change every limit.
+            if answer == before:
                 self._believe(answer)
                 return
             before = answer
@@ -275,10 +284,14 @@ class SerialLine:
         self.send(Signal.RESET)
 
     def _answer(self, beginning: bytes = b"?") -> bytes | None:
-        """Send a query; return the answering line with this beginning, or None.
+        """Send a query; return the last answer, or None.
 
-        Answers to earlier queries may come first. If some came, and then none for a while, the
+        Answers to earlier queries may arrive first. If some arrive and then none for a while, the
         others are lost.
+
+        Parameters
+        ----------
+        beginning : with which the line of an answer begins.
         """
         self.send(Signal.QUERY)
         self._asked += 1
@@ -289,7 +302,8 @@ class SerialLine:
             lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
-            elif now > end:  # seen before a look at the port: this computer may pause
+            # Compared with a time before the look at the port, because this computer may pause.
+            elif now > end:
                 break
             else:
                 time.sleep(_LOOK)
@@ -299,10 +313,10 @@ class SerialLine:
         return answers[-1]
 
     def _try_stock(self) -> None:
-        """Let a stock bench stream for a moment, to count its encoders."""
-        # A run of 0.1 s without motion shows whether a stock bench is there at all.
+        """Let a stock bench send lines for a moment, to count its encoders."""
+        # A run of 0.1 s without motion makes a stock bench send lines.
         self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
-        self._in_run, self._is_cleared = False, True  # in it the motor must be off
+        self._in_run, self._is_cleared = False, True  # the motor must be off in this run too
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)
@@ -325,13 +339,13 @@ class SerialLine:
 
 
 class _Ear:
-    """Notices that the motor is on, from two lines in a row: a single one may be garbled."""
+    """Notice that the motor is on, from two lines in a row; a single line may be garbled."""
 
     def __init__(self) -> None:
         self._tail, self._on = b"", False
 
     def hear(self, data: bytes) -> int:
-        """Return the duty counts that drive the motor; 0: it is off."""
+        """Return the duty counts that drive the motor; 0 if it is off."""
         if not data:
             return 0
         *lines, self._tail = (self._tail + data).split(b"\n")
@@ -344,11 +358,15 @@ class _Ear:
 
 
 def open_line(port: str, *, baud: int) -> SerialLine:
-    """Open a port and shake hands; `port` is a device or any URL that pyserial knows.
+    """Open a port and identify the bench.
+
+    Parameters
+    ----------
+    port : a device, or any URL that pyserial knows.
 
     Raises
     ------
-    HardwareError : there is no such port, another program has it, or no bench answers.
+    HardwareError : there is no such port, another program uses it, or no bench answers.
     """
     line = SerialLine(_opened(port, baud=baud), name=port)
     try:
@@ -369,13 +387,13 @@ def _opened(port: str, *, baud: int) -> "serial.SerialBase":
         try:
             opened = serial.serial_for_url(port, do_not_open=True)
             opened.baudrate = baud
-            opened.timeout = 0  # a read returns what is there
+            opened.timeout = 0  # a read returns what has arrived
             opened.write_timeout = 0.5  # s
             opened.exclusive = True if "://" not in port else None
             opened.open()
         except (serial.SerialException, ValueError, OSError) as error:
             failure = _plain(error)
-            if isinstance(error, ValueError):  # a URL of no known form: a retry cannot help
+            if isinstance(error, ValueError):  # an unknown kind of URL: another try cannot help
                 break
             continue
         return opened
@@ -401,7 +419,7 @@ def _say_ports() -> str:
 
 
 def port_names() -> Sequence[str]:
-    """Return the serial ports of this machine, each with the device plugged in."""
+    """Return the serial ports of this computer, each with the name of its device."""
     return [
         f"{port.device} ({port.description})" if port.description != "n/a" else port.device
         for port in sorted(list_ports.comports())

@@ -1,8 +1,9 @@
-"""Runs on the bench, one at a time: rest, start, watch every line, and always stop.
+"""Carry out runs on the bench, one at a time: rest, start, check every line, and always stop.
 
-One loop watches a run. Every few milliseconds it reads the port, writes the bytes to the raw file,
-sends the heartbeat and checks the limits. The rest before the run works in the same way. The loop
-has no thread of its own: if it hangs, the heartbeat ends and the bench cuts its motor itself.
+One loop carries out a run. Every few milliseconds it reads the port, writes the bytes to the raw
+file, sends the heartbeat and checks the limits. The rest before the run works in the same way. The
+loop has no thread of its own: if the program hangs, the heartbeat ends and the bench cuts its
+motor.
 """
 
 import gc
@@ -32,16 +33,16 @@ from pipeline.errors import HardwareError
 from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.plan_words import hold_words
 
-SILENCE = 0.5  # s without a byte during a run: the bench is gone
-_NEARLY = 100.0  # ms before the end after which silence is the end; later lines are too many
-_STILL = 4  # counts that a cart at rest may flicker; in a valid run some free cart moves more
-_LOOK = 0.003  # s between looks at the port
-_AFTER_END = 0.02  # s that the last lines may take to arrive
+SILENCE = 0.5  # s without a byte during a run, after which the bench counts as gone
+_NEARLY = 100.0  # ms around the planned end: silence before it is the end, later lines are too many
+_STILL = 4  # counts by which a resting cart may flicker; in a valid run a free cart moves more
+_LOOK = 0.003  # s between two looks at the port
+_AFTER_END = 0.02  # s within which the last lines arrive
 
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep Python from collecting garbage: among all lines of a run that takes 0.1 s."""
+    """Turn off Python's garbage collection, which takes 0.1 s with all lines of a run in memory."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -52,17 +53,18 @@ def _no_collection() -> Iterator[None]:
 
 
 class Session:
-    """A bench and its state: which carts are held, by whom, and its true period.
+    """Runs on one bench; it remembers which carts are held, and the bench's true period.
 
     Parameters
     ----------
-    carts : of the submission; a bench that describes itself may have more, whose travel is watched
-        too.
+    carts : number of carts in the submission; a bench that describes itself may have more, and
+        their
+        travel is watched too.
     buttons : read before anything moves and at every look at the port.
 
     Attributes
     ----------
-    wish : the button that ended the run, or the rest before it; None: no button.
+    wish : the button that ended the run or the rest before it; None if no button did.
     """
 
     def __init__(
@@ -81,20 +83,20 @@ class Session:
         self._observer = observer
         self._moving = max(carts, line.bench.carts) if line.bench.commands else carts
         self._period = 1e3 * line.bench.period
-        self._zeroed_at = -1  # resets of the line when the carts were zeroed at rest
-        self._swings_out = False  # the last run took a cart past its travel
-        self._free: tuple[int, ...] | None = None  # as a person was last asked
+        self._zeroed_at = -1  # number of resets of the line when the carts were zeroed at rest
+        self._swings_out = False  # the last run moved a cart too far
+        self._free: tuple[int, ...] | None = None  # as a person was last asked to free them
         self._beat = float("-inf")
-        self._latest_beat = 0.0  # s, the longest time without a heartbeat in this run
+        self._latest_beat = 0.0  # s; the longest time without a heartbeat in this run
         self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
-        """Have the carts held or freed and brought to rest; return a problem, or "".
+        """Let the right carts be held and free, and wait until they rest; return a problem, or "".
 
         Raises
         ------
-        HardwareError : the carts cannot come to rest, or nobody can check it.
-        Runaway : the motor is on, or a cart is past its travel, without an order.
+        HardwareError : the carts do not come to rest, or nobody can confirm it.
+        Runaway : the motor is on, or a cart is too far out, without an order.
         """
         recording = order.recording
         self.wish = None
@@ -123,9 +125,14 @@ class Session:
     ) -> RunOutcome:
         """Carry out one run and write its raw file.
 
-        Whatever ends it early (a limit, the line, Ctrl-C, a signal), the bench is told to stop and
-        the data are in the file; an interrupt goes on to the caller. A held interrupt is let in
-        with `let_in` while lines arrive. Once the last line is there, the run is whole.
+        A limit, a fault of the line, Ctrl-C or a signal may end it early. In any case the bench is
+        stopped and the data are in the file. Interrupts are raised again.
+
+        Parameters
+        ----------
+        let_in : called while lines arrive; it raises an interrupt that is being held. Once the last
+            line
+            has arrived, the run is complete, and interrupts wait.
         """
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)
@@ -160,7 +167,7 @@ class Session:
         if not partial and recording.controller is None and stream.widest <= _STILL:
             partial = "no free cart moved: is it held, is its encoder plugged in, is the motor on?"
         fit = stream.fit()
-        if stream.lines > 1000 and not partial:  # enough to determine a clock's period
+        if stream.lines > 1000 and not partial:  # enough to determine the period of a clock
             self._say_other_period(fit.period)
             self._period = fit.period
         return RunOutcome(
@@ -184,11 +191,11 @@ class Session:
 
     @property
     def _stated(self) -> float | None:
-        """The ms between lines of a bench whose waves are known to the ms."""
+        """The ms between lines, if the bench's wave is known to the ms; None for a stock bench."""
         return self._period if self._line.bench.commands else None
 
     def _say_other_period(self, period: float) -> None:
-        """Report once that the bench does not keep its stated period (ms)."""
+        """Report, once, a bench whose period (ms) is not the stated one."""
         stated = 1e3 * self._line.bench.period
         if not self._line.bench.commands or abs(self._period / stated - 1) > OTHER_PERIOD:
             return
@@ -211,7 +218,10 @@ class Session:
         )
 
     def _rest(self, order: Order) -> str:
-        """Wait, in a run without motion, until the carts have come to rest."""
+        """Wait until the carts rest, watching them in a run without motion.
+
+        Returns a message if they still move, or "".
+        """
         recording = order.recording
         if recording.settle <= 0:
             return ""
@@ -220,10 +230,11 @@ class Session:
             self._observer.settling(recording, recording.settle)
             watch = RestWatch(
                 nothing,
-                # Carts that a run took too far swing back by themselves.
+                # Carts that were moved too far swing back without an order.
                 carts=0 if self._swings_out else self._zeroed,
                 period=self._stated,
-                since=1e3 * recording.settle - 500,  # the half second described below
+                # The last half second, in which the carts must be at rest.
+                since=1e3 * recording.settle - 500,
             )
             self._look_on(nothing, watch)
             self._swings_out = False
@@ -245,7 +256,8 @@ class Session:
 
         Raises
         ------
-        HardwareError : it ended early; Runaway : because the bench acted.
+        HardwareError : the rest ended early.
+        Runaway : it ended early because the bench acted without an order.
         """
         settle = nothing.recording.settle
         trouble = self._carry_out(nothing, self._stream(()), seconds=settle, watch=watch)
@@ -255,28 +267,29 @@ class Session:
 
     @property
     def _zeroed(self) -> int:
-        """The number of carts with a true zero: all or zero."""
+        """The number of carts with a true zero: all or none."""
         return self._moving if self._line.resets == self._zeroed_at else 0
 
     def _zero_at_rest(self, recording: Recording) -> None:
-        """Zero the bench before the motor's first run on this line, which was opened at any time.
+        """Set the counts to zero before the motor's first run on this line, while the carts rest.
 
-        After a lost line the carts still swing, so their position then is no zero for the travel
-        limit. A run by hand is not zeroed: a cart held by hand is never quite at rest.
+        When the line was opened, for example after it was lost, the carts may have been swinging.
+        The positions of that moment are no zero for the travel limit. Before a run by hand the
+        counts are not set to zero, because a cart held by hand never rests exactly.
         """
         if self._zeroed or not recording.amplitude:
             return
         self._line.send(Signal.RESET)
         self._line.drain()
-        self._beat = float("-inf")  # a reset disarms the watchdog
+        self._beat = float("-inf")  # a reset turns the watchdog off
         self._zeroed_at = self._line.resets
 
     def _by_hand(self) -> str:
-        """Return why a person wants this run to end, or "".
+        """Return why a person wants to end this run, or "".
 
         Raises
         ------
-        Stopped : the whole session must end.
+        Stopped : the person wants to end the whole session.
         """
         self.wish = self._buttons.pressed
         match self.wish:
@@ -301,9 +314,9 @@ class Session:
         begin: Callable[[], None] = lambda: None,
         arrived: Callable[[bytes], None] = lambda data: None,
     ) -> str:
-        """Start a run and listen to its end; return why it ended early, or "".
+        """Start a run and read its lines to the end; return why it ended early, or "".
 
-        Whatever ends it, the bench is told to stop.
+        The bench is stopped in any case.
         """
         partial = "stopped"
         try:
@@ -317,7 +330,7 @@ class Session:
     def _start(self, commands: Sequence[Command]) -> None:
         if why := self._by_hand():
             raise HardwareError(why)
-        self._line.clear()  # nothing of an earlier run belongs to this one
+        self._line.clear()  # no line of an earlier run may count for this one
         self._heartbeat()
         self._latest_beat = 0.0
         self._line.send(*commands)
@@ -330,7 +343,7 @@ class Session:
             self._beat = now
 
     def _lateness(self) -> str:
-        """Return a message if the bench's watchdog had reason to cut the motor, or ""."""
+        """Return a message if heartbeats were so late that the bench cut its motor, or ""."""
         if self._latest_beat < WATCHDOG:
             return ""
         return (
@@ -339,22 +352,23 @@ class Session:
         )
 
     def _stop(self, *, always: bool) -> None:
-        """Stop the bench; a stock one, whose stop zeroes it, only if the run did not end by itself.
+        """Stop the bench and discard later lines, which nobody asked for.
 
-        Then the line is cleared, as any later lines were not asked for.
+        On a stock bench, stopping also sets the counts to zero. So it is done only if the run ended
+        early.
         """
         try:
             try:
                 if always or self._line.knows("s"):
                     self._line.stop()
-            except KeyboardInterrupt:  # pressed twice: the stop still comes first
+            except KeyboardInterrupt:  # pressed twice; the bench is stopped first
                 self._line.stop()
                 raise
         except HardwareError as error:
             guard = "" if self._line.knows("k") else "; the motor may be on: switch it off"
             self._observer.remark(f"the stop could not be sent: {error}{guard}")
             return
-        with suppress(HardwareError):  # the next start reports it
+        with suppress(HardwareError):  # the next start reports the error
             self._line.clear(queries=1)
 
     @_no_collection()
@@ -366,11 +380,11 @@ class Session:
         watch: LineWatch,
         arrived: Callable[[bytes], None],
     ) -> str:
-        """Read lines until the run is over; return why it ended early, or ""."""
+        """Read lines until the run has ended; return why it ended early, or ""."""
         end = 1e3 * seconds
         since = last = time.monotonic()
         first: int | None = None  # ms of the first line
-        unread: float | None = None  # the time since which no valid line has come
+        unread: float | None = None  # time since the last valid line
         while True:
             self._heartbeat()
             now = time.monotonic()
@@ -388,9 +402,9 @@ class Session:
                         return watch.stop("the bench went on past the end of the run")
                 else:
                     unread = now if unread is None else unread
-                    if now - unread > 0.25:  # s: the motor may be on, and nobody sees it
+                    if now - unread > 0.25:  # s; the motor may be on without being watched
                         return watch.stop("the bench's lines cannot be read, so nothing is watched")
-            if why := self._by_hand():  # after the limits, whose message must never be lost
+            if why := self._by_hand():  # after the limits, whose messages are more important
                 return why
             quiet = now - last
             if stream.latest >= end - 2 * self._period and quiet > _AFTER_END:
@@ -403,6 +417,6 @@ class Session:
                     if stream.latest >= 0
                     else "the bench did not begin to stream"
                 )
-            if len(data) < LUMP:  # nothing waits
+            if len(data) < LUMP:  # no more bytes are waiting
                 since = now
                 time.sleep(_LOOK)

@@ -1,4 +1,4 @@
-"""Signals that end a program: turned into an exception, or held until some work is finished."""
+"""Signals that end a program: raise them as an exception, or hold them until work is finished."""
 
 import signal
 import threading
@@ -6,17 +6,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-# Told to end; the terminal was closed; Ctrl-Break on Windows. No system has all three.
+# Sent by kill, by a closing terminal, and by Ctrl-Break on Windows. No system has all three.
 _ENDING = ("SIGTERM", "SIGHUP", "SIGBREAK")
 
 
 class Stopped(KeyboardInterrupt):
-    """The program was told to end by a signal."""
+    """A signal asked the program to end."""
 
 
 @contextmanager
 def stopping_on_signals() -> Iterator[None]:
-    """Turn signals that end a program into an exception, so a run is stopped and saved."""
+    """Raise an exception for signals that end a program, so that a run is stopped and saved."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -25,7 +25,7 @@ def stopping_on_signals() -> Iterator[None]:
         raise Stopped(f"signal {number}")
 
     numbers = [getattr(signal, name) for name in _ENDING if hasattr(signal, name)]
-    # An ignored one stays ignored: with nohup a closed terminal must not end the program.
+    # An ignored signal stays ignored: after nohup, a closed terminal must not end the program.
     before = {n: signal.signal(n, stop) for n in numbers if signal.getsignal(n) == signal.SIG_DFL}
     try:
         yield
@@ -36,9 +36,9 @@ def stopping_on_signals() -> Iterator[None]:
 
 @contextmanager
 def signals_held() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C and similar signals until the block is over.
+    """Hold Ctrl-C and similar signals until the end of the block.
 
-    The yielded function lets them in.
+    Yields a function that raises a signal that has arrived.
     """
     waiting: list[int] = []
 
@@ -54,7 +54,7 @@ def signals_held() -> Iterator[Callable[[], None]]:
         waiting.append(number)
 
     numbers = [getattr(signal, name) for name in ("SIGINT", *_ENDING) if hasattr(signal, name)]
-    # A signal that is ignored, or ends the program at once, stays as it is.
+    # A signal that is ignored, or that ends the program at once, is left alone.
     before = {n: signal.signal(n, hold) for n in numbers if callable(signal.getsignal(n))}
     try:
         yield let_in

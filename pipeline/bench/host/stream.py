@@ -1,8 +1,8 @@
-"""From chunks of bytes to lines, with a count of every fault on the way.
+"""Turn chunks of bytes into lines, and count every fault on the way.
 
-A line is judged when the next one is there. A bench's clock never goes back, and no cart jumps out
-and back within two lines. So a readable line that differs from both neighbours was garbled. This
-costs one line of delay and no valid line.
+A line is judged when the next line has arrived. The bench's clock never runs backwards, and no cart
+jumps out and back within two lines. So a readable line that differs from both neighbours was
+garbled. This delays each line by one, and loses no valid line.
 """
 
 from array import array
@@ -14,9 +14,9 @@ from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
 
-# An encoder is stuck if it stands still in a window (ms) although it moved in the one before and
-# the motor drives as hard (duty counts; less moves no cart). An encoder that never moved is stuck
-# if it is on the driven cart, or beside a moving neighbour.
+# An encoder is stuck if it moved in one window (ms) and stands still in the next, although the
+# motor drives as hard. Fewer duty counts than the second number move no cart. An encoder that never
+# moved is stuck if it is on the driven cart, or if its neighbour moves.
 _WINDOW, _DRIVEN = 1000, 8
 
 
@@ -25,14 +25,16 @@ class Stream:
 
     Parameters
     ----------
-    encoders : number of fields that are counts.
-    period : expected ms between lines; `stated`: by the bench itself.
+    encoders : number of encoder counts in a line.
+    period : expected ms between lines.
+    stated : the bench itself stated this period.
     free : the carts that can move; their encoders are watched.
-    closed : the loop is closed: its duty may kick for a single line when an encoder flickers.
+    closed : the loop is closed, so that the duty may jump for a single line when an encoder
+        flickers.
 
     Attributes
     ----------
-    broken : a fault of the bench's clock, after which no line belongs to this run; "": none.
+    broken : a fault of the bench's clock that ended the run; "" without one.
     """
 
     def __init__(
@@ -49,27 +51,28 @@ class Stream:
         self._closed = closed
         self._expected = period
         self._tail = b""
-        self._before: Reading | None = None  # the last line passed on
-        self._held: Reading | None = None  # waits for its successor
+        self._before: Reading | None = None  # the last line that was returned
+        self._held: Reading | None = None  # waits for the next line, to be judged
         self._stamps = array("q")
         self._missing = _MissingSoFar(period)
         self._garbled = 0
-        self._garbled_lines = 0  # two merged lines are one garbled place and two lines
+        self._garbled_lines = 0  # two lines that merged count once in `_garbled`, twice here
         self._late = 0
         self._resets = 0
         self.broken = ""
-        # The smallest difference of arrival and stamp, s: in the second before, and in this one.
+        # Smallest difference between arrival and time stamp, in s: during the last second, and
+        # during this one.
         self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
 
     @property
     def lines(self) -> int:
-        """The number of valid lines passed on."""
+        """The number of valid lines so far."""
         return len(self._stamps)
 
     @property
     def latest(self) -> int:
-        """The stamp of the newest line, judged or not, ms; -1 without lines."""
+        """The stamp of the newest line in ms, judged or not; -1 without lines."""
         newest = self._held or self._before
         return -1 if newest is None else newest.ms
 
@@ -79,11 +82,19 @@ class Stream:
         return self._watch.widest
 
     def fit(self) -> StampFit:
-        """Return the clock that explains the stamps; too slow during a run."""
+        """Return the clock that explains the time stamps.
+
+        It takes too long to be used during a run.
+        """
         return fit_stamps(np.array(self._stamps), period=self._expected, stated=self._stated)
 
     def anomalies(self, fit: StampFit | None = None) -> Anomalies:
-        """Return all faults so far; lost lines are estimated until there is a `fit`."""
+        """Return all faults so far.
+
+        Parameters
+        ----------
+        fit : the clock of the complete run; without it, the number of lost lines is an estimate.
+        """
         missing = self._missing.lines if fit is None else fit.missing
         return Anomalies(
             lost=max(0, missing - self._garbled_lines),
@@ -96,11 +107,16 @@ class Stream:
     def feed(self, data: bytes, *, since: float, now: float) -> list[Reading]:
         """Return the lines that are now known to be valid.
 
-        The data came between `since`, when the port was last found empty, and `now` (s, on any
-        steady clock). So a host that was busy does not make lines late.
+        Parameters
+        ----------
+        data : new bytes from the port.
+        since : time in s when the port was last found empty; data that waited while this computer
+            was busy
+            are not late.
+        now : time in s, of the same clock.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")
-        if len(self._tail) > 512:  # bytes without a line end: noise
+        if len(self._tail) > 512:  # bytes without a line end are noise
             lines.append(self._tail)
             self._tail = b""
         valid: list[Reading] = []
@@ -113,7 +129,7 @@ class Stream:
         return valid
 
     def finish(self) -> list[Reading]:
-        """Return the line that still waited for its successor at the end of the run."""
+        """Return the last line of the run, which waited for a next line to be judged."""
         last, self._held = self._held, None
         if last is None or (self._before is not None and last.ms < self._before.ms):
             return []
@@ -140,7 +156,7 @@ class Stream:
         self._garbled_lines += lines
 
     def _judge(self, after: Reading) -> list[Reading]:
-        """Return the waiting line if its neighbours confirm it, and let this one wait."""
+        """Return the waiting line if its neighbours confirm it; the new line then waits."""
         if self.broken:
             return []
         before, held, self._held = self._before, self._held, after
@@ -166,13 +182,14 @@ class Stream:
         self._keep(held)
         if self.lines > 500:
             went_on = held.ms - self._stamps[-501]
-            # Half of their time would be another period, less is a clock that stands still.
+            # Half of the expected time could be another period; a quarter is a clock that stands
+            # still.
             if went_on < 0.25 * 500 * self._expected:
                 self._break(f"the bench's clock stands still: 500 lines in {went_on} ms of it")
         return [held]
 
     def _break(self, why: str) -> list[Reading]:
-        """End the run here."""
+        """End the run because of a fault of the clock."""
         self.broken, self._held = why, None
         return []
 
@@ -183,20 +200,20 @@ class Stream:
 
     def _time(self, reading: Reading, *, since: float, now: float) -> None:
         due = 1e-3 * reading.ms
-        if now - self._lead_from > 1.0:  # s; then the two clocks are aligned again
+        if now - self._lead_from > 1.0:  # s; compare the two clocks again
             self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
         self._new_lead = min(self._new_lead, now - due)
-        # 0.02 s behind the earliest lines: they waited somewhere for each other.
+        # Lines more than 0.02 s later than the earliest ones were held back somewhere.
         self._late += since - due > min(self._lead, self._new_lead) + 0.02
 
 
 def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool) -> bool:
-    """Return whether a line contradicts both neighbours, which agree with each other."""
+    """Return whether a line contradicts both neighbours, while these agree with each other."""
     if before.ms <= after.ms and not before.ms <= held.ms <= after.ms:
         return True
     if held.ms < before.ms:
         return True
-    # A hit on an end stop moves a true reading by this many counts a line.
+    # A cart that hits an end stop changes its count by at most this much per ms.
     room = 32 * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
@@ -206,11 +223,12 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
 
 
 class _MissingSoFar:
-    """Lines missing, second by second.
+    """An estimate of the missing lines, second by second.
 
-    A clock itself skips a stamp now and then. If one even clock explains the stamps of a second, no
-    line is missing, and it gives the period for other seconds. Until then, the smallest mean
-    spacing of any second is nearest to the true period, if few lines are lost.
+    Even without a loss, the clock skips a time stamp now and then. If one regular clock explains
+    the stamps of a second, no line is missing in it, and the period of this clock is used for other
+    seconds. Until there is such a second, the smallest mean spacing of any second is used. It is
+    nearest to the true period if few lines are lost.
     """
 
     def __init__(self, period: float) -> None:
@@ -220,7 +238,7 @@ class _MissingSoFar:
         self.lines = 0
 
     def tick(self, ms: int) -> None:
-        """Record a stamp."""
+        """Record the time stamp of a line, in ms."""
         self._stamps.append(ms)
         span, count = ms - self._stamps[0], len(self._stamps) - 1
         if span < _WINDOW or not count:
@@ -229,7 +247,7 @@ class _MissingSoFar:
             self._period, self._seen_even = even, True
         else:
             measured = span / count
-            near = abs(measured / self._expected - 1) < 0.005  # a clock may be off by this much
+            near = abs(measured / self._expected - 1) < 0.005  # a clock may be wrong by this much
             first = self._period == self._expected
             if near and not self._seen_even and (first or measured < self._period):
                 self._period = measured
@@ -238,7 +256,7 @@ class _MissingSoFar:
 
 
 class _EncoderWatch:
-    """Notices encoders that stand still although the motor does not."""
+    """Notice encoders that stand still although the motor drives."""
 
     def __init__(self, carts: Iterable[int]) -> None:
         self._encoders = [cart - 1 for cart in carts]
@@ -252,7 +270,7 @@ class _EncoderWatch:
 
     @property
     def stuck(self) -> int:
-        """The number of encoders that froze while driven, or never moved though carts had to."""
+        """The number of encoders that stopped while driven, or never moved although they had to."""
         moved = {encoder: seen.width for encoder, seen in self._overall.items()}
         pushed = self._driven.width >= _DRIVEN
         never = {
@@ -261,13 +279,13 @@ class _EncoderWatch:
             if width == 0
             and pushed
             and (encoder == 0 or max(moved.values()) >= 200)
-            and self._earlier is not None  # a run shorter than a window shows nothing
+            and self._earlier is not None  # a run shorter than a window proves nothing
         }
         return len(self._frozen | never)
 
     @property
     def widest(self) -> int:
-        """The largest range of any watched encoder, counts."""
+        """The largest range of any watched encoder, in counts."""
         return max((seen.width for seen in self._overall.values()), default=0)
 
     def see(self, readings: Sequence[Reading]) -> None:
@@ -301,7 +319,7 @@ class _EncoderWatch:
 
 
 class _Range:
-    """The smallest and the largest of some integers."""
+    """The range of some integers."""
 
     def __init__(self) -> None:
         self._low: int | None = None
@@ -309,11 +327,11 @@ class _Range:
 
     @property
     def width(self) -> int:
-        """Their difference; 0 without any."""
+        """The largest minus the smallest; 0 without integers."""
         return 0 if self._low is None else self._high - self._low
 
     def widen(self, values: Sequence[int]) -> None:
-        """Include some more."""
+        """Include more integers."""
         low, high = min(values), max(values)
         self._high = high if self._low is None else max(self._high, high)
         self._low = low if self._low is None else min(self._low, low)

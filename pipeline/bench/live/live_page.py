@@ -1,8 +1,8 @@
 """A page in the browser that shows a session at the bench while it runs.
 
-The desk shows it among its own pages. `cartlab acquire --web` serves it alone, to this computer
-only, and only to visitors with the address, which holds a secret for this session. Requests from
-other pages are refused. The server polls for news a few times a second, so a slow browser never
+The desk shows the same content on its own pages. `cartlab acquire --web` serves this page alone,
+and only to visitors on this computer who have the address, which contains a secret. Requests from
+other pages are refused. The server looks for news a few times a second, so a slow browser never
 delays the acquisition.
 """
 
@@ -29,7 +29,7 @@ from pipeline.resources import TEMPLATES
 from pipeline.web.guard import Guard, find_site, list_own_names, refuse
 from pipeline.web.server import Served
 
-_LARGEST_ANSWER = 200  # largest body of a button's request, bytes
+_LARGEST_ANSWER = 200  # bytes; the largest request of a button
 _FILES = {
     "": ("live.html", "text/html"),
     "live.js": ("live.js", "text/javascript"),
@@ -41,18 +41,18 @@ _FILES = {
 def stream_news(
     session: ShownSession, *, is_over: Callable[[], bool], last_words: str = ""
 ) -> Response:
-    """Return the news of a session as it comes, in the server's own loop.
+    """Return the news of a session as a stream of events.
 
     Parameters
     ----------
     is_over : whether the session has ended.
-    last_words : an event that says so.
+    last_words : the event that reports the end.
     """
-    if session.viewers >= 8:  # each costs a little of the processor
+    if session.viewers >= 8:  # each open page costs a little computing time
         return PlainTextResponse("too many pages show this session", status_code=503)
 
     async def news() -> AsyncIterator[str]:
-        """Send changes as they happen; a slow page gets less, not later."""
+        """Yield changes when they happen; a slow page gets fewer of them, not later ones."""
         session.viewers += 1
         try:
             said, over = time.monotonic(), is_over()
@@ -77,7 +77,7 @@ def stream_news(
 
 
 def press_button(session: ShownSession, wish: str, number: str) -> int:
-    """Pass on a button; return the status to answer with, 204 if it is accepted."""
+    """Pass a pressed button to the session; return the HTTP status, 204 if it is accepted."""
     try:
         heeded = session.heed(wish, int(number))
     except ValueError:
@@ -86,21 +86,21 @@ def press_button(session: ShownSession, wish: str, number: str) -> int:
 
 
 def live_view() -> str:
-    """Return the view of a session, with its buttons, for live.js to fill."""
+    """Return the HTML of a session's view with its buttons, which live.js fills in."""
     return (TEMPLATES / "live-view.html").read_text(encoding="utf-8")
 
 
 class LivePage(LiveState):
-    """An observer with a page in the browser; a context manager that serves the page.
+    """An observer that serves a page in the browser; a context manager.
 
     Parameters
     ----------
     folder : of the submission.
-    port : to serve at; 0: a free one.
+    port : to listen at; 0: any free port.
 
     Attributes
     ----------
-    url : of the page, including the secret: for the person only, not for a file or a log.
+    url : of the page, with the secret. Show it only to the person; write it to no file or log.
     """
 
     def __init__(self, folder: Path, *, port: int = 0) -> None:
@@ -129,7 +129,7 @@ class LivePage(LiveState):
     def __exit__(self, *raised: object) -> None:
         self.end()
         self._closing = True
-        until = time.monotonic() + 1.0  # s for open pages to hear that the session is over
+        until = time.monotonic() + 1.0  # s for open pages to learn that the session has ended
         while self.viewers and time.monotonic() < until:
             time.sleep(0.02)
         self._served.stop()
@@ -145,7 +145,7 @@ class LivePage(LiveState):
         return Response(text.replace("<!-- the view -->", live_view()), media_type=kind)
 
     async def _press(self, request: Request) -> Response:
-        """Take a button: `done` with an instruction, or a wish for a turn, by its number."""
+        """Handle a pressed button; its number says which instruction or turn it is for."""
         if int(request.headers.get("content-length", _LARGEST_ANSWER + 1)) > _LARGEST_ANSWER:
             return PlainTextResponse("too long", status_code=413)
         try:
@@ -160,20 +160,20 @@ class LivePage(LiveState):
 
 
 class _SecretPath:
-    """Access for visitors with the secret, with which every address begins."""
+    """Admit visitors who have the secret, with which every address begins."""
 
     arrivals = False
 
     def __init__(self, secret: str, *, port: int) -> None:
         self._sites = list_own_names(port)
-        self._secret = f"{secret}/"  # relative links of the page start at the slash
+        self._secret = f"{secret}/"  # the slash makes relative links of the page work
 
     def site(self, headers: Headers) -> str:
-        """Return by which name of this computer the request asks."""
+        """Return the name of this computer that the request uses."""
         return find_site(self._sites, headers)
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
-        """Return the rest of the path."""
+        """Return the path without the secret, or a refusal."""
         secret, slash, inside = scope["path"].removeprefix("/").partition("/")
         if secrets.compare_digest((secret + slash).encode(), self._secret.encode()):
             return {"path": f"/{inside}"}

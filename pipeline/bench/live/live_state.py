@@ -1,6 +1,6 @@
 """The content of a live page.
 
-Written by the acquisition in one thread, read by a server in another.
+The acquisition writes it in one thread, and a server reads it in another.
 """
 
 import threading
@@ -24,27 +24,29 @@ from pipeline.submission import (
 )
 
 Phase = Literal["waiting", "settling", "recording", "thinking", "over"]
-FRAME = 1 / 30  # s between looks for news
+FRAME = 1 / 30  # s between two looks for news
 
-_APART = 5  # ms between points shown: a screen of ten seconds cannot show more
+_APART = 5  # ms between points; a screen that shows ten seconds cannot show more
 
 
 class ShownSession(ABC):
-    """The content that pages show, written in one thread and read in another; and their buttons.
+    """What pages show of a session, and their buttons.
+
+    One thread writes it and another reads it.
 
     Attributes
     ----------
-    version : grows whenever `snapshot` changes.
-    viewers : pages that are open.
+    version : grows with every change of `snapshot`.
+    viewers : number of open pages.
     """
 
     def __init__(self) -> None:
         self.version = self.viewers = 0
         self._lock = threading.Lock()
         self._run = 0
-        # Points that a page has not fetched within 12 s are dropped.
+        # The points of the last 12 s; a page that comes later misses the earlier ones.
         self._points: deque[Sequence[float]] = deque(maxlen=2400)
-        self._end = 0  # points of this run, including dropped ones
+        self._end = 0  # points of this run, including those dropped
         self._counters: Mapping[str, int] = _count(0, Anomalies())
 
     @abstractmethod
@@ -53,16 +55,20 @@ class ShownSession(ABC):
 
     @abstractmethod
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button.
+        """Accept a pressed button; return whether it counts.
 
-        `done` with an instruction or a wish for a turn; return whether it counts.
+        Parameters
+        ----------
+        wish : `done`, or one of the buttons of a run.
+        number : of the instruction that is done, or of the turn in which the page showed the
+            button.
         """
 
     def points(self, *, run: int, start: int) -> dict[str, Any]:
-        """Return the points since `start` of a run; all points if the run has changed.
+        """Return the points of a run from index `start` on; all points if the run has changed.
 
-        Each is (t in s, input, target, x1, x2, …). `end` is where the next ones start; `counters`
-        are those of the run so far.
+        Each point is (t in s, input, target, x1, x2, …). In the result, `end` is the index of the
+        next point, and `counters` are the numbers of lines and faults of the run so far.
         """
         with self._lock:
             first = self._end - len(self._points)
@@ -76,11 +82,11 @@ class ShownSession(ABC):
             }
 
     def follow(self, *, version: int = 0) -> Iterator[list[tuple[str, Mapping[str, Any]]]]:
-        """Yield, at each request, what changed since the last one: kind of news and content.
+        """Yield, whenever it is resumed, the changes since the last time: kind of news and content.
 
         Parameters
         ----------
-        version : of the state that the reader has already.
+        version : of the state that the reader already has.
         """
         run = start = 0
         while True:
@@ -97,7 +103,7 @@ class ShownSession(ABC):
     def _keep(
         self, run: int, points: Sequence[Sequence[float]], counters: Mapping[str, int]
     ) -> None:
-        """Add points of a run, which may be a new one; the caller has the lock."""
+        """Add points of the current or of a new run; the caller must hold the lock."""
         if run != self._run:
             self._run, self._end = run, 0
             self._points.clear()
@@ -111,7 +117,8 @@ class LiveState(ShownSession):
 
     Parameters
     ----------
-    folder : of the submission, whose units are shown; it exists once a plan is announced.
+    folder : of the submission, whose units are shown; it need not exist before the plan is
+        announced.
 
     Attributes
     ----------
@@ -129,14 +136,14 @@ class LiveState(ShownSession):
         self._partial: dict[str, str] = {}
         self._now: Recording | None = None
         self._phase: Phase = "waiting"
-        self._instruction: tuple[int, str] | None = None  # its number, its text
+        self._instruction: tuple[int, str] | None = None  # number and text
         self._asked = 0
-        self._stage = ""  # what it is computing
+        self._stage = ""  # what is being computed
         self._thoughts = 0
         self._thought = ""
         self._remarks: deque[str] = deque(maxlen=20)
         self.version = 1
-        self._last_ms, self._lines = -_APART, 0  # of this run
+        self._last_ms, self._lines = -_APART, 0  # of the current run
 
     # ------------------------------------------------------------- by the acquisition
 
@@ -148,11 +155,11 @@ class LiveState(ShownSession):
             self.version += 1
 
     def confirm(self, instruction: str) -> None:
-        """Show what a person must do, and wait until it is done or another button is pressed.
+        """Show what a person must do; wait until it is done or another button is pressed.
 
         Raises
         ------
-        ConfigError : the page was closed meanwhile, so nobody can confirm.
+        ConfigError : the page was closed, so nobody can confirm.
         """
         with self._lock:
             self._asked += 1
@@ -161,25 +168,25 @@ class LiveState(ShownSession):
             while (
                 self._instruction is not None and self._phase != "over" and not self.buttons.pressed
             ):
-                self._answered.wait(0.2)  # s: the page may be closed meanwhile
+                self._answered.wait(0.2)  # s; the page may be closed in the meantime
             unanswered, self._instruction = self._instruction is not None, None
             self.version += 1
             if unanswered and not self.buttons.pressed:
                 raise ConfigError(f"nobody confirmed: {instruction}")
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Announce that the carts come to rest first."""
+        """Announce that the carts must come to rest first."""
         self._change("settling", recording)
 
     def started(self, recording: Recording) -> None:
-        """Announce that the bench streams."""
+        """Announce that the run has started."""
         with self._lock:
             self._last_ms, self._lines = -_APART, 0
             self._keep(self._run + 1, [], _count(0, Anomalies()))
         self._change("recording", recording)
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Keep a few of the lines that arrived."""
+        """Store a few of the lines that arrived."""
         kept = []
         for reading in batch:
             if reading.ms - self._last_ms >= _APART:
@@ -203,9 +210,10 @@ class LiveState(ShownSession):
         self._change("waiting", None)
 
     def remark(self, sentence: str) -> None:
-        """Announce something that concerns no single run."""
+        """Announce something that does not belong to a single run."""
         with self._lock:
-            if sentence not in self._remarks:  # an exploration opens the line once in each turn
+            # An exploration opens the line in every turn and repeats its remarks.
+            if sentence not in self._remarks:
                 self._remarks.append(sentence)
             self.version += 1
 
@@ -216,7 +224,7 @@ class LiveState(ShownSession):
         self._change("thinking", None)
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is doubted, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, and the next recording with its reason."""
         with self._lock:
             self._thoughts += 1
             self._thought = sentence
@@ -228,7 +236,7 @@ class LiveState(ShownSession):
             self.version += 1
 
     def _point(self, reading: Reading) -> tuple[float, ...]:
-        """Return a line in the submission's units, or in counts if it states none."""
+        """Return a line as a point in the submission's units, or in counts without units."""
         position, drive, carts = 1.0, 1.0, len(reading.counts)
         if self._submission is not None:
             system = self._submission.system
@@ -243,7 +251,7 @@ class LiveState(ShownSession):
     # ------------------------------------------------------------------ by the server
 
     def answer(self, number: int) -> bool:
-        """Confirm instruction `number`; an earlier one does not count."""
+        """Confirm the instruction with this number; one with another number does not count."""
         with self._lock:
             if self._instruction is None or self._instruction[0] != number:
                 return False
@@ -253,7 +261,7 @@ class LiveState(ShownSession):
             return True
 
     def press(self, wish: Wish, *, turn: int) -> bool:
-        """Press a button; return whether it will be accepted."""
+        """Press a button; return whether the acquisition accepts it."""
         heeded = self.buttons.press(wish, turn=turn)
         with self._lock:
             self.version += 1
@@ -261,16 +269,13 @@ class LiveState(ShownSession):
         return heeded
 
     def heed(self, wish: str, number: int) -> bool:
-        """Take a button.
-
-        `done` with an instruction or a wish for a turn; return whether it counts.
-        """
+        """Accept a pressed button; return whether it counts. See `ShownSession.heed`."""
         if wish == "done":
             return self.answer(number)
         return wish in WISHES and self.press(wish, turn=number)
 
     def end(self) -> None:
-        """Announce the end."""
+        """Announce the end of the session."""
         self._change("over", None)
 
     def snapshot(self) -> dict[str, Any]:
@@ -304,7 +309,7 @@ class LiveState(ShownSession):
             }
 
     def _waits(self) -> str:
-        """Return in one sentence what the program is doing, or waiting for."""
+        """Return a sentence on what the program is doing or waiting for."""
         if self._phase == "over":
             return "The session is over."
         if self.buttons.pressed == "stop":
@@ -335,7 +340,7 @@ class LiveState(ShownSession):
 
 
 def _unit(scale: InputScale | PositionScale | None) -> str:
-    """Return the unit that counts are converted to; without a scale they stay counts."""
+    """Return the unit into which counts are converted; without a scale it is "count"."""
     return scale.unit if scale and scale.per_count else "counts"
 
 

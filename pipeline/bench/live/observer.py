@@ -1,4 +1,4 @@
-"""Observers of a session at the bench: the terminal, a web page, a test."""
+"""The interface for those who watch a session at the bench: the terminal, a web page, a test."""
 
 import threading
 from collections.abc import Sequence
@@ -14,14 +14,14 @@ WISHES: tuple[Wish, ...] = get_args(Wish)
 
 @dataclass(frozen=True, kw_only=True)
 class Anomalies:
-    """Faults on the line, with their numbers.
+    """The number of faults on the line.
 
     Attributes
     ----------
-    lost : lines that never came, by their time stamps.
-    garbled : unreadable lines, and merged ones.
-    late : lines that came together, long after they were due.
-    resets : the bench's clock started again during the run.
+    lost : lines that never arrived, by their time stamps.
+    garbled : lines that could not be read, and merged ones.
+    late : lines that arrived together, long after they were due.
+    resets : restarts of the bench's clock during the run.
     stuck : encoders that did not move although the motor did.
     """
 
@@ -32,7 +32,7 @@ class Anomalies:
     stuck: int = 0
 
     def __str__(self) -> str:
-        """Return a list such as "12 lines lost, 3 late", or "none"."""
+        """Return the faults as a list, such as "12 lines lost, 3 late", or "none"."""
         words = [
             (self.lost, "line" if self.lost == 1 else "lines", "lost"),
             (self.garbled, "garbled"),
@@ -49,12 +49,12 @@ class RunOutcome:
 
     Attributes
     ----------
-    lines : valid lines kept.
-    partial : why it ended early; "": it did not.
+    lines : number of valid lines.
+    partial : why it ended early; "" if it did not.
     remarks : notes for the person, one sentence each.
     is_astray : the bench acted without an order, so it gets no more orders.
-    is_unsafe : going on was not safe, so the same is not tried again.
-    wish : the button that ended it; None: no button.
+    is_unsafe : it was not safe to continue, so the same recording is not tried again.
+    wish : the button that ended it; None if no button did.
     """
 
     recording: Recording
@@ -68,31 +68,31 @@ class RunOutcome:
 
 
 class Observer(Protocol):
-    """Events of an acquisition; every call returns at once except `confirm`."""
+    """Receives the events of an acquisition; every method returns at once, except `confirm`."""
 
     def planned(self, plan: Plan, done: frozenset[str]) -> None:
         """Announce the recordings, and the ids of those that exist."""
         ...
 
     def confirm(self, instruction: str) -> None:
-        """Have a person do something at the bench, and wait until it is done.
+        """Ask a person to do something at the bench, and wait until it is done.
 
         Raises
         ------
-        ConfigError : there is nobody who could.
+        ConfigError : no person can be asked.
         """
         ...
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Announce that the carts come to rest first."""
+        """Announce that the carts must come to rest first."""
         ...
 
     def started(self, recording: Recording) -> None:
-        """Announce that the bench streams."""
+        """Announce that the run has started."""
         ...
 
     def readings(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Pass on new lines, in order; `anomalies` are those of this run so far."""
+        """Receive new lines in order, and all faults of this run so far."""
         ...
 
     def finished(self, outcome: RunOutcome) -> None:
@@ -100,7 +100,7 @@ class Observer(Protocol):
         ...
 
     def remark(self, sentence: str) -> None:
-        """Announce something that concerns no single run."""
+        """Announce something that does not belong to a single run."""
         ...
 
     def thinking(self, stage: str) -> None:
@@ -108,12 +108,12 @@ class Observer(Protocol):
         ...
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is doubted, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, and the next recording with its reason."""
         ...
 
 
 class Observers:
-    """Several observers as one; the first of them asks a person to confirm."""
+    """Several observers that act as one; the first one asks a person to confirm."""
 
     def __init__(self, observers: Sequence[Observer]) -> None:
         self._observers = tuple(observers)
@@ -124,17 +124,17 @@ class Observers:
             observer.planned(plan, done)
 
     def confirm(self, instruction: str) -> None:
-        """Have a person do something at the bench, and wait until it is done."""
+        """Ask a person to do something at the bench, and wait until it is done."""
         for observer in self._observers[:1]:
             observer.confirm(instruction)
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Announce that the carts come to rest first."""
+        """Announce that the carts must come to rest first."""
         for observer in self._observers:
             observer.settling(recording, seconds)
 
     def started(self, recording: Recording) -> None:
-        """Announce that the bench streams."""
+        """Announce that the run has started."""
         for observer in self._observers:
             observer.started(recording)
 
@@ -149,7 +149,7 @@ class Observers:
             observer.finished(outcome)
 
     def remark(self, sentence: str) -> None:
-        """Announce something that concerns no single run."""
+        """Announce something that does not belong to a single run."""
         for observer in self._observers:
             observer.remark(sentence)
 
@@ -159,21 +159,22 @@ class Observers:
             observer.thinking(stage)
 
     def thought(self, sentence: str) -> None:
-        """Announce what is known, what is doubted, and the next recording with its reason."""
+        """Announce what is known, what is uncertain, and the next recording with its reason."""
         for observer in self._observers:
             observer.thought(sentence)
 
 
 class Buttons:
-    """A person's wish for the present run: pressed in one thread, carried out in another.
+    """The button that a person pressed for the current run.
 
-    A button does nothing by itself. The acquisition states which buttons it would accept now,
-    checks them in every turn of its loop, and decides.
+    It is pressed in one thread and acted on in another. A button does nothing by itself. The
+    acquisition states which buttons it accepts now, checks in every turn of its loop which one was
+    pressed, and decides what to do.
 
     Attributes
     ----------
-    turn : the try and the recording of the offer; a press for another turn does not count.
-    offered : buttons accepted now besides "stop", which always is.
+    turn : number of the current offer; a press that was meant for another turn does not count.
+    offered : buttons accepted now, apart from "stop", which is always accepted.
     """
 
     def __init__(self) -> None:
@@ -184,11 +185,11 @@ class Buttons:
 
     @property
     def pressed(self) -> Wish | None:
-        """The button pressed in this turn; "stop" stays pressed."""
+        """The button pressed in this turn, if any; "stop" stays pressed."""
         return self._pressed
 
     def begin(self) -> None:
-        """Begin another turn, with nothing offered yet."""
+        """Begin another turn, in which no button is offered yet."""
         with self._lock:
             self.turn += 1
             self.offered = ()
@@ -196,12 +197,15 @@ class Buttons:
                 self._pressed = None
 
     def offer(self, *wishes: Wish) -> None:
-        """Set the accepted buttons; a button already pressed in this turn stays pressed."""
+        """Set which buttons are accepted.
+
+        One that was already pressed in this turn stays pressed.
+        """
         with self._lock:
             self.offered = wishes
 
     def press(self, wish: Wish, *, turn: int) -> bool:
-        """Press a button; return whether it is accepted. "stop" is, at any time."""
+        """Press a button; return whether it is accepted. "stop" is always accepted."""
         with self._lock:
             if wish != "stop" and (self._pressed or turn != self.turn or wish not in self.offered):
                 return False

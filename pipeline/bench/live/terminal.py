@@ -1,4 +1,4 @@
-"""A session at the bench, shown in the terminal; nearly silent if stderr is not a terminal."""
+"""Show a session at the bench in the terminal; print little if stderr is not a terminal."""
 
 import sys
 import time
@@ -22,11 +22,11 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 class Terminal:
-    """Shows the plan, the run and the positions while they change.
+    """An observer that shows the plan, the run and the positions in the terminal.
 
     Parameters
     ----------
-    yes : take everything a person is asked to do as done.
+    yes : take everything that a person is asked to do as done.
     """
 
     def __init__(self, *, yes: bool = False, console: Console | None = None) -> None:
@@ -54,11 +54,11 @@ class Terminal:
         self._view.done = set(done)
 
     def confirm(self, instruction: str) -> None:
-        """Ask the person at the keyboard and wait.
+        """Ask the person at the keyboard, and wait.
 
         Raises
         ------
-        ConfigError : nobody is there.
+        ConfigError : nobody is at the keyboard.
         """
         if self._yes:
             self.remark(f"{instruction}: taken as done")
@@ -68,7 +68,7 @@ class Terminal:
         self._ask(instruction, keys="then press Enter")
 
     def settling(self, recording: Recording, seconds: float) -> None:
-        """Show that the carts come to rest."""
+        """Show that the carts must come to rest."""
         self._view.begin(recording, f"coming to rest, {seconds:g} s")
 
     def started(self, recording: Recording) -> None:
@@ -80,7 +80,7 @@ class Terminal:
         self._view.take(batch, anomalies)
 
     def finished(self, outcome: RunOutcome) -> None:
-        """Print a line that stays."""
+        """Print how the run ended, in a line that stays."""
         self._view.recording = None
         name = outcome.recording.id
         if not outcome.partial:
@@ -94,7 +94,11 @@ class Terminal:
         self._console.print(Text(sentence), soft_wrap=True)
 
     def _ask(self, question: str, *, keys: str) -> str:
-        """Return what is typed in answer; `keys`: the keys to choose from.
+        """Ask a question and return the typed answer.
+
+        Parameters
+        ----------
+        keys : the keys to choose from.
 
         Raises
         ------
@@ -121,7 +125,7 @@ class Terminal:
         self.remark(sentence)
 
     def vetoes(self, recording: Recording) -> bool:
-        """Ask whether to leave out a recording.
+        """Ask whether to leave out a recording; return True if so.
 
         Raises
         ------
@@ -131,7 +135,7 @@ class Terminal:
 
 
 class _View:
-    """The present picture."""
+    """What the terminal shows at the moment."""
 
     def __init__(self) -> None:
         self.plan: tuple[Recording, ...] = ()
@@ -145,14 +149,14 @@ class _View:
         self._arrived: deque[tuple[float, int]] = deque()
 
     def begin(self, recording: Recording, state: str) -> None:
-        """Show another run."""
+        """Begin to show another run."""
         self.recording, self._state, self._ms = recording, state, 0
         self.thinking = ""
         self._anomalies = Anomalies()
         self._traces, self._arrived = [], deque()
 
     def take(self, batch: Sequence[Reading], anomalies: Anomalies) -> None:
-        """Take in lines; one in each batch is enough for a sparkline."""
+        """Add new lines; the last one of each batch is enough for the sparklines."""
         last, now = batch[-1], time.monotonic()
         self._ms, self._anomalies = last.ms, anomalies
         if len(self._traces) != len(last.counts):
@@ -164,7 +168,7 @@ class _View:
             self._arrived.popleft()
 
     def render(self) -> Group:
-        """Return the picture."""
+        """Return what to show."""
         left = [r for r in self.plan if r.id not in self.done]
         seconds = max(0.0, session_time(left) - 1e-3 * self._ms)
         head = Table.grid(padding=(0, 2))
@@ -184,23 +188,23 @@ class _View:
         )
         lines = [Text(f"{run.id} ({run.kind}): {state}")]
         for number, trace in enumerate(self._traces, start=1):
-            shown = list(trace)  # at once, as the lines come in another thread
+            shown = list(trace)  # a copy, because another thread appends to it
             if shown:
                 lines.append(Text(f"  encoder {number} {shown[-1]:>7}  {sparkline(shown)}"))
         return lines
 
     def _rate(self) -> float:
-        arrived = list(self._arrived)  # at once, as the lines come in another thread
+        arrived = list(self._arrived)  # a copy, because another thread appends to it
         if len(arrived) < 2 or arrived[-1][0] == arrived[0][0]:
             return 0.0
         return sum(n for _, n in arrived[1:]) / (arrived[-1][0] - arrived[0][0])
 
 
 def _forget_keys() -> None:
-    """Drop keys typed before the question: they are no answer to it, and a motor may start."""
+    """Discard keys typed before the question; they do not answer it, and a motor may start."""
     try:
         import termios
-    except ImportError:  # Windows
+    except ImportError:  # on Windows
         import msvcrt
 
         while msvcrt.kbhit():  # pyright: ignore[reportAttributeAccessIssue]
@@ -210,7 +214,7 @@ def _forget_keys() -> None:
 
 
 def sparkline(values: Sequence[int]) -> str:
-    """Return values as a row of bars, the smallest lowest."""
+    """Return values as a row of bars of different heights."""
     low, high = min(values), max(values)
     step = (high - low) / (len(_BARS) - 1) or 1.0
     return "".join(_BARS[round((value - low) / step)] for value in values)

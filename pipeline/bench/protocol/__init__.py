@@ -1,1 +1,1 @@
-"""The messages between host and bench, and the clock behind them."""
+"""The messages between host and bench, and the clock that their time stamps come from."""

@@ -1,4 +1,4 @@
-"""Cut the bytes that arrive at a bench into commands; noise and lost bytes never hide a stop."""
+"""Split the bytes that arrive at a bench into commands; noise and lost bytes never hide a stop."""
 
 import re
 from collections.abc import Callable, Collection, Mapping
@@ -18,27 +18,30 @@ from pipeline.bench.protocol.messages import (
     Wave,
 )
 
-# The limits of 32-bit firmware; no bench needs more.
+# Limits of 32-bit firmware; no bench needs more.
 _LONGEST_FIELD = 32  # characters
 _LARGEST_NUMBER = 1e9
 _LARGEST_AMPLITUDE = 1_000_000
-_MOST_PHASE = 10.0  # rad, more than a turn
+_MOST_PHASE = 10.0  # rad; more than one turn
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 _WHOLE = re.compile(r"[+-]?\d+", re.ASCII)
 
 
 class CommandReader:
-    """Cuts the bytes that arrive at a bench into commands; anything else is counted and dropped.
+    """Split the bytes that arrive at a bench into commands; count and drop anything else.
 
-    A field that does not fit its place ends the command before it and may begin another. If it ends
-    in the letter of a stop or a reset it counts as such, whatever noise comes before. So does an
-    `s` that seemed to be the wave of a start which then breaks off. So a lost byte never hides the
-    stop that follows.
+    A field that does not fit ends the command before it, and may begin another one. To never miss a
+    stop after a lost byte, two kinds of field count as a stop or reset:
+
+    - A field that ends in the letter of a stop or a reset, whatever noise precedes the letter.
+    - An `s` that was read as the wave of a start, if that start then breaks off.
 
     Parameters
     ----------
     encoders : of the bench; state feedback has two gains for each.
-    extensions : the letters known beyond the stock bench's; without any, no query either.
+    extensions : letters of the commands that the stock bench does not know; without any, there is
+        no
+        query either.
     """
 
     def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:
@@ -52,7 +55,8 @@ class CommandReader:
     def feed(self, data: bytes) -> list[Command]:
         """Return the commands that are now complete, in order."""
         *whole, rest = (self._rest + data.decode("latin-1")).split(";")
-        self._rest = rest[-_LONGEST_FIELD - 1 :]  # longer ones are just too long
+        # A longer field is refused, so its beginning is not needed.
+        self._rest = rest[-_LONGEST_FIELD - 1 :]
         return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
 
     def _take(self, field: str) -> list[Command]:
@@ -110,7 +114,7 @@ def _whole_within(lowest: int, highest: int) -> _Reader:
 
 
 def _field_kinds(encoders: int, extensions: Collection[str]) -> Mapping[str, tuple[_Reader, ...]]:
-    """Return the kinds of field after each letter."""
+    """Return, for each letter, the kinds of the fields that follow it."""
     waves = "".join(w for w in Wave if w not in (Wave.CHIRP, Wave.MULTISINE) or w in extensions)
     frequency = _number_within(*FREQUENCIES)
     gain = _number_within(-_LARGEST_NUMBER, _LARGEST_NUMBER)

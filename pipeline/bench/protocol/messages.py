@@ -1,8 +1,8 @@
-"""The messages between host and bench: one command or one line of text at a time.
+"""The messages between host and bench: commands, and lines of text in reply.
 
-docs/protocol.md specifies it in words. Commands are fields that each end in a semicolon; the first
-letter defines the others. The stock bench knows `d`, `g` and `z`; a bench that answers `?;` lists
-its extensions.
+docs/protocol.md specifies them in words. A command consists of fields that each end in a semicolon;
+its first letter decides which fields follow. The stock bench knows `d`, `g` and `z`. A bench that
+answers `?;` lists its extensions.
 """
 
 import math
@@ -15,18 +15,18 @@ from typing import TypeAlias, TypeVar
 from pipeline.errors import DataError
 
 FULL_SCALE = 4096  # duty counts: 5 V
-HEARTBEAT_EVERY = 0.03  # s
-WATCHDOG = 0.1  # s after the last heartbeat the motor is cut
-PULSE = 0.05  # s a delta wave is on
+HEARTBEAT_EVERY = 0.03  # s between heartbeats
+WATCHDOG = 0.1  # s after the last heartbeat, at which the bench cuts the motor
+PULSE = 0.05  # s; length of the pulse of a delta wave
 NOMINAL_PERIOD = 1e-3  # s between lines
-CHIRP_SPAN = 20.0  # the default ratio of a chirp's end frequency to its start
-FREQUENCIES = (1e-3, 1e3)  # Hz, of a wave; a command with another frequency is dropped
-EXTENSIONS = frozenset("cfhkms")  # the commands, except `?`, that the stock bench does not know
+CHIRP_SPAN = 20.0  # end frequency of a chirp divided by its start frequency, by default
+FREQUENCIES = (1e-3, 1e3)  # Hz; a command with a frequency outside this range is dropped
+EXTENSIONS = frozenset("cfhkms")  # commands, except `?`, that the stock bench does not know
 
-# The limits of 32-bit firmware; no bench needs more.
+# Limits of 32-bit firmware; no bench needs more.
 MOST_TONES = 64  # of a multisine
 _Read = TypeVar("_Read")
-_LONGEST_COUNT = 10  # digits of a field of a line
+_LONGEST_COUNT = 10  # digits of a count in a line
 
 _LINE = re.compile(rf"(?:-?\d{{1,{_LONGEST_COUNT}}}:){{4,5}}\d{{1,{_LONGEST_COUNT}}}", re.ASCII)
 
@@ -34,10 +34,10 @@ _LINE = re.compile(rf"(?:-?\d{{1,{_LONGEST_COUNT}}}:){{4,5}}\d{{1,{_LONGEST_COUN
 class Wave(StrEnum):
     """The shape of the target over one period 1/FREQ.
 
-    delta is a short pulse as the period begins; square is zero for half a period, then the
-    amplitude; sine, triangle and sawtooth start at zero and swing to both sides; chirp sweeps once,
-    logarithmically, over the whole run; multisine is the sum of the stored tones.
-    `pipeline.bench.protocol.waves` has the formulas.
+    `delta` is a short pulse at the beginning of the period. `square` is zero for half a period,
+    then the amplitude. `sine`, `triangle` and `sawtooth` start at zero and swing to both sides.
+    `chirp` sweeps the frequency once over the whole run, logarithmically. `multisine` is the sum of
+    the stored tones. The formulas are in `pipeline.bench.protocol.waves`.
     """
 
     DELTA = "d"
@@ -51,12 +51,12 @@ class Wave(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Start:
-    """`d`: start a run of cycles/frequency seconds.
+    """`d`: start a run that lasts cycles/frequency seconds.
 
     Attributes
     ----------
-    encoder : 1 or 2, whose count a PID follows; None: open loop.
-    frequency : Hz.
+    encoder : 1 or 2, the one that a PID controller follows; None: open loop.
+    frequency : in Hz.
     amplitude : duty counts in open loop, encoder counts in closed loop.
     cycles : periods of the wave.
     """
@@ -69,13 +69,13 @@ class Start:
 
     @property
     def duration(self) -> float:
-        """How long the bench streams, s of its clock."""
+        """How long the bench sends lines, in s of its own clock."""
         return self.cycles / self.frequency
 
 
 @dataclass(frozen=True, kw_only=True)
 class PidGains:
-    """`g`: the PID gains of later closed-loop starts.
+    """`g`: set the PID gains for later closed-loop runs.
 
     duty = kp e + ki ∫e dt + kd de/dt, with e in encoder counts.
     """
@@ -87,7 +87,10 @@ class PidGains:
 
 @dataclass(frozen=True, kw_only=True)
 class StateGains:
-    """`f`: duty = prefilter target - gains [x1, v1, x2, v2, …], counts and counts/s."""
+    """`f`: set the state feedback for later closed-loop runs.
+
+    duty = prefilter target - gains [x1, v1, x2, v2, …], in counts and counts/s.
+    """
 
     gains: tuple[float, ...]
     prefilter: float
@@ -95,20 +98,20 @@ class StateGains:
 
 @dataclass(frozen=True, kw_only=True)
 class ChirpEnd:
-    """`c`: the end frequency of later chirps, Hz."""
+    """`c`: set the end frequency of later chirps, in Hz."""
 
     frequency: float
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tone:
-    """`m`: one sine of later multisines; harmonic 0 clears those stored so far.
+    """`m`: add one sine to later multisines; harmonic 0 removes all sines stored so far.
 
     Attributes
     ----------
-    harmonic : of the wave's frequency.
+    harmonic : multiple of the wave's frequency.
     share : its amplitude relative to the wave's.
-    phase : rad, at the start.
+    phase : in rad, at the start.
     """
 
     harmonic: int
@@ -118,12 +121,12 @@ class Tone:
 
 @dataclass(frozen=True, kw_only=True)
 class Hands:
-    """`h`: a virtual bench's hands hold some carts and, in the next run, release one.
+    """`h`: let the hands of a virtual bench hold some carts, and release one in the next run.
 
     Attributes
     ----------
     held : the held carts.
-    released : the cart pulled out and released; 0: none.
+    released : the cart that is pulled out and released; 0: no cart.
     """
 
     held: tuple[int, ...] = ()
@@ -133,20 +136,20 @@ class Hands:
 class Signal(StrEnum):
     """Commands without fields."""
 
-    RESET = "z"  # stop, count and clock from zero, forget gains
+    RESET = "z"  # stop, set counts and clock to zero, forget the gains
     STOP = "s"
-    HEARTBEAT = "k"  # the first one after a reset arms the watchdog
+    HEARTBEAT = "k"  # the first one after a reset turns the watchdog on
     QUERY = "?"
 
 
 Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Tone | Hands | Signal
 
-# A bench without `s` is stopped by a run that does nothing, then reset.
+# A bench without `s` is stopped by starting a run without motion and resetting it.
 STOCK_STOP: tuple[Command, ...] = (Start(wave=Wave.DELTA, frequency=1.0, amplitude=0), Signal.RESET)
 
 
 def encode(command: Command) -> bytes:
-    """Return a command as it is sent over the line."""
+    """Return the bytes of a command on the line."""
     match command:
         case Start(wave=wave, encoder=encoder):
             loop = "o" if encoder is None else "c"
@@ -163,7 +166,7 @@ def encode(command: Command) -> bytes:
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
-            # The empty field ends a command left open by a lost byte; stock benches have no stop.
+            # The empty field ends a command that a lost byte left open. Stock benches have no stop.
             fields = ["", "s"] if command is Signal.STOP else [command.value]
     return "".join(f"{field};" for field in fields).encode("ascii")
 
@@ -174,13 +177,13 @@ def _number(value: float) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Reading:
-    """One line of the stream.
+    """One line from the bench.
 
     Attributes
     ----------
     counts : of the encoders, two or three.
     target : duty counts in open loop, encoder counts in closed loop.
-    duty : duty counts that act from now on.
+    duty : duty counts applied from now on.
     ms : whole milliseconds since the start of the run.
     """
 
@@ -191,13 +194,13 @@ class Reading:
 
 
 def format_reading(reading: Reading) -> bytes:
-    """Return the line, its end included."""
+    """Return the bytes of a line, including its end."""
     fields = (*reading.counts, reading.target, reading.duty, reading.ms)
     return (":".join(map(str, fields)) + "\n").encode("ascii")
 
 
 def parse_reading(line: bytes) -> Reading | None:
-    """Return the content of a line, with or without its end; None: not a line of the stream."""
+    """Return the content of a line, with or without its end; None if it is no such line."""
     text = line.decode("latin-1").rstrip("\r\n")
     if not _LINE.fullmatch(text):
         return None
@@ -207,19 +210,20 @@ def parse_reading(line: bytes) -> Reading | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A bench's answer to `?;`: its description, on one line that starts with a question mark.
+    """A bench's description of itself: its answer to `?;`, a line that starts with `?`.
 
     Attributes
     ----------
-    name : in one word.
-    encoders : number of fields that are counts: two or three.
-    carts : how many of them are carts.
+    name : one word.
+    encoders : number of encoder counts in a line, two or three.
+    carts : number of encoders that are on carts.
     period : nominal s between lines.
     baud : of the line.
-    commands : the letters known beyond the stock ones, with `c` also for the chirp and `m` for the
-        multisine.
-    input_unit, input_per_count : the input in its unit is this times the duty counts.
-    position_unit, position_per_count : likewise of the encoders.
+    commands : letters of the commands beyond the stock ones; `c` also means that it knows the
+        chirp,
+        `m` the multisine.
+    input_unit, input_per_count : unit of the input, and its value per duty count.
+    position_unit, position_per_count : unit of the positions, and its value per encoder count.
     """
 
     name: str
@@ -251,11 +255,11 @@ def format_description(bench: Description) -> bytes:
 
 
 def parse_description(line: bytes) -> Description:
-    """Read the answer to a query.
+    """Return the description in an answer to a query.
 
     Raises
     ------
-    DataError : it is not a description, or of a version this program does not know.
+    DataError : it is no description, or one of a version that this program does not know.
     """
     text = line.decode("ascii", "replace").strip()
     head, *words = text.split(" ")
@@ -287,8 +291,8 @@ def parse_description(line: bytes) -> Description:
 
 
 def _scaled(text: str) -> tuple[float, str]:
-    """Split "0.00227cm" into the number and the unit."""
+    """Split text such as "0.00227cm" into number and unit."""
     digits = len(text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ/%"))
-    if not 0.0 < abs(number := float(text[:digits])) < math.inf:  # of no use to a limit
+    if not 0.0 < abs(number := float(text[:digits])) < math.inf:  # a limit cannot use it
         raise ValueError(repr(text))
     return number, text[digits:]

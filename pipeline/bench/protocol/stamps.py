@@ -1,8 +1,8 @@
-"""The number of lines that a run's time stamps lack, and the true period behind them.
+"""Find how many lines are missing from a run, and the true period, from its time stamps.
 
-Stamps are whole milliseconds. Near 1 kHz a clock of 1.0024 ms skips a stamp every 417 ms although
-no line is lost, so one difference proves nothing. But the clock's own skips are evenly spaced, like
-the teeth of a comb, and losses are not.
+Stamps are whole milliseconds. Near 1 kHz, a clock with a period of 1.0024 ms skips one stamp every
+417 ms although no line is lost. So a single gap proves nothing. But the skips of a clock are evenly
+spaced, like the teeth of a comb, and lost lines are not.
 """
 
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 Stamps = NDArray[np.int64]
 
-OTHER_PERIOD = 0.02  # of a period: no clock differs more from the stated one
-_SLOW = 1.5  # ms; from this period on, each difference is conclusive
-_MOST_ABSENT = 0.2  # of the stamps; more means a slower clock
-_CLOSEST_TEETH = 20  # a clock of 1.05 ms; no bench that aims at 1 kHz is further off
-_TOOTH_SLACK = 1  # ms by which a tooth may be off: stamps are rounded
-_FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps tried as the comb's first two teeth
+OTHER_PERIOD = 0.02  # share of a period; clocks that differ more have another period than stated
+_SLOW = 1.5  # ms; from this period on, every gap shows a lost line
+_MOST_ABSENT = 0.2  # share of the stamps; if more are missing, the clock is slower
+_CLOSEST_TEETH = 20  # stamps from skip to skip of a clock with 1.05 ms; no bench for 1 kHz is worse
+_TOOTH_SLACK = 1  # ms by which a tooth may be off, because stamps are rounded
+_FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps that are tried as first and as second tooth
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,7 +28,7 @@ class StampFit:
     Attributes
     ----------
     period : ms from line to line.
-    missing : ticks of the clock without a line.
+    missing : number of lines that are missing.
     """
 
     period: float
@@ -36,11 +36,17 @@ class StampFit:
 
 
 def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampFit:
-    """Return the clock behind stamps (n,) in ms, never falling; `period` (ms) is the expected one.
+    """Return the clock that explains the time stamps of a run.
 
-    The expectation is used only if the stamps are not conclusive: a short run with losses, a clock
-    within some 1e-5 of 1 ms, or one that ticks twice within a millisecond. If the bench itself
-    `stated` it, it is also used if too many lines are missing to find a comb.
+    The expected period is used only if the stamps are not conclusive: in a short run with losses,
+    if the clock is within about 1e-5 of 1 ms, or if it ticks twice within a millisecond. A period
+    that the bench stated is also used if too many lines are missing to find a comb.
+
+    Parameters
+    ----------
+    stamps : (n,) in ms, never falling.
+    period : expected, in ms.
+    stated : whether the bench itself stated this period.
     """
     n = stamps.size
     if n < 2 or stamps[-1] == stamps[0]:
@@ -55,10 +61,11 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
         return StampFit(period=period, missing=missing)
     usual = float(np.median(steps))
     if usual >= _SLOW:
-        measured = float(steps[steps < usual + _SLOW].mean())  # rounding gives two usual steps
+        # Rounding makes two sizes of gap usual.
+        measured = float(steps[steps < usual + _SLOW].mean())
         lost = int((np.round(steps / measured) - 1).clip(min=0).sum())
         return StampFit(period=span / (n - 1 + lost), missing=lost)
-    if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has leapt
+    if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has jumped
         if stated or period >= 1 / (1 - _MOST_ABSENT):
             return StampFit(period=period, missing=missing)
         return StampFit(period=span / (n - 1), missing=0)  # not the expected bench
@@ -68,8 +75,8 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
     seen[stamps - stamps[0]] = True
     absent = np.flatnonzero(~seen).tolist()
     teeth = _comb(absent)
-    chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # of a false tooth
-    # Losses look like this comb by chance less often than once in a hundred runs.
+    chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # probability of a false tooth
+    # By chance, lost lines look like this comb less than once in a hundred runs.
     if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < 0.01:
         spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
         return StampFit(period=spacing / (spacing - 1), missing=len(absent) - len(teeth))
@@ -78,19 +85,20 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
 
 
 def even_period(stamps: Stamps) -> float | None:
-    """Return the period of stamps that one even clock explains without a loss, else None."""
+    """Return the period if one regular clock explains all stamps without a lost line, else None."""
     i = np.arange(stamps.size) - (stamps.size - 1) / 2
     slope = float(i @ stamps / (i @ i))
-    # Stamps of one even clock lie within 1 ms of a line; a loss makes it 1.5 or more.
+    # Stamps of a regular clock lie within 1 ms of a straight line; a lost line makes it 1.5 ms or
+    # more.
     return slope if slope > 0 and np.ptp(stamps - slope * i) < 1.25 else None
 
 
 def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
-    """Return the clock of the even pieces, if it differs from the stated one.
+    """Return the clock that most pieces of the run have, if it differs from the stated one.
 
-    If a bench loses lines, no long piece is even, unless few are lost.
+    Only pieces without a lost line count; if many lines are lost, there are too few such pieces.
     """
-    long = 200  # lines of a piece, which usually lacks some if one in a hundred is lost
+    long = 200  # lines in a piece; often one is missing if one line in a hundred is lost
     pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
     even = [period for piece in pieces if (period := even_period(piece)) is not None]
     if len(even) < max(0.25 * len(pieces), 1):
@@ -108,28 +116,29 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
 
 def _comb(absent: Sequence[int]) -> list[int]:
-    """Return the missing stamps (ascending) that are the clock's own skips: the longest comb.
+    """Return those missing stamps (ascending) that are skips of the clock: the longest comb.
 
-    Every tooth of it must be there, from the first missing stamps to the last.
+    Every tooth of the comb must be among them, from the first missing stamps to the last.
     """
     there = frozenset(absent)
     best: list[int] = []
     for i, first in enumerate(absent[:_FIRST_TEETH]):
         for second in absent[i + 1 : i + 1 + _SECOND_TEETH]:
-            # Closer teeth are a rarer find, as a comb may not lack any: the most teeth win.
+            # A comb with closer teeth rarely occurs by chance, because no tooth may be absent. So
+            # the most teeth win.
             teeth = _follow(first, second, there=there, last=absent[-1])
             best = max(best, teeth, key=len)
     return best
 
 
 def _follow(first: int, second: int, *, there: frozenset[int], last: int) -> list[int]:
-    """Return the teeth starting with the first two; [] if one is missing before the end."""
+    """Return the teeth that continue the first two; [] if one is absent before the end."""
     if second - first < _CLOSEST_TEETH:
         return []
     teeth = [first, second]
     while True:
-        back = teeth[-16:]  # a clock may drift
-        # Two teeth determine their spacing to a millisecond, many to a fraction of it.
+        back = teeth[-16:]  # the last teeth only, because a clock may drift
+        # Two teeth determine the spacing to a millisecond, many teeth to a fraction of it.
         expected = back[-1] + (back[-1] - back[0]) / (len(back) - 1)
         slack = _TOOTH_SLACK + 1.0 / (len(back) - 1)
         low, high = int(np.ceil(expected - slack)), int(np.floor(expected + slack))

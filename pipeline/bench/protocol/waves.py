@@ -1,4 +1,4 @@
-"""The target of a run over time, as a bench follows it and a plan knows it in advance."""
+"""The target of a run over time, for a bench that follows it and a plan that predicts it."""
 
 import math
 from collections.abc import Sequence
@@ -9,11 +9,11 @@ from pipeline.bench.protocol.messages import CHIRP_SPAN, PULSE, Start, Tone, Wav
 def target_at(
     start: Start, t: float, *, chirp_end: float | None = None, tones: Sequence[Tone] = ()
 ) -> int:
-    """Return the target `t` s after the start: duty counts in open loop, else encoder counts.
+    """Return the target `t` s after the start, in duty counts (open loop) or encoder counts.
 
     Parameters
     ----------
-    chirp_end : Hz, end of a chirp; None: `CHIRP_SPAN` times its start frequency.
+    chirp_end : end frequency of a chirp, in Hz; None: `CHIRP_SPAN` times its start frequency.
     tones : of a multisine.
     """
     return nearest_count(start.amplitude * shape_at(start, t, chirp_end=chirp_end, tones=tones))
@@ -27,7 +27,7 @@ def nearest_count(value: float) -> int:
 def shape_at(
     start: Start, t: float, *, chirp_end: float | None = None, tones: Sequence[Tone] = ()
 ) -> float:
-    """Return the wave at unit amplitude; see `target_at`."""
+    """Return the wave for an amplitude of one; see `target_at`."""
     turns = t * start.frequency
     phase = turns - math.floor(turns)
     match start.wave:
@@ -51,9 +51,9 @@ def shape_at(
 
 
 def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:
-    """Return the integral of a frequency that grows by the same factor every second."""
+    """Return the turns of a chirp, whose frequency grows by the same factor every second."""
     span = CHIRP_SPAN if chirp_end is None else chirp_end / start.frequency
     if span == 1.0:
         return start.frequency * t
-    grown = start.duration / math.log(span)  # s in which it grows e-fold
+    grown = start.duration / math.log(span)  # s in which the frequency grows e-fold
     return start.frequency * grown * math.expm1(t / grown)
