@@ -3,7 +3,7 @@
 In a notebook: `from pipeline import analyse, check, explain`, then `analyse("team-07")`.
 """
 
-TYPE_CHECKING = False  # as that of typing, which takes its time to load
+TYPE_CHECKING = False  # stands in for typing.TYPE_CHECKING: importing typing is slow
 if TYPE_CHECKING:
     from typing import Any
 
@@ -11,7 +11,7 @@ __version__ = "0.2.0"
 
 
 def __getattr__(name: str) -> "Any":
-    """Load what a notebook asks for when it does, as the command line must answer at once."""
+    """Import a notebook function on first use, so that the command line starts quickly."""
     if name in ("analyse", "check", "explain"):
         from importlib import import_module
 

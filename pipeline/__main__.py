@@ -1,4 +1,4 @@
-"""`python -m pipeline` is `cartlab`."""
+"""Make `python -m pipeline` run the command `cartlab`."""
 
 from pipeline.cli import main
 

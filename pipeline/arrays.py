@@ -8,7 +8,7 @@ ComplexArray = NDArray[np.complex128]
 
 
 def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Return a read-only float64 copy, its shape checked."""
+    """Return a read-only float64 copy of an array, after checking its shape."""
     array = np.array(values, dtype=np.float64)
     if shape is not None and array.shape != shape:
         raise ValueError(f"{name}: expected shape {shape}, found {array.shape}")
@@ -17,7 +17,7 @@ def frozen_array(values: object, *, name: str, shape: tuple[int, ...] | None = N
 
 
 def freeze(instance: object, *names: str) -> None:
-    """Replace the named array fields by read-only copies."""
+    """Replace the named array fields of a frozen dataclass by read-only copies."""
     for name in names:
         value = getattr(instance, name)
         if value is not None:

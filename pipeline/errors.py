@@ -1,11 +1,11 @@
-"""The errors, named for who must act.
+"""The error classes, one for each person or thing that must act.
 
-Every message is one line a person can act on: where, what was needed, what was found.
+Every message is one line: where the fault is, what was needed, what was found.
 """
 
 import errno
 
-# All that the name of a file can cause: too long, of another kind, taken, in no encoding.
+# Errors that a bad file name can cause: too long, a wrong kind of file, taken, not encodable.
 _OF_A_NAME = frozenset(
     {
         errno.ENAMETOOLONG,
@@ -16,17 +16,17 @@ _OF_A_NAME = frozenset(
         errno.EILSEQ,
     }
 )
-# All that a file of somebody's own can cause besides: not there, a loop of links, kept closed.
+# Errors that a user's own file can cause as well: missing, a loop of links, no permission.
 _OF_A_FILE = _OF_A_NAME | {errno.ENOENT, errno.ELOOP, errno.EACCES, errno.EPERM}
 _OF_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class PipelineError(Exception):
-    """Anything cartlab cannot go on from; the command line prints its text and exits 2."""
+    """An error that stops cartlab; the command line prints its text and exits with status 2."""
 
 
 class DataError(PipelineError):
-    """The measured data do not support what was asked of them: look at the recording."""
+    """The measured data cannot give the wanted result: look at the recording."""
 
 
 class SubmissionError(PipelineError):
@@ -34,7 +34,7 @@ class SubmissionError(PipelineError):
 
 
 class ConfigError(PipelineError):
-    """A rubric, preset, option or output folder is wrong: the person at the keyboard acts."""
+    """A rubric, preset, option or output folder is wrong: the person who runs cartlab must act."""
 
 
 class HardwareError(PipelineError):
@@ -42,18 +42,18 @@ class HardwareError(PipelineError):
 
 
 def lies_in_the_name(error: OSError) -> bool:
-    """Tell whether a file's name is to blame, and not the computer that was to write or read it.
+    """Return whether the file's name caused the error, rather than the computer.
 
-    An error without a number is no complaint of the system, but a decoder's about what it reads.
+    An error without a number comes from a text decoder, so it is about the file too.
     """
     return error.errno is None or error.errno in _OF_A_NAME
 
 
 def lies_in_the_file(error: OSError) -> bool:
-    """Tell whether a file, or its name, is to blame, and not the computer that was to read it."""
+    """Return whether the file or its name caused the error, rather than the computer."""
     return error.errno is None or error.errno in _OF_A_FILE
 
 
 def lacks_room(error: OSError) -> bool:
-    """Tell whether a file could not be written for lack of room on the disk."""
+    """Return whether a file could not be written because the disk is full."""
     return error.errno in _OF_ROOM

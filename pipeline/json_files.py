@@ -1,7 +1,8 @@
-"""Types as JSON files: a file holds what its type marks as written, in the order of the type.
+"""Write types to JSON files and read them back.
 
-A result type marks its fields by `written`, and what it derives by `computed`. From the marks
-come the file (`json_text`), its JSON Schema (`json_schema`) and reading it back (`read_json`).
+A result type marks the fields that go into its file by `written`, and derived values by `computed`.
+These marks give the file (`json_text`), its JSON Schema (`json_schema`) and the way to read it back
+(`read_json`). The keys have the order of the class body.
 """
 
 import json
@@ -33,26 +34,26 @@ T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Any])
 _ORDER = count()
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-_SIGNIFICANT = 10  # digits: below that, processors and library versions differ
+_SIGNIFICANT = 10  # digits. Further digits depend on the processor and the library versions
 
 
 # --------------------------------------------------------------------- marking a type
 
 
 class InFile(NamedTuple):
-    """The form in the file of a value of the annotated type."""
+    """The type that a value has in the file, as part of its annotation."""
 
     type: Any
 
 
-Number = Annotated[float, InFile(float | None)]  # null where it is not finite
-Numbers = Annotated[Array, InFile(tuple[float | None, ...])]  # each of them, likewise
+Number = Annotated[float, InFile(float | None)]  # null if it is not finite
+Numbers = Annotated[Array, InFile(tuple[float | None, ...])]  # each null if not finite
 Sha256 = Annotated[str, InFile(Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")])]
 Matrix = Annotated[Array, InFile(tuple[tuple[float, ...], ...])]
 
 
 class _Mark(NamedTuple):
-    """How a member is written; its `order` among the others is that of the class body."""
+    """How a member is written; `order` is its place in the class body."""
 
     order: int
     description: str
@@ -74,11 +75,11 @@ def written(
 
     Parameters
     ----------
-    description : for the JSON Schema.
-    key : in the file, by default the field's name.
-    part : the keys that are written of the type it holds, in their order; by default all.
-    older : what a file without the key stands for, where earlier versions wrote none.
-    default, default_factory : of the field.
+    description : text for the JSON Schema.
+    key : the key in the file. By default the field's name.
+    part : if the field holds a `result`, the keys of it to write, in this order. By default all.
+    older : the value to assume for a file of an earlier version, which lacks the key.
+    default, default_factory : as for a dataclass field.
     """
     mark = _Mark(next(_ORDER), description, key, part, older)
     return field(default=default, default_factory=default_factory, metadata={"written": mark})
@@ -87,7 +88,7 @@ def written(
 def computed(
     *, key: str = "", part: tuple[str, ...] = (), older: Any = MISSING
 ) -> Callable[[F], F]:
-    """Mark the function of a property that is written to the file; its docstring describes it."""
+    """Mark a property's function as written to the file; its docstring is the description."""
 
     def mark(function: F) -> F:
         description = (getdoc(function) or "").removesuffix(".")
@@ -99,13 +100,13 @@ def computed(
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(written, field))
 def result(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
-    """Make a class a frozen dataclass; `eq` as there: False where it holds arrays."""
+    """Make a class a frozen dataclass; pass `eq=False` if it holds arrays."""
     return dataclass(frozen=True, kw_only=True, eq=eq)
 
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenMember:
-    """The content that a type writes under one key; `stored` if it is a field, not derived."""
+    """What a type writes under one key; `stored` is true for a field, false for a property."""
 
     name: str
     key: str
@@ -118,7 +119,7 @@ class WrittenMember:
 
 @cache
 def members(cls: type, part: tuple[str, ...] = ()) -> tuple[WrittenMember, ...]:
-    """Return what a type writes, in the order of the file; with `part` those keys alone."""
+    """Return what a type writes, in the order of the file; with `part` only those keys."""
     hints = get_type_hints(cls, include_extras=True)
     marks = {
         own.name: (own.metadata["written"], hints[own.name])
@@ -148,7 +149,7 @@ def members(cls: type, part: tuple[str, ...] = ()) -> tuple[WrittenMember, ...]:
 
 
 def keys(cls: type) -> list[str]:
-    """Return the keys of a type in its file."""
+    """Return the keys that a type writes to its file."""
     return [member.key for member in members(cls)]
 
 
@@ -156,14 +157,15 @@ def keys(cls: type) -> list[str]:
 
 
 def json_text(value: Any) -> str:
-    """Return a file as text: same numbers, same bytes."""
+    """Return the JSON text of a value; the same numbers always give the same bytes."""
     return json.dumps(plain(value), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ()) -> Any:
-    """Return JSON's own types: floats at so many digits, NaN and infinity as None.
+    """Return a value as plain JSON types: floats rounded to `digits`, NaN and infinity as None.
 
-    Of a result what it writes, with `part` those keys alone; of a model its fields.
+    A `result` becomes a dict of its written members (with `part`, only those keys), a pydantic
+    model a dict of its fields.
     """
     match value:
         case None | bool() | str() | int():
@@ -180,7 +182,7 @@ def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ())
             return plain([value.real, value.imag], digits=digits)
         case BaseModel():
             return plain(value.model_dump(by_alias=True), digits=digits)
-        case _ if hasattr(value, "written_as"):  # the name of what stands for it
+        case _ if hasattr(value, "written_as"):  # written as the name of the object
             return getattr(value, value.written_as)
         case _ if is_dataclass(value):
             return {
@@ -188,7 +190,7 @@ def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ())
                 for own in members(type(value), part)
             }
         case _ if math.isfinite(value):
-            return float(f"{value:.{digits}g}") + 0.0  # no minus zero
+            return float(f"{value:.{digits}g}") + 0.0  # + 0.0 turns -0.0 into 0.0
         case _:
             return None
 
@@ -197,7 +199,7 @@ def plain(value: Any, *, digits: int = _SIGNIFICANT, part: tuple[str, ...] = ())
 
 
 def json_schema(cls: type, *, title: str) -> dict[str, Any]:
-    """Return the JSON Schema of a type's files, its definitions in alphabetical order."""
+    """Return the JSON Schema of a type's files, with its definitions in alphabetical order."""
     schema = file_model(cls).model_json_schema(by_alias=True, mode="serialization")
     definitions = schema.pop("$defs", {})
     return {
@@ -210,13 +212,14 @@ def json_schema(cls: type, *, title: str) -> dict[str, Any]:
 
 @cache
 def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
-    """Return what checks a file of a type; unknown keys are let through, as later ones may come.
+    """Return the pydantic model that checks a type's file.
 
-    Its fields have the keys as aliases, and the names of the members with a `_` behind.
+    Unknown keys are allowed, because later versions may add some. The model's fields are named
+    after the members with `_` appended; their aliases are the keys.
     """
     if issubclass(cls, BaseModel):
         return cls
-    # Only the first paragraph concerns the written fields.
+    # Of the docstring, only the text before `Attributes` describes the written fields.
     about = (getdoc(cls) or "").partition("\n\nAttributes\n")[0]
     found: dict[str, Any] = {
         f"{own.name}_": (
@@ -235,7 +238,7 @@ def file_model(cls: type, part: tuple[str, ...] = ()) -> type[BaseModel]:
 
 
 def _file_type(hint: Any, part: tuple[str, ...]) -> Any:
-    """Return the type in the file for a value of a type."""
+    """Return the type that a value of type `hint` has in the file."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return args[1].type
@@ -261,21 +264,22 @@ Readers = Mapping[type, Callable[[str], Any]]
 
 
 def read_json(cls: type[T], text: str | bytes, *, readers: Readers | None = None) -> T:
-    """Return the value that a file of a type holds; fields that are not written have defaults.
+    """Return the value that a file of type `cls` holds; unwritten fields get their defaults.
 
-    `readers` make a value of the name that stands for it. A type whose values are not made of
-    their fields as written has a class method `from_written`, which takes all its members.
+    `readers` gives, for each type that is written as a name, the function that finds the object of
+    that name. If the fields differ from what is written, the type has a class method
+    `from_written`, which takes all written members.
 
     Raises
     ------
-    ValueError : it is no such file (pydantic's `ValidationError`), or null where a number is
-        needed.
+    ValueError : the file does not fit the type (pydantic's `ValidationError`), or it holds null
+        where a number is needed.
     """
     return _build(cls, file_model(cls).model_validate_json(text), readers or {})
 
 
 def _build(hint: Any, value: Any, readers: Readers) -> Any:
-    """Return the value of a type that what a file holds stands for."""
+    """Return the value of type `hint` for the checked content of a file."""
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
         return _build(args[0], value, readers)

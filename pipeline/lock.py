@@ -1,4 +1,4 @@
-"""One cartlab at a time writes into a folder: a run keeps others out, a change waits its turn."""
+"""Keep two cartlab programs from writing into one folder at the same time."""
 
 import os
 from collections.abc import Iterator
@@ -10,23 +10,23 @@ from filelock import FileLock, Timeout
 from pipeline.errors import ConfigError
 from pipeline.output import LOCK, OWNERS_FOLDER, TURN
 
-_PATIENCE = 30.0  # s for a turn, which takes less than one
-_AGAIN = 0.02  # s until who waits asks again
+_PATIENCE = 30.0  # s to wait for a turn. A turn takes less than one
+_AGAIN = 0.02  # s between attempts
 
 
 @contextmanager
 def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
     """Make a folder and keep other runs out of it; remove it if it stays empty.
 
-    The lock is the system's: it is gone with its process however that ends.
+    The operating system holds the lock and releases it when the process ends, however it ends.
 
     Parameters
     ----------
-    private : only its owner may enter a folder that is made here.
+    private : if the folder is made here, only its owner may enter it.
 
     Raises
     ------
-    ConfigError : another run is under way in it.
+    ConfigError : another run is using the folder.
     """
     new, lock = not out.exists(), out / LOCK
     out.mkdir(OWNERS_FOLDER if private else 0o777, parents=True, exist_ok=True)
@@ -41,14 +41,15 @@ def alone_in(out: Path, *, private: bool = False) -> Iterator[None]:
 
 @contextmanager
 def turn_in(folder: Path) -> Iterator[None]:
-    """Wait until nobody else reads a file of a folder to write it again.
+    """Wait until no other program is changing a file of this folder, then hold the turn.
 
-    It is a lock of its own: a session on a bench has the folder to itself for an hour, and changes
-    its `submission.toml` all the while.
+    This lock is separate from `alone_in`: a session on a bench holds that one for an hour, and
+    `submission.toml` may change during the session.
 
     Raises
     ------
-    ConfigError : another has had its turn for half a minute, or nothing can be written there.
+    ConfigError : another program has held the turn for half a minute, or the folder is not
+        writable.
     """
     with _locked(folder / TURN, patience=_PATIENCE):
         yield
@@ -76,14 +77,14 @@ def _locked(path: Path, *, patience: float) -> Iterator[None]:
         lock.release()
 
 
-# The number of the process follows a blank, because on Windows only the holder of a lock can read
-# its first byte.
+# The lock file holds a blank, then the process number: on Windows, only the holder of the lock can
+# read the first byte.
 
 
 def _sign(file: int) -> None:
-    """Write this process's number into the acquired lock, for messages to others."""
+    """Write this process's number into the acquired lock; messages to others give it."""
     before = os.read(file, 32)
-    # Up to version 0.2 a lock was a database.
+    # Up to version 0.2 a lock file was an SQLite database.
     if before.strip() and not before.strip().isdigit() and not before.startswith(b"SQLite format"):
         raise OSError("is not a lock of cartlab")
     os.ftruncate(file, 0)

@@ -1,8 +1,9 @@
-"""Names of parameters, as in the paper's Tables 1-3: read only here.
+"""Names of parameters, as in the paper's Tables 1-3; only this module takes names apart.
 
-`K_1` is the static gain of cart 1, `omega_2` and `zeta_2` belong to cart 2 alone, `omega_a`,
-`omega_b`, … are resonances and `omega_x`, `omega_y` the nulls of cart 1 with three carts. One
-cart has no index: `K`, `omega_n`, `zeta`; a body on no spring `mass`, `damping`.
+`K_1` is the static gain of cart 1. `omega_2` and `zeta_2` belong to cart 2 with the other carts
+held. `omega_a`, `omega_b`, … are resonances; `omega_x` and `omega_y` are the nulls of cart 1 with
+three carts. One cart has no index: `K`, `omega_n`, `zeta`. One cart without a spring has `mass` and
+`damping`.
 """
 
 from collections.abc import Iterable
@@ -12,19 +13,19 @@ from functools import cache
 from pipeline.set_up import Units
 
 MODES = "abcdefgh"  # resonances, ascending in frequency
-NULLS = "xy"  # of cart 1 with three carts
+NULLS = "xy"  # frequencies at which cart 1 of three hardly moves
 
 
 @dataclass(frozen=True)
 class Name:
-    """A parameter's name, read: "omega_a" is the symbol "omega" with the suffix "a"."""
+    """A parameter's name in its parts: "omega_a" is the symbol "omega" with the suffix "a"."""
 
     symbol: str
     suffix: str
 
     @property
     def is_gain(self) -> bool:
-        """Whether it is a static gain: a length for an input, so that both scales are in it."""
+        """Whether it is a static gain; its unit combines the position and the input unit."""
         return self.symbol == "K"
 
     @property
@@ -39,7 +40,7 @@ class Name:
 
     @property
     def is_damping(self) -> bool:
-        """Whether it is a damping of either kind: worth half as many digits as the rest."""
+        """Whether it is a damping ratio or coefficient; estimates of these are less precise."""
         return self.symbol in ("zeta", "damping")
 
     @property
@@ -54,22 +55,22 @@ class Name:
 
     @property
     def is_by_eye(self) -> bool:
-        """Whether a first estimate is read off a plot: resonances and nulls of several carts."""
+        """Whether the first estimate is read off a plot: resonances and nulls of several carts."""
         return self.suffix != "" and self.suffix in MODES + NULLS
 
     @property
     def cart(self) -> int | None:
-        """The cart (or spring) it belongs to, from 1."""
+        """The cart (or spring) that the parameter belongs to, counted from 1."""
         return int(self.suffix) if self.suffix.isdigit() else None
 
     @property
     def damping(self) -> str:
-        """The name of the damping ratio that belongs to a frequency: "zeta_1" to "omega_1"."""
+        """The name of the damping ratio that belongs to this frequency: "zeta_1" for "omega_1"."""
         return mode_zeta(self.suffix)
 
     @property
     def words(self) -> str:
-        """Its name in words: "damping ratio ζ of cart 1"."""
+        """The name in words: "damping ratio ζ of cart 1"."""
         symbols = {"K": "static gain K", "omega": "frequency ω", "zeta": "damping ratio ζ"}
         place = ""
         if self.cart is not None:
@@ -79,7 +80,7 @@ class Name:
         return symbols.get(self.symbol, self.symbol) + place
 
     def unit(self, units: Units) -> str:
-        """Return its unit; "" for a damping ratio."""
+        """Return the parameter's unit; "" for a damping ratio."""
         by_symbol = {
             "K": units.gain,
             "omega": "rad/s",
@@ -91,13 +92,13 @@ class Name:
 
 @cache
 def read_name(name: str) -> Name:
-    """Return what a name stands for."""
+    """Return a parameter's name in its parts."""
     symbol, _, suffix = name.partition("_")
     return Name(symbol, suffix)
 
 
 def names_beginning(names: Iterable[str], prefix: str) -> list[str]:
-    """Return the names that somebody means who types how they begin: "zeta", "omega_1"."""
+    """Return the names that begin with `prefix`, such as "zeta" or "omega_1"."""
     return [name for name in names if name.startswith(prefix)]
 
 
@@ -107,12 +108,12 @@ def gain_name(cart: int, *, n: int) -> str:
 
 
 def own_omega(cart: int, *, n: int) -> str:
-    """Return the name of the frequency that a cart has alone, the others held."""
+    """Return the name of the natural frequency of a cart while the other carts are held."""
     return "omega_n" if n == 1 else f"omega_{cart}"
 
 
 def own_zeta(cart: int, *, n: int) -> str:
-    """Return the name of the damping ratio that a cart has alone, the others held."""
+    """Return the name of the damping ratio of a cart while the other carts are held."""
     return "zeta" if n == 1 else f"zeta_{cart}"
 
 
@@ -127,7 +128,7 @@ def mode_zeta(suffix: str) -> str:
 
 
 def omega_names(suffixes: Iterable[str]) -> list[str]:
-    """Return the names of the frequencies with these suffixes."""
+    """Return the names of the frequencies that have these suffixes."""
     return [f"omega_{suffix}" for suffix in suffixes]
 
 
@@ -143,5 +144,5 @@ def parameter_names(n: int, *, rigid: bool = False) -> list[str]:
 
 
 def toml_flags(flags: Iterable[bool]) -> str:
-    """Return flags in the form of a file: "[false, true]"."""
+    """Return flags as TOML text: "[false, true]"."""
     return f"[{', '.join('true' if flag else 'false' for flag in flags)}]"

@@ -1,4 +1,4 @@
-"""Analyses for a notebook: one call each, and everything in the types of pandas and control."""
+"""Analyses for a notebook: one call each, with results as pandas and control objects."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ _AT_A_GLANCE = ("summary", "parameters")
 
 @dataclass(frozen=True)
 class Shown:
-    """Blocks of a report, which a notebook shows as the report does."""
+    """Parts of a report, displayed in a notebook as in the report."""
 
     title: str
     blocks: tuple[Block, ...]
@@ -54,11 +54,11 @@ class Shown:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Lab:
-    """All results of one submission; at the end of a cell it shows its summary and its table.
+    """All results of one submission; a notebook cell displays its summary and table.
 
     Attributes
     ----------
-    results : the same in the program's own types (`pipeline.results`).
+    results : the same results in cartlab's own types (`pipeline.results`).
     """
 
     results: Analysis
@@ -72,7 +72,7 @@ class Lab:
 
         Raises
         ------
-        DataError : the carts could not be identified, with the reasons.
+        DataError : the carts could not be identified; the message gives the reasons.
         """
         if self.results.chain is None:
             raise DataError(f"the carts were not identified: {self._reasons}")
@@ -84,7 +84,7 @@ class Lab:
 
         Raises
         ------
-        DataError : no feedback was designed, with the reasons.
+        DataError : no feedback was designed; the message gives the reasons.
         """
         if self.results.feedback is None:
             raise DataError(f"no feedback was designed: {self._reasons}")
@@ -96,12 +96,12 @@ class Lab:
 
     @cached_property
     def system(self) -> "control.StateSpace":
-        """The carts: states `x1, v1, …`, input `u`, outputs `x1, …`, continuous."""
+        """The carts as a continuous system: states `x1, v1, …`, input `u`, outputs `x1, …`."""
         return self.chain.to_control()
 
     @cached_property
     def transfer_functions(self) -> "dict[str, control.TransferFunction]":
-        """The same from `u` to each output, by the output's name."""
+        """The transfer function from `u` to each output, by the output's name."""
         import control
 
         return {
@@ -113,9 +113,9 @@ class Lab:
 
     @cached_property
     def closed_loop(self) -> "control.StateSpace":
-        """The designed loop from the set point `r` to the positions, sampled: `dt` in s.
+        """The designed loop from the set point `r` to the positions, sampled with `dt` in s.
 
-        States `x1, v1, …` and the effort `u` that acts, computed a sample before.
+        Its states are `x1, v1, …` and `u`, the input computed one sample earlier.
         """
         controller = self.design.controller(self.chain)
         return closed_loop(self.chain, controller, sample_time=self.design.sample_time)
@@ -124,12 +124,12 @@ class Lab:
 
     @cached_property
     def parameters(self) -> "pd.DataFrame":
-        """Initial and final estimates, by parameter."""
+        """Initial and final estimates, one row per parameter."""
         return frames.parameters(self.results)
 
     @cached_property
     def checks(self) -> "pd.DataFrame":
-        """The consistency checks, by id."""
+        """The consistency checks, one row per check."""
         return frames.checks(self.results)
 
     @cached_property
@@ -154,7 +154,7 @@ class Lab:
 
     @cached_property
     def records(self) -> "dict[str, pd.DataFrame]":
-        """The records by experiment, each by `time`, with columns `u`, `x1`, …"""
+        """The measured data by experiment: tables with index `time` and columns `u`, `x1`, …"""
         records = self.results.records
         return {r.id: frames.record_frame(r, analysis=self.results) for r in records}
 
@@ -162,12 +162,12 @@ class Lab:
 
     @property
     def questions(self) -> dict[str, str]:
-        """What this data raises, by the id under which `notes.md` answers it."""
+        """The questions that these data raise, by the id under which `notes.md` answers them."""
         return {question.id: with_symbols(question.text) for question in ask(self.results)}
 
     @property
     def sections(self) -> tuple[str, ...]:
-        """The sections that `show` knows."""
+        """The names of the sections that `show` accepts."""
         return tuple(section.id for section in self.document.sections)
 
     def show(self, section: str) -> Shown:
@@ -194,12 +194,12 @@ class Lab:
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class ExplainedGap:
-    """The gap analysis; at the end of a cell it shows its verdict.
+    """The gap analysis; a notebook cell displays its verdict.
 
     Attributes
     ----------
-    results : the same in the program's own types (`pipeline.gap.types`).
-    analysis : of the submission, what the tables take their units from.
+    results : the same results in cartlab's own types (`pipeline.gap.types`).
+    analysis : the analysis of the submission. The tables take their units from it.
     """
 
     results: Gap
@@ -212,36 +212,36 @@ class ExplainedGap:
 
     @cached_property
     def effects(self) -> "pd.DataFrame":
-        """The effects in the order found, a row each, its columns as in `gap.json`."""
+        """The effects in the order found, one row each, with the keys of `gap.json` as columns."""
         return gap_frames.effects(self.results)
 
     @cached_property
     def parameters(self) -> "pd.DataFrame":
-        """The parameters of the effects, a row each, with their standard errors and units."""
+        """The parameters of the effects, one row each, with standard errors and units."""
         return gap_frames.parameters(self.results)
 
     @cached_property
     def linear(self) -> "control.StateSpace":
-        """The linear carts that fit best: states `x1, v1, …`, input `u`, outputs `x1, …`."""
+        """The best linear model of the carts: states `x1, v1, …`, input `u`, outputs `x1, …`."""
         return self.results.linear.chain.to_control()
 
     @cached_property
     def system(self) -> "control.NonlinearIOSystem":
-        """The carts with their effects: states `x1, v1, …` and the effects' own.
+        """The carts with their effects: states `x1, v1, …` and the effects' own states.
 
         Raises
         ------
-        DataError : the drive leads its log, which no system of states can.
+        DataError : the motor acts before its logged input; no state model can do that.
         """
         return EquationsOfMotion(self.results.model).to_control()
 
     @property
     def records(self) -> tuple[str, ...]:
-        """The recordings that were used: what `simulate` knows."""
+        """The recordings that were used and that `simulate` accepts."""
         return tuple(sorted({trace.experiment for trace in self.results.traces}))
 
     def simulate(self, record: str) -> "pd.DataFrame":
-        """Return a recording by `time`: `measured`, `linear` and `with_effects`, a column a cart.
+        """Return a recording by `time`, with `measured`, `linear` and `with_effects` for each cart.
 
         Raises
         ------
@@ -254,7 +254,7 @@ class ExplainedGap:
 
     @cached_property
     def residual(self) -> "pd.DataFrame":
-        """The force that the model does not explain, a row for each cart and short window."""
+        """The force that the model does not explain, one row per cart and short window."""
         return gap_frames.residual(self.results, analysis=self.analysis)
 
     def __repr__(self) -> str:
@@ -264,14 +264,14 @@ class ExplainedGap:
 def explain(folder: Path | str, *, budget: float | None = None) -> ExplainedGap:
     """Find what the linear model of a submission leaves out, as `cartlab gap` does.
 
-    `budget` in s; past it the best answer so far.
+    `budget` is a time limit in s; if the search reaches it, the result is the best answer so far.
 
     Raises
     ------
     SubmissionError : `submission.toml` is wrong or missing, or no data can be read.
-    DataError : no recording that a model could be held against.
+    DataError : no recording can be compared with a model.
     """
-    from pipeline.gap.explain import investigate  # compiles, which takes its time
+    from pipeline.gap.explain import investigate  # imported here because it compiles, which is slow
 
     analysis = run(load_submission(Path(folder)), design=False)
     found = investigate(analysis, budget=budget, progress=silent)
@@ -292,11 +292,11 @@ def analyse(folder: Path | str) -> Lab:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class CheckedNumbers:
-    """Which reported numbers disagree with the recordings; shown as `cartlab check` prints it.
+    """Which reported numbers disagree with the recordings, displayed as by `cartlab check`.
 
     Attributes
     ----------
-    answer : what `checks.jsonl` keeps, without any value.
+    answer : the entry of `checks.jsonl`. It contains no estimated value.
     """
 
     answer: CheckAnswer
@@ -312,7 +312,7 @@ class CheckedNumbers:
         return self.answer.agree
 
     def share(self, *numbers: str) -> float:
-        """Return how many of these numbers agree, as a share; a missing one does not."""
+        """Return the share of these numbers that agree; a missing number counts as not agreeing."""
         if not numbers:
             raise TypeError('name the numbers that count: share("final.K", "final.zeta")')
         return sum(number in self.agree for number in numbers) / len(numbers)
@@ -329,15 +329,15 @@ def check(
 ) -> CheckedNumbers:
     """Say which numbers disagree with a submission's recordings, as `cartlab check` does.
 
-    Asked again without changes, it says where to look. It never tells a value, and writes each
-    answer into the submission's `checks.jsonl`.
+    A second call without changes says where to look. The answer never contains the right value.
+    Each answer is appended to the submission's `checks.jsonl`.
 
     Parameters
     ----------
-    reported : numbers in tables, `{"final": {"K": 24.3}}`; a text such as "0.10" keeps its digits.
+    reported : numbers in tables, `{"final": {"K": 24.3}}`. A text such as "0.10" keeps its digits.
         None: the numbers of `submission.toml`.
-    rubric : whose tolerances hold, a file or a shipped name; None: the shipped one for so many
-        carts.
+    rubric : the file or shipped name of the rubric with the tolerances. None: the shipped rubric
+        for this number of carts.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Writing results: whole files or none, never through a link that a submission brought.
+"""Write results: whole files or none, and never through a link that a submission brought.
 
-Tables are written so that a spreadsheet runs nothing that a student wrote.
+Tables are written so that a spreadsheet does not run any formula that a student wrote.
 """
 
 import os
@@ -15,21 +15,22 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError
 
-OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of files with students' names
+OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of files and folders with students' names
 LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
-# Not a formula although it looks like one: a number, or the dash for a missing value.
+# Not a formula although it begins like one: a number, or the dash for a missing value.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
-# What starts a formula, wide and small forms too, at the start of a cell or behind a semicolon,
-# where a spreadsheet of a country with decimal commas begins another cell, quotes or not.
+# Characters that start a formula, wide and small forms included, at the start of a cell or after a
+# semicolon. With decimal commas, a spreadsheet starts a new cell at a semicolon, even inside
+# quotes.
 _FORMULA = re.compile(r"(^|;)(?=[ \"']*[=+\-@＝＋－＠﹦﹢﹣﹫])")
 
 
 def check_folder(out: Path) -> Path:
-    """Return the folder, there or not yet.
+    """Return the folder, which may exist or not.
 
     Raises
     ------
-    ConfigError : something else is in its place.
+    ConfigError : its path is taken by something that is not a folder.
     """
     if out.exists() and not out.is_dir():
         raise ConfigError(f"{out}: is a file; give a folder with --out")
@@ -37,12 +38,12 @@ def check_folder(out: Path) -> Path:
 
 
 def named_folder(out: Path) -> Path:
-    """Return a folder that a person named, there or not yet.
+    """Return an output folder that a person named, which may exist or not.
 
     Raises
     ------
-    ConfigError : something else is in its place, or its name is meant for a file: several are
-        written.
+    ConfigError : its path is taken by something that is not a folder, or it looks like a file's
+        name although several files are written.
     """
     files = (".html", ".pdf", ".json", ".csv", ".xlsx", ".zip", ".db", ".sqlite")
     if not out.is_dir() and out.suffix.lower() in files:
@@ -51,11 +52,11 @@ def named_folder(out: Path) -> Path:
 
 
 def new_folder(out: Path) -> Path:
-    """Return the folder, not yet there or empty but for locks.
+    """Return the folder, which may not exist yet or is empty except for lock files.
 
     Raises
     ------
-    ConfigError : there is something in it, which a new submission would be mixed with.
+    ConfigError : the folder holds files, which the new submission would mix with.
     """
     if named_folder(out).is_dir() and any(path.name not in (LOCK, TURN) for path in out.iterdir()):
         raise ConfigError(f"{out}: is not empty; choose a new folder with --out")
@@ -63,11 +64,11 @@ def new_folder(out: Path) -> Path:
 
 
 def own_folder(parent: Path, name: str) -> Path:
-    """Return a folder of ours inside another, there or not yet.
+    """Return a folder of cartlab's own inside another folder; it may exist or not.
 
     Raises
     ------
-    ConfigError : a file or a link is in its place; what a link points at may be anybody's.
+    ConfigError : its path is taken by a file or a link. A link could lead to anybody's files.
     """
     folder = parent / name
     if folder.is_symlink():
@@ -76,9 +77,9 @@ def own_folder(parent: Path, name: str) -> Path:
 
 
 def write_file(path: Path, content: str | bytes, *, private: bool = False) -> None:
-    """Write a file whole or not at all; a link in its place is replaced, not followed.
+    """Write a file whole or not at all; replace a link at its path instead of following it.
 
-    Remains of a program that was killed while writing are removed, once per process.
+    The first write into a folder also removes partial files of a program that was killed.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def write_file(path: Path, content: str | bytes, *, private: bool = False) -> No
     """
     raw = content.encode() if isinstance(content, str) else content
     _clear_left_over(path.parent)
-    part = path.with_name(f".{secrets.token_hex(8)}.part")  # of this write alone
+    part = path.with_name(f".{secrets.token_hex(8)}.part")  # a unique name
     try:
         with open(part, "xb", opener=_for_the_owner if private else None) as file:
             file.write(raw)
@@ -100,19 +101,19 @@ def _for_the_owner(path: str, flags: int) -> int:
     return os.open(path, flags, OWNER_ONLY)
 
 
-# Once a folder: to look through thousands of files takes as long as to write one.
+# Once per folder: searching thousands of files takes as long as writing one.
 @lru_cache(maxsize=1000)
 def _clear_left_over(folder: Path) -> None:
-    an_hour_ago = time.time() - 3600.0  # no write takes so long; clocks are not so far apart
+    an_hour_ago = time.time() - 3600.0  # longer than any write takes or clocks differ
     for part in folder.glob(".*.part"):
-        with suppress(OSError):  # another has just removed it
+        with suppress(OSError):  # another process has just removed it
             ours = re.fullmatch(r"\.[0-9a-f]{16}\.part", part.name)
             if ours and part.stat().st_mtime < an_hour_ago:
                 part.unlink()
 
 
 def clear_files(folder: Path, pattern: str) -> None:
-    """Remove files of an earlier run, so that no stale ones stay."""
+    """Remove the files of an earlier run that match a pattern."""
     for path in folder.glob(pattern):
         if path.is_file() or path.is_symlink():
             path.unlink()
@@ -132,10 +133,10 @@ def _cell(value: object) -> str:
 
 
 def harmless(text: str) -> str:
-    """Return text without control characters, an apostrophe before what starts a formula.
+    """Return text without control characters, with an apostrophe before any start of a formula.
 
-    Blanks of all sorts and marks that show as nothing become plain blanks: none ends a row, and
-    none keeps a spreadsheet, but not us, from seeing a formula.
+    Special blanks and invisible characters become plain blanks. So they cannot end a row, and they
+    cannot hide a formula from this function.
     """
     text = "".join(c if c.isprintable() else " " for c in text)
     return text if _PLAIN.fullmatch(text) else _FORMULA.sub(r"\1'", text)

@@ -1,8 +1,9 @@
-"""Processes of our own that do one task after another, so that a bad one can be stopped.
+"""Worker processes that do one task after another and can be stopped without harm to the parent.
 
-The parent's side is a `Supervisor`, the child's is `serve`: lines of JSON go both ways. The first
-line to the child says what its tasks have in common, every further one is a task. It answers
-`ready`, then for each task `stage` as often as it likes and `done` or `failed` at the end.
+The parent uses a `Supervisor`, the worker calls `serve`; they exchange lines of JSON. The first
+line to the worker holds the settings for all its tasks, each further line holds one task. The
+worker answers `ready` first. For each task it sends any number of `stage` lines, then `done` or
+`failed`.
 """
 
 import faulthandler
@@ -27,26 +28,28 @@ from pipeline.threads import ONE_EACH
 from pipeline.words.progress import Progress, silent
 
 _GLANCE = 0.05  # s between checks of time, memory and stop requests
-_START_LIMIT = 120.0  # s; a cold start on a busy machine takes ten
-_STARTS = 3  # the system may end a new process to free memory
-_TASKS_EACH = 500  # then a new process, so that memory kept by libraries does not grow
-_GRACE = 30.0  # s after its limit until a task without a parent ends by itself
-_LAST_WORDS = 300  # characters of the last output of a process, or of an internal error
-_LUMP = 65_536  # bytes
-# One thread computes; another only listens, and needs no heap of its own, of 64 MB in glibc.
+_START_LIMIT = 120.0  # s. A cold start on a busy machine takes ten
+_STARTS = 3  # attempts. The system may end a new process to free memory
+_TASKS_EACH = 500  # The process is then replaced, because libraries keep more and more memory
+_GRACE = 30.0  # s that a task may run past its limit if the parent is gone
+_LAST_WORDS = 300  # characters kept of a process's last output, or of an internal error
+_LUMP = 65_536  # bytes to read at once
+# Only one thread computes. The other one only listens and does not need its own heap, which takes
+# 64 MB in glibc.
 _SPARING = {**ONE_EACH, "MALLOC_ARENA_MAX": "1"}
 
 
 class Failed(PipelineError):
-    """A task came to nothing; the text says why."""
+    """A task failed; the text says why."""
 
 
 class Ended(Failed):
-    """A process did not live to answer.
+    """A worker process ended before it answered.
 
     Attributes
     ----------
-    how : why it ended; `crash` and `start` by itself, the latter before it could do anything.
+    how : why it ended. `start` and `crash` mean that it ended by itself, before or after it was
+        ready.
     status : its exit status or signal, in words.
     said : the end of what it wrote to stderr.
     """
@@ -64,14 +67,7 @@ class Ended(Failed):
 
 
 class Supervisor:
-    """Has a process do tasks: started when needed, stopped at a limit, replaced after a fault.
-
-    Parameters
-    ----------
-    module : run by `python -m`, it calls `serve`.
-    memory : bytes that a task may take beyond what the process needs itself.
-    setup : plain data for `serve`, the same for all tasks.
-    """
+    """Runs tasks in a worker process: starts it, stops it at a limit, replaces it if it fails."""
 
     def __init__(self, module: str, *, memory: int, setup: Mapping[str, Any] | None = None) -> None:
         self._module, self._memory = module, memory
@@ -87,19 +83,19 @@ class Supervisor:
         stop: threading.Event | None = None,
         tell: Progress = silent,
     ) -> Any:
-        """Return the answer to a task, both plain data.
+        """Do a task in the worker and return its answer; both are plain data.
 
         Parameters
         ----------
-        limit : s for it, the start of a process not included.
-        stop : set to cancel the task.
-        tell : called with what it is about.
+        limit : time limit in s, without the start of the process.
+        stop : event that cancels the task when it is set.
+        tell : function that is called with each stage of the task.
 
         Raises
         ------
-        Failed : it came to nothing.
-        Ended : neither did its process live on.
-        OSError : the computer starts no process.
+        Failed : the task failed.
+        Ended : the task failed and its process ended.
+        OSError : the computer cannot start a process.
         """
         stop = stop or threading.Event()
         process = self._ready(stop)
@@ -108,7 +104,7 @@ class Supervisor:
         try:
             process.send(_json_line({"task": task, "limit": limit}))
         except OSError:
-            pass  # it has ended: the next line says so
+            pass  # it has ended; reading the answer will report that
         while True:
             answer = self._line(process, end=end, most=most, stop=stop)
             if answer is None:
@@ -125,7 +121,7 @@ class Supervisor:
 
     @property
     def runs(self) -> bool:
-        """Whether a process is there for the next task."""
+        """Whether the process is running and ready for the next task."""
         return self._process is not None and self._process.runs
 
     def start(self, stop: threading.Event) -> None:
@@ -138,7 +134,7 @@ class Supervisor:
         self._ready(stop)
 
     def close(self) -> None:
-        """End the process; the next task starts another."""
+        """End the process; the next task will start another one."""
         process, self._process = self._process, None
         if process is not None:
             process.close()
@@ -161,7 +157,7 @@ class Supervisor:
                 if error.how == "stopped":
                     raise
                 why = str(error)
-            except OSError as error:  # it has ended
+            except OSError as error:  # the process has ended
                 why = f"the process ended ({error.strerror})"
             said = process.said()
         self.close()
@@ -170,7 +166,7 @@ class Supervisor:
     def _line(
         self, process: "LineProcess", *, end: float, most: float, stop: threading.Event
     ) -> dict[str, Any] | None:
-        """Return what the process says next; None where it says nothing in time."""
+        """Return the next message of the process, or None if it sends none before `end`."""
         while True:
             if stop.is_set():
                 raise self._ended(process, "stopped", "stopped")
@@ -199,9 +195,10 @@ class Supervisor:
 
 
 class LineProcess:
-    """A process that works, a plain subprocess.
+    """A worker process that exchanges lines with this one.
 
-    A daemonic process such as a Dask worker may not have children of `multiprocessing`.
+    It is a plain subprocess, because a daemonic process such as a Dask worker may not have children
+    of `multiprocessing`.
     """
 
     def __init__(self, module: str) -> None:
@@ -221,57 +218,57 @@ class LineProcess:
         threading.Thread(target=self._listen, daemon=True).start()
 
     def send(self, line: bytes) -> None:
-        """Hand a line to the process.
+        """Send a line to the process.
 
         Raises
         ------
-        OSError : it has ended.
+        OSError : the process has ended.
         """
         assert self._process.stdin is not None
         self._process.stdin.write(line)
         self._process.stdin.flush()
 
     def line(self, *, timeout: float) -> bytes:
-        """Return the next line that it wrote; b"" where it has ended.
+        """Return the next line that the process wrote; b"" if the process has ended.
 
         Raises
         ------
-        queue.Empty : none came within `timeout` (s).
+        queue.Empty : no line came within `timeout` (s).
         """
         return self._lines.get(timeout=timeout)
 
     @property
     def runs(self) -> bool:
-        """Whether it has not ended."""
+        """Whether the process is still running."""
         return self._process.poll() is None
 
     @property
     def memory(self) -> int:
-        """Bytes that it holds, 0 where it has ended."""
+        """Bytes of memory that the process uses, 0 if it has ended."""
         try:
             return psutil.Process(self._process.pid).memory_info().rss
         except psutil.Error:
             return 0
 
     def ending(self) -> str:
-        """Wait for its end and return how it was."""
+        """Wait for the end of the process and return its exit status or signal in words."""
         code = self._process.wait()
         return f"signal {-code}" if code < 0 else f"exit status {code}"
 
     def said(self) -> str:
-        """Return the end of what it wrote to stderr, "" once it is closed."""
+        """Return the end of what the process wrote to stderr; "" after `close`."""
         if self._stderr.closed:
             return ""
         self._stderr.seek(0)
         return self._stderr.read().decode(errors="replace")[-4_000:]
 
     def last_words(self) -> str:
-        """Return how it ended and the last line that it wrote to stderr."""
+        """Return how the process ended and the last line that it wrote to stderr."""
         words = self.said().strip().rpartition("\n")[2][-_LAST_WORDS:]
         return f"the process ended ({self.ending()}) {words}".rstrip()
 
     def close(self) -> None:
-        """End it."""
+        """Kill the process."""
         self._process.kill()
         self._process.wait()
         for pipe in (self._process.stdin, self._stderr):
@@ -279,10 +276,10 @@ class LineProcess:
                 if pipe is not None:
                     pipe.close()
             except OSError:
-                pass  # what was not sent yet is not wanted any more
+                pass  # nobody needs the unsent data any more
 
     def _listen(self) -> None:
-        """Keep every line, b"" where they end."""
+        """Put every line of the process into the queue, then b"" at the end."""
         assert self._process.stdout is not None
         with self._process.stdout as lines:
             for line in lines:
@@ -291,11 +288,12 @@ class LineProcess:
 
 
 def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
-    """Do what a `Supervisor` asks of this process; end at once when it is gone.
+    """Do the tasks that a `Supervisor` sends to this process; exit at once when the parent is gone.
 
     Parameters
     ----------
-    prepare : given the set-up by name, it returns what does a task and tells how far it is.
+    prepare : called with the settings by name. It returns the function that does a task, which
+        takes the task and a function to report its stages.
     """
     collect_seldom()
     say = answering()
@@ -317,11 +315,11 @@ def serve(prepare: Callable[..., Callable[[Any, Progress], Any]]) -> None:
 
 
 def attempt(work: Callable[[], Any]) -> Any:
-    """Do a task; an error ends the task but not the process.
+    """Do a task and turn any of its errors into `Failed`, so that the process lives on.
 
     Raises
     ------
-    Failed : with the reason, for the caller.
+    Failed : the task raised an error; the text gives the reason.
     """
     try:
         return work()
@@ -339,7 +337,10 @@ def attempt(work: Callable[[], Any]) -> Any:
 
 
 def answering() -> Callable[..., None]:
-    """Keep stdout for answers, a line of JSON each; what libraries print goes to stderr."""
+    """Reserve stdout for answers and return the function that writes one as a line of JSON.
+
+    Anything that libraries print goes to stderr.
+    """
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
@@ -351,9 +352,9 @@ def answering() -> Callable[..., None]:
 
 
 def lines_sent() -> Iterator[bytes]:
-    """Yield the lines that the parent sends, in such a process, until it is gone.
+    """Yield the lines that the parent sends to a worker process, until the parent is gone.
 
-    They are not read from `sys.stdin`: Python cannot end while a thread waits for that, and aborts.
+    They are not read through `sys.stdin`: Python aborts if it ends while a thread waits for that.
     """
     rest = b""
     while lump := os.read(0, _LUMP):
@@ -362,7 +363,7 @@ def lines_sent() -> Iterator[bytes]:
 
 
 def limit_memory(more: int) -> None:
-    """Let the address space of this process grow by so many bytes; only Linux can."""
+    """Limit the growth of this process's address space to `more` bytes, on Linux only."""
     if sys.platform != "linux":
         return
     import resource
@@ -374,7 +375,7 @@ def limit_memory(more: int) -> None:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment of such a process: one thread, and the same package as here."""
+    """Return the environment of a worker process: one thread, and the same package as here."""
     package = str(Path(__file__).resolve().parents[1])
     before = os.environ.get("PYTHONPATH")
     path = f"{package}{os.pathsep}{before}" if before else package
@@ -384,7 +385,7 @@ def _environment() -> dict[str, str]:
 def _listen(sent: "queue.SimpleQueue[bytes]") -> None:
     for line in lines_sent():
         sent.put(line)
-    os._exit(0)  # whatever is under way: files are written whole or not at all
+    os._exit(0)  # it may interrupt a write, but files are written whole or not at all
 
 
 def _json_line(value: Any) -> bytes:

@@ -38,12 +38,12 @@ CheckOutcome = Literal["pass", "fail", "skip"]
 
 
 def passed(good: bool) -> CheckOutcome:
-    """Return the outcome of a check that passes where all is good, and else fails."""
+    """Return "pass" if `good` is true, else "fail"."""
     return "pass" if good else "fail"
 
 
-# χ² per degree of freedom up to which model and noise explain the data: by chance it is under 1.5
-# with 30 points and more; errors stated 40 % too small give 2.
+# Limit of χ² per degree of freedom: below it, model and noise explain the data. By chance it stays
+# under 1.5 with 30 or more points; standard errors that are 40 % too small give 2.
 EXPLAINED = 2.0
 
 
@@ -52,7 +52,10 @@ EXPLAINED = 2.0
 
 @dataclass(frozen=True, kw_only=True)
 class HeadingUnit:
-    """A unit that a heading states; `converts`: into the submission's, else it was not heeded."""
+    """A unit that a heading states.
+
+    `converts` is true if it can be converted to the submission's unit; otherwise it was ignored.
+    """
 
     role: Literal["position", "input"]
     heading: str
@@ -67,20 +70,22 @@ class Record:
     Attributes
     ----------
     id : the experiment's id, used in every message.
-    t : (n,) s, strictly increasing, as measured: never assumed uniform.
-    u : (n,) input, or None if the file has no input. Positive pushes cart 1 towards positive x.
-    y : (len(carts), n) positions; row j belongs to cart `carts[j]`.
+    t : (n,) s, strictly increasing. As measured, never assumed uniform.
+    u : (n,) input, or None if the file has no input. A positive input pushes cart 1 towards
+        positive x.
+    y : (len(carts), n) positions. Row j belongs to cart `carts[j]`.
     carts : the carts that were measured.
-    free : the carts free to move; the others are held.
+    free : the carts free to move. The others are held.
     reference : (n,) set point of a closed-loop run, in position units, or None.
     omega : frequency of a sine dwell, rad/s, or None.
-    resolution : (len(carts),) the encoder step, in position units; 0 if it is not visible.
+    resolution : (len(carts),) the encoder step, in position units. It is 0 if no step is visible.
     hold : how the input behaves between samples.
-    source : path inside the submission; `notes` list corrections made while reading.
-    turned : its input had the opposite sign to the bench's others, and was reversed.
-    position_scale, input_scale : factors from the file's own numbers to y and u
-        (the sign included); a controller's gains may be in the file's units.
-    heading_units : what the headings of positions and input state.
+    source : path inside the submission.
+    notes : corrections made while reading.
+    turned : whether the sign of the input was reversed here to agree with the other recordings.
+    position_scale, input_scale : signed factors from the file's own numbers to y and u. A
+        controller's gains may be in the file's units.
+    heading_units : the units that the headings of the position and input columns state.
     """
 
     id: str
@@ -125,9 +130,9 @@ class Record:
 
 @result()
 class Intervention:
-    """A stretch of a record in which an unmeasured force moves a cart.
+    """A stretch of a record in which an unmeasured force moves or holds a cart.
 
-    A hand, most likely; or one holds the cart away from its rest until it lets go.
+    Most likely it is a hand that moves the cart, or holds it away from its rest and lets it go.
     """
 
     experiment: str = written()
@@ -179,7 +184,7 @@ class SinePoint:
 
 @result(eq=False)
 class FrictionTest:
-    """The F-test for dry friction in a decay: does it explain more than viscous damping alone?"""
+    """The F-test for dry friction in a decay: is viscous damping alone enough?"""
 
     present: bool = written("whether the statistic is above its threshold")
     f_statistic: Number = written("of one further parameter")
@@ -196,10 +201,13 @@ class LogDecrement:
 
     Attributes
     ----------
-    peak_t, peak_y : (n_peaks,) the extrema used, maxima and minima in turn.
-    amplitude : (n_peaks - 2,) half the swing about the moving rest point, at peak_t[1:-1].
-    fit_t, fit_y : the fitted decay, for the figure; envelope_upper/lower at fit_t.
-    zeta_at_amplitude : (2, n) amplitude and the local damping ratio there.
+    peak_t, peak_y : (n_peaks,) times and positions of the extrema used. Maxima and minima
+        alternate.
+    amplitude : (n_peaks - 2,) half the peak-to-peak swing, at peak_t[1:-1]. A moving rest point
+        does not affect it.
+    fit_t, fit_y : the fitted decay, for the figure.
+    envelope_upper, envelope_lower : the envelope of the fitted decay, at fit_t.
+    zeta_at_amplitude : (2, n) amplitudes and the local damping ratio at each.
     """
 
     experiment: str = written()
@@ -233,15 +241,15 @@ class LogDecrement:
 
     @property
     def name(self) -> str:
-        """The record's id, and which of its decays it is."""
+        """The record's id and, if it has several decays, the number of this one."""
         return f"{self.experiment}, decay {self.number}" if self.number else self.experiment
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StepEdge:
-    """One edge of the input and the levels on its two sides.
+    """One jump of the input, with the levels of input and position on both sides.
 
-    `gain` is (level_after - level_before) / (u_after - u_before); windows in s.
+    `gain` is (level_after - level_before) / (u_after - u_before). `t` and the windows are in s.
     """
 
     t: float
@@ -276,7 +284,7 @@ class StepGain:
 
 @result(eq=False)
 class FrequencyResponse:
-    """X_cart/U at each frequency; carries its own grid, never interpolated: (n_w,) arrays."""
+    """X_cart/U at each frequency, on its own frequency grid; arrays (n_w,), never interpolated."""
 
     cart: int = written()
     omega: Array = written("rad/s, ascending")
@@ -295,11 +303,12 @@ class FrequencyResponse:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A number with its standard error and where it comes from ("step", "log_decrement", …).
+    """A number with its standard error and its source ("step", "log_decrement", …).
 
-    `at_bound`: a fit ended at the bound of what is possible (a damping of zero), so `value` is
-    that bound and no measurement, `std` is None, and nothing may be concluded from either.
-    `experiments` are the recordings it rests on; of a fit's, see `ChainFit.experiments`.
+    `at_bound` is true if a fit ended at the limit of what is possible, such as zero damping. Then
+    `value` is that limit and not a measurement, `std` is None, and no conclusion may be drawn from
+    either. `experiments` are the recordings behind the number; for a fit see
+    `ChainFit.experiments`.
     """
 
     value: float
@@ -317,15 +326,17 @@ class ChainFit:
     ----------
     chain : the fitted plant.
     names : physical parameters that have a standard error ("m_1", "c_1", "k_2", …).
-    covariance : (n_p, n_p) of those.
-    at_bound : physical parameters that the fit's own data leave open down to their bound, zero:
-        held there, or taken from the decays where those tell.
-    parameters : the named parameters of the chain with standard errors, in table order. One that
-        ended at its bound says so (`Estimate.at_bound`) and is in no table.
-    staged : the named parameters the stage-by-stage fit (last cart first) found, for the report.
-    misfit : of a "bode_fit" by how much of their magnitude points lie off it, beyond their errors.
-    standardised : per cart (n_w,) or per record (n,): residual over its standard error.
-    experiments : the recordings that it was fitted to.
+    covariance : (n_p, n_p) covariance of these parameters.
+    at_bound : physical parameters that the fitted data do not keep away from their bound, zero.
+        They are held at zero or, where possible, taken from the decays.
+    parameters : the named parameters of the chain with standard errors, in table order. If one
+        ended at its bound, its `Estimate.at_bound` is true and no table shows it.
+    staged : the named parameters from the stage-by-stage fit (last cart first). For the report.
+    misfit : for a "bode_fit", the distance of the magnitude points from the fit beyond their
+        standard errors. It is a share of the magnitude.
+    standardised : residuals divided by their standard errors. One array (n_w,) per cart or (n,)
+        per record.
+    experiments : the recordings that the chain was fitted to.
     """
 
     method: Literal["bode_fit", "time_fit"] = written("to the frequency response or time records")
@@ -361,7 +372,7 @@ class ChainFit:
 
 @result()
 class ParameterRow:
-    """One parameter of the transfer functions, estimated in up to two ways: Tables 1-3."""
+    """One parameter with its initial and final estimate, a row of the paper's Tables 1-3."""
 
     name: str = written("K_1, omega_a, zeta_1, …")
     unit: str = written("empty for a damping ratio")
@@ -371,13 +382,13 @@ class ParameterRow:
     @property
     @computed(key="initial")
     def initial_value(self) -> float | None:
-        """From the first stages."""
+        """The estimate from the first stages."""
         return self.initial and self.initial.value
 
     @property
     @computed()
     def initial_std(self) -> float | None:
-        """In the unit of the parameter."""
+        """The standard error, in the unit of the parameter."""
         return self.initial and self.initial.std
 
     @property
@@ -389,13 +400,13 @@ class ParameterRow:
     @property
     @computed(key="final")
     def final_value(self) -> float | None:
-        """From the fit of all carts at once."""
+        """The estimate from the fit of all carts at once."""
         return self.final and self.final.value
 
     @property
     @computed()
     def final_std(self) -> float | None:
-        """In the unit of the parameter."""
+        """The standard error, in the unit of the parameter."""
         return self.final and self.final.std
 
     @property
@@ -443,20 +454,20 @@ CheckKind = Literal[
 
 @result()
 class Check:
-    """One consistency check, in a sentence for a student; outcome against `limit`.
+    """One consistency check, in a sentence for a student; `value` is compared with `limit`.
 
     Attributes
     ----------
-    kind : what is asked, whatever it is asked of.
-    run, cart, parameter : what it is asked of, where that is one.
-    part : which of several questions of a kind: "converged" of the fit, "in_ab" of a frequency's
-        order, the number of a recording's decay.
+    kind : the question, such as whether a step has one gain.
+    run, cart, parameter : what the question is about, as far as it has these.
+    part : tells several questions of one kind apart. It is "converged" for the fit, "in_ab" for the
+        order of a frequency, or the number of a recording's decay.
     """
 
     @property
     @computed()
     def id(self) -> str:
-        """What is asked, and of what: "decay.run-1.cart_1"."""
+        """The kind of check and what it is about: "decay.run-1.cart_1"."""
         return f"{self.kind}.{self.about}" if self.about else self.kind
 
     kind: CheckKind
@@ -471,7 +482,7 @@ class Check:
 
     @property
     def about(self) -> str:
-        """The subject of the check, such as "run-1.cart_1", or ""."""
+        """What the check is about, such as "run-1.cart_1"; may be ""."""
         cart = "" if self.cart is None else f"cart_{self.cart}" if self.run else f"cart-{self.cart}"
         if self.parameter and self.part:
             return f"{self.parameter}_{self.part}"
@@ -487,8 +498,8 @@ class FeedbackDesign:
 
     Attributes
     ----------
-    requested_poles : what pole placement was asked for; None with LQR.
-    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u²; None with pole placement.
+    requested_poles : the poles requested from pole placement. None with LQR.
+    Q (2n, 2n), R : the weights of LQR's cost, the sum of x'Q x + R u². None with pole placement.
     t, y (n_carts, n), u : the simulated step.
     """
 
@@ -517,13 +528,13 @@ class FeedbackDesign:
     u: Array
 
     def controller(self, chain: Chain) -> StateFeedback:
-        """Return what runs: its observer knows the carts it was designed for."""
+        """Return the controller for the hardware; its observer uses the given chain."""
         return StateFeedback(gains=self.gains, prefilter=self.prefilter, model=chain)
 
 
 @result()
 class MeasuredInput:
-    """The plant alone, driven by the logged input."""
+    """Comparison of the plant alone, driven by the logged input, with the measurement."""
 
     nrmse: Number = written()
     input_scale: float | None = written(
@@ -537,12 +548,13 @@ class HardwareCheck:
 
     Attributes
     ----------
-    input_scale : the factor on the logged input that explains the motion best (1 = as logged),
-        its sign included; None where it was not looked for.
+    input_scale : the factor on the logged input, sign included, that explains the motion best. It
+        is
+        1 if the log is right, and None where it was not estimated.
     t, measured, model : (n,).
-    effort : (n,) input that the modelled loop asks for; None with the measured input.
-    set_point : (n,) where the loop is told to bring this cart; None where it is another that is.
-    contradicted : what was logged or stated of the run cannot be so; the note says how.
+    effort : (n,) input of the simulated loop. None in the comparison with the measured input.
+    set_point : (n,) desired position of this cart. None if the loop controls another cart.
+    contradicted : whether the log or the stated controller cannot be right. The note says why.
     """
 
     experiment: str = written()
@@ -574,7 +586,7 @@ class HardwareCheck:
 
 
 class Stage(StrEnum):
-    """A stage that may not run, as results.json calls it."""
+    """A stage that may be skipped, as named in results.json."""
 
     READING = "reading"
     LOG_DECREMENT = "log decrement"
@@ -595,14 +607,14 @@ class Stage(StrEnum):
 class Skipped:
     """A stage that could not run, with its recording, cart or parameter, and the reason.
 
-    `missing` names the missing data in words. It is empty if there are recordings that cannot be
-    used; the reason then says why.
+    `missing` names the missing data in words. It is empty if there are such recordings but they
+    cannot be used; the reason then says why.
     """
 
     @property
     @computed(key="stage")
     def name(self) -> str:
-        """The stage and what it is of: "step gain, run-1, cart 1", "reading run-1"."""
+        """The stage, with its recording and cart: "step gain, run-1, cart 1", "reading run-1"."""
         if self.stage in (Stage.READING, Stage.FINAL_PARAMETER):
             return f"{self.stage} {self.run}{self.parameter}"
         cart = "" if self.cart is None else f"cart {self.cart}"
@@ -631,7 +643,7 @@ class LeftOut:
 
 @result()
 class Assumption:
-    """Something about the bench that every number rests on, and how the data support it."""
+    """A statement about the bench that every number depends on, and whether the data support it."""
 
     key: str = written("of submission.toml: system.springs, …")
     about: str = written("which one, where there are several: wall-1", default="")
@@ -648,9 +660,10 @@ class Assumption:
 
 @dataclass(frozen=True, kw_only=True)
 class LateChannel:
-    """A cart whose channel is read later than another's, in the experiments of one kind.
+    """A cart whose position is read later than another cart's, in the experiments of one kind.
 
-    `delay` : s, negative where it is read earlier, against `limit`; `than` is the other cart.
+    `delay` is in s, negative if it is read earlier; `limit` is the largest allowed. `than` is the
+    other cart.
     """
 
     cart: int
@@ -663,7 +676,7 @@ class LateChannel:
 
 @result()
 class Submitted:
-    """Whose it is, and the bench."""
+    """The title, the authors and the bench of a submission."""
 
     title: str = written()
     section: str = written()
@@ -675,7 +688,7 @@ class Submitted:
 
 @result()
 class Provenance:
-    """What made a file, and of what."""
+    """The program version and the data files behind a result file."""
 
     version: str = written("of cartlab", default=__version__)
     files: dict[str, Sha256] = written("SHA-256 of every data file")
@@ -698,7 +711,7 @@ class ChainWithUnits(Chain):
 
     @classmethod
     def of(cls, chain: Chain, units: Units) -> "ChainWithUnits":
-        """Return a chain with the units that it has in the submission's."""
+        """Return the chain together with its units."""
         own = ChainUnits(m=units.mass, c=units.damping, k=units.stiffness)
         return cls(m=chain.m, c=chain.c, k=chain.k, units=own)
 
@@ -719,15 +732,16 @@ class Analysis:
 
     Attributes
     ----------
-    authors : (id, name) of each.
-    tables : the students' own reduced tables, even if dwells replace them.
-    rows : the table of parameters; `chain` is None if no fit was possible (`skipped` says why).
+    authors : (id, name) of each author.
+    tables : the students' own reduced tables, even if dwells replace them. May be empty.
+    rows : the table of parameters.
+    fit : None if no fit was possible. `skipped` says why.
     files : the SHA-256 of each data file.
     unreadable : the reason, for each experiment that could not be read.
     unexplained : for each driven recording with motion, the share of its power that the fitted
         carts do not explain.
     discussion : `notes.md`, without its comments.
-    reported : the students' own numbers, initial and final, as typed.
+    reported : the students' own numbers, initial and final. Digits are as typed.
     """
 
     schema: Literal["cartlab-results/1"] = written(default="cartlab-results/1")
@@ -739,7 +753,7 @@ class Analysis:
     @property
     @computed()
     def submission(self) -> Submitted:
-        """Whose it is, and the bench."""
+        """The title, the authors and the bench."""
         return Submitted(
             title=self.title,
             section=self.section,
@@ -806,7 +820,7 @@ class Analysis:
     @property
     @computed()
     def provenance(self) -> Provenance:
-        """What made the file, and of what."""
+        """The program version and the data files behind these results."""
         return Provenance(files=dict(sorted(self.files.items())))
 
     @property
@@ -816,10 +830,10 @@ class Analysis:
 
     @property
     def steps(self) -> frozenset[str]:
-        """The steps: what rings after one was not let go."""
+        """The ids of the step recordings; ringing after a step is not a free release."""
         return frozenset(record.id for record in self.records if record.kind == "step")
 
     @property
     def failed_checks(self) -> tuple[Check, ...]:
-        """The checks that were not passed: each is a reason to doubt the numbers."""
+        """The checks that failed: each is a reason to doubt the numbers."""
         return tuple(check for check in self.checks if check.outcome == "fail")

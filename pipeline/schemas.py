@@ -1,4 +1,4 @@
-"""The JSON Schemas of all files, by name."""
+"""The JSON Schemas of all result files, by name."""
 
 import json
 
@@ -20,7 +20,7 @@ MODELS: dict[str, type] = {
 
 
 def schema_text(name: str) -> str:
-    """Return the JSON Schema of a file: `results.json`, or a line of `checks.jsonl` ("check").
+    """Return the JSON Schema of a file, such as "results", or "check" for a line of `checks.jsonl`.
 
     Raises
     ------

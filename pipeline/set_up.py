@@ -1,4 +1,4 @@
-"""The set-up that every number is about, as one value: carts, springs, units, sign."""
+"""The lab set-up as one value: carts, springs, units and sign of the input."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,31 +8,31 @@ from pipeline.json_files import result, written
 
 @result()
 class Units:
-    """The submission's own units."""
+    """The submission's own units of position and input."""
 
     position: str = written()
     input: str = written()
 
-    # Those that follow; times are in s. The input gain is one, so forces are in input units.
+    # Derived units; times are in s. The input gain is 1, so forces have the input unit.
 
     @property
     def gain(self) -> str:
-        """Of a static gain."""
+        """The unit of a static gain."""
         return f"{self.position}/{self.input}"
 
     @property
     def mass(self) -> str:
-        """Of a mass."""
+        """The unit of a mass."""
         return f"{self.input} s^2/{self.position}"
 
     @property
     def damping(self) -> str:
-        """Of a damping coefficient."""
+        """The unit of a damping coefficient."""
         return f"{self.input} s/{self.position}"
 
     @property
     def stiffness(self) -> str:
-        """Of a spring, and of a prefilter."""
+        """The unit of a spring's stiffness, and of a prefilter."""
         return f"{self.input}/{self.position}"
 
 
@@ -41,12 +41,14 @@ PAPER_UNITS = Units(position="cm", input="V")
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """The carts in a row between two walls, and what their numbers are measured in.
+    """The carts in a row between two walls, and the units of their measurements.
 
     Attributes
     ----------
-    springs : (n + 1,) whether there is a spring from wall to cart 1, 1 to 2, …, n to wall.
-    sign : of the input, as stated: -1 drives cart 1 towards negative x; None, found from the data.
+    springs : (n + 1,) whether each spring exists: wall to cart 1, cart 1 to 2, …, cart n to wall.
+    sign : the stated sign of the input. With -1 a positive input pushes cart 1 towards negative x.
+        None
+        if the sign must be found from the data.
     """
 
     springs: tuple[bool, ...]
@@ -60,15 +62,18 @@ class Bench:
 
     @property
     def rigid(self) -> bool:
-        """Whether there is one cart without a spring: a mass and a damping, no gain."""
+        """Whether it is one cart without a spring, which has a mass but no static gain."""
         return self.n == 1 and not any(self.springs)
 
     @property
     def tied(self) -> bool:
-        """Whether a spring ties the carts to a wall: else no constant input has a rest position."""
+        """Whether a spring ties the carts to a wall; without one a constant input has no rest."""
         return self.springs[0] or self.springs[-1]
 
     @property
     def stiff(self) -> tuple[bool, ...]:
-        """(n + 1,) the springs that have a stiffness of their own: of one cart's two, their sum."""
+        """(n + 1,) whether each stiffness can be identified.
+
+        Of one cart's two springs only the sum can; it counts as the first.
+        """
         return (any(self.springs), False) if self.n == 1 else self.springs

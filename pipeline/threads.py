@@ -1,6 +1,6 @@
-"""One thread for linear algebra: our matrices are small, and more threads only wait for another.
+"""One thread for linear algebra: our matrices are small, so a second thread only waits.
 
-With two, a report takes a fifth more of the processor.
+With two threads a report takes a fifth more processor time.
 """
 
 import os
@@ -11,9 +11,9 @@ ONE_EACH = dict.fromkeys(
 
 
 def one_thread() -> None:
-    """Have linear algebra compute in one thread, in a process that is ours alone.
+    """Make linear algebra use one thread, in a process that only cartlab uses.
 
-    Called before numpy is loaded; what the user has set stays.
+    Call it before numpy is loaded. Settings of the user are kept.
     """
     for name, value in ONE_EACH.items():
         os.environ.setdefault(name, value)

@@ -1,7 +1,7 @@
 """The workflow from a submission to its analysis.
 
-The stages that measure the carts are, in order, in `identify/carts.py`, their fits in
-`identify/fit.py`; what follows them is here.
+`identify/carts.py` lists the stages that measure the carts, `identify/fit.py` their fits. The steps
+after that are here.
 """
 
 from dataclasses import replace
@@ -42,9 +42,9 @@ _WORDS = phrases("skipped")
 def analyse(
     submission: Submission, *, design: bool = True, progress: Progress = silent
 ) -> Analysis:
-    """Run every stage that the submission's data support; the rest is skipped with its reason.
+    """Run every stage that the submission's data support; skip the others and record why.
 
-    Without `design` no controller is designed: see `reference_design`.
+    Without `design` no controller is designed; see `reference_design`.
 
     Raises
     ------
@@ -101,7 +101,7 @@ def analyse(
 
 
 def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Intervention, ...]]:
-    """Return what the files hold, and where a force that was not measured moved a cart."""
+    """Return the measured data, and the stretches in which an unmeasured force moved a cart."""
     data = read_data(submission)
     for name, reason in data.unreadable.items():
         log.skip(Stage.READING, reason, run=name)
@@ -111,13 +111,13 @@ def _read(submission: Submission, *, log: Log) -> tuple[Ingested, tuple[Interven
     return data, interventions
 
 
-# ----------------------------------------------- what rests on the carts
+# -------------------------------------------------- stages that use the fitted carts
 
 
 def _with_loops(
     analysis: Analysis, submission: Submission, *, design: bool, progress: Progress, log: Log
 ) -> Analysis:
-    """Return the analysis with the designed loop and those that ran, and all that the log holds."""
+    """Return the analysis with the designed loop, the loops that ran and the log's notes."""
     fit, feedback, checks = analysis.fit, None, list(analysis.checks)
     if design:
         progress("state feedback")
@@ -145,11 +145,11 @@ def _with_loops(
 
 
 def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDesign:
-    """Return the state feedback for the submission's task on the carts as they were identified.
+    """Return the state feedback that the submission's task asks for, for the identified carts.
 
     Raises
     ------
-    DataError : they are not identified well enough to design for.
+    DataError : the carts are not identified well enough for a design.
     """
     if fit is None:
         raise DataError(_WORDS.text("no_carts"))
@@ -160,7 +160,7 @@ def reference_design(submission: Submission, fit: ChainFit | None) -> FeedbackDe
 
 
 def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[HardwareCheck]:
-    """Return how the loops that ran compare with the carts."""
+    """Return how each recorded loop compares with a simulation of the fitted carts."""
     fit = analysis.fit
     runs = {record.id: record for record in analysis.records if record.kind == "closed_loop"}
     if not runs:
