@@ -3,7 +3,7 @@
 In a notebook: `from pipeline import analyse, check, explain`, then `analyse("team-07")`.
 """
 
-TYPE_CHECKING = False  # stands in for typing.TYPE_CHECKING: importing typing is slow
+TYPE_CHECKING = False  # replaces typing.TYPE_CHECKING, as importing typing is slow
 if TYPE_CHECKING:
     from typing import Any
 

@@ -106,7 +106,7 @@ def result(*, eq: bool = True) -> Callable[[type[T]], type[T]]:
 
 @dataclass(frozen=True, kw_only=True)
 class WrittenMember:
-    """What a type writes under one key; `stored` is true for a field, false for a property."""
+    """The content of one key in a type's file; `stored` is false for a property."""
 
     name: str
     key: str

@@ -31,8 +31,8 @@ _GLANCE = 0.05  # s between checks of time, memory and stop requests
 _START_LIMIT = 120.0  # s. A cold start on a busy machine takes ten
 _STARTS = 3  # attempts. The system may end a new process to free memory
 _TASKS_EACH = 500  # The process is then replaced, because libraries keep more and more memory
-_GRACE = 30.0  # s that a task may run past its limit if the parent is gone
-_LAST_WORDS = 300  # characters kept of a process's last output, or of an internal error
+_GRACE = 30.0  # s. A task without a parent may run past its limit for so long.
+_LAST_WORDS = 300  # characters of a process's last output, or of an internal error.
 _LUMP = 65_536  # bytes to read at once
 # Only one thread computes. The other one only listens and does not need its own heap, which takes
 # 64 MB in glibc.

@@ -1,19 +1,18 @@
-"""The map: every type that passes between the stages, in the order of the pipeline.
+"""Every type that passes between the stages, in the order of the pipeline.
 
 Units throughout: the submission's own position unit (say cm) and input unit (say V), seconds,
 radians. Time is the last axis. Carts and springs count from 1. A standard error ("std") is one
 sigma; `None` means it could not be determined.
 
-It starts with a recording and the results of single recordings. Other packages have further types:
+The file starts with a recording and the results of single recordings. Fields marked `written` are
+in the type's file, in this order (`json_files.py`). Other packages have further types:
 
-- `Ingested` (`ingest/read.py`): the data read;
-- `Identified` and `Fitted` (`identify/`): results of the stages up to the fit;
-- `Repeats` (`soundness/repeated_numbers.py`);
-- `Gap` (`gap/types.py`): the gap of the linear carts and its explanation;
-- `Grade` (`grading/grade.py`): the points of a submission, with reasons;
-- `Grading` (`grading/gradings.py`): its place in a class.
-
-Fields marked `written` are in the type's file, in that order (`json_files.py`).
+- `Ingested` (`ingest/read.py`). The data read.
+- `Identified` and `Fitted` (`identify/`). Results of the stages up to the fit.
+- `Repeats` (`soundness/repeated_numbers.py`). Steps and decays in repeated recordings.
+- `Gap` (`gap/types.py`). The gap of the linear carts and its explanation.
+- `Grade` (`grading/grade.py`). The points of a submission, with reasons.
+- `Grading` (`grading/gradings.py`). The place of a grade in a class.
 """
 
 from collections.abc import Mapping
@@ -82,7 +81,7 @@ class Record:
     hold : how the input behaves between samples.
     source : path inside the submission.
     notes : corrections made while reading.
-    turned : whether the sign of the input was reversed here to agree with the other recordings.
+    turned : whether the sign of the input was reversed. It then agrees with the other recordings.
     position_scale, input_scale : signed factors from the file's own numbers to y and u. A
         controller's gains may be in the file's units.
     heading_units : the units that the headings of the position and input columns state.
@@ -206,7 +205,7 @@ class LogDecrement:
     amplitude : (n_peaks - 2,) half the peak-to-peak swing, at peak_t[1:-1]. A moving rest point
         does not affect it.
     fit_t, fit_y : the fitted decay, for the figure.
-    envelope_upper, envelope_lower : the envelope of the fitted decay, at fit_t.
+    envelope_upper, envelope_lower : the envelope. It is given at fit_t.
     zeta_at_amplitude : (2, n) amplitudes and the local damping ratio at each.
     """
 
@@ -325,7 +324,7 @@ class ChainFit:
     Attributes
     ----------
     chain : the fitted plant.
-    names : physical parameters that have a standard error ("m_1", "c_1", "k_2", …).
+    names : physical parameters that have a standard error. For example "m_1", "c_1", "k_2".
     covariance : (n_p, n_p) covariance of these parameters.
     at_bound : physical parameters that the fitted data do not keep away from their bound, zero.
         They are held at zero or, where possible, taken from the decays.
@@ -482,7 +481,7 @@ class Check:
 
     @property
     def about(self) -> str:
-        """What the check is about, such as "run-1.cart_1"; may be ""."""
+        """The subject of the check, such as "run-1.cart_1", or ""."""
         cart = "" if self.cart is None else f"cart_{self.cart}" if self.run else f"cart-{self.cart}"
         if self.parameter and self.part:
             return f"{self.parameter}_{self.part}"
@@ -737,9 +736,9 @@ class Analysis:
     rows : the table of parameters.
     fit : None if no fit was possible. `skipped` says why.
     files : the SHA-256 of each data file.
-    unreadable : the reason, for each experiment that could not be read.
-    unexplained : for each driven recording with motion, the share of its power that the fitted
-        carts do not explain.
+    unreadable : by experiment, the reason why it could not be read. Empty if all were read.
+    unexplained : for each driven recording with motion, a share of its power. The fitted carts do
+        not explain this share.
     discussion : `notes.md`, without its comments.
     reported : the students' own numbers, initial and final. Digits are as typed.
     """
@@ -794,7 +793,7 @@ class Analysis:
     @property
     @computed(key="hardware")
     def hardware_by_cart(self) -> tuple[HardwareCheck, ...]:
-        """One entry a run and cart: the loop that ran, with the measured-input check inside it."""
+        """One entry per run and cart: the simulated loop, with the measured-input check inside."""
         found: dict[tuple[str, int], HardwareCheck] = {}
         for check in sorted(self.hardware, key=lambda check: check.loop):  # "closed" before "open"
             key = (check.experiment, check.cart)

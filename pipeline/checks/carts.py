@@ -1,4 +1,4 @@
-"""Checks of the fitted carts: does the fit explain the data, and is its chain a possible one."""
+"""Checks of the fitted carts: whether the fit explains the data and the chain is possible."""
 
 from collections.abc import Mapping
 from itertools import pairwise
@@ -14,15 +14,16 @@ from pipeline.results import EXPLAINED, ChainFit, Check, passed
 from pipeline.set_up import Bench
 from pipeline.stages.compare import SIGMA_LIMIT
 
-_REDUNDANCY = 1e-9  # two routes to one number through unrounded values
-_BELOW_ZERO = 2.0  # standard errors by which a mass, damping or spring may be below zero
-# Share of its larger neighbour: on no bench masses, dampers or springs differ fifty times. Without
-# a spring, dry friction and loose screws look like one of up to 1 % of the next.
+_REDUNDANCY = 1e-9  # relative. One number computed in two ways, without rounding.
+_BELOW_ZERO = 2.0  # standard errors. A mass, damping or spring may be this far below zero.
+# A parameter below this share of its larger neighbour may not exist: on no bench do masses, dampers
+# or springs differ by a factor of 50. If a spring is missing, dry friction and loose screws look
+# like a spring of up to 1 % of its neighbour.
 NEGLIGIBLE = 0.02
 
 
 def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
-    """Check the fit, and its chain against the laws of a real one: signs, redundancies, orders."""
+    """Check the fit, and the chain against laws of a real one: signs, redundancies, orders."""
     if fit is None:
         message = "No model was identified: the reasons are among what was skipped."
         return [Check(kind="fit", part="identified", outcome="fail", message=message)]
@@ -64,7 +65,10 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
 
 
 def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
-    """No mass, damping or spring may be negative by more than its standard error allows."""
+    """Check that nothing is negative by more than its standard error allows.
+
+    This covers all masses, dampings and springs.
+    """
     values, std = physical_values(fit.chain, bench=bench), fit.std
     below = {
         name: -value / std[name] if std.get(name) else np.inf
@@ -89,7 +93,7 @@ def _sign_check(fit: ChainFit, *, bench: Bench) -> Check:
 
 
 def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
-    """Return the masses, dampings and springs that are declared, by name."""
+    """Return the masses, dampings and springs that the bench has, by name."""
     values = {f"m_{i}": float(m) for i, m in enumerate(chain.m, start=1)}
     values |= {f"c_{i}": float(c) for i, c in enumerate(chain.c, start=1)}
     springs = enumerate(zip(chain.k, bench.stiff, strict=True), start=1)
@@ -99,7 +103,8 @@ def physical_values(chain: Chain, *, bench: Bench) -> dict[str, float]:
 def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
     """Fail for each mass, damping or spring that may not exist.
 
-    It is zero within its error, or negligible beside its larger neighbour of the same kind.
+    Its value is zero within its standard error, or negligible beside its larger neighbour of the
+    same kind.
     """
     if not fit.converged:
         return []
@@ -133,7 +138,7 @@ def check_vanishing(fit: ChainFit, *, bench: Bench) -> list[Check]:
 
 
 def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
-    """Return the larger of the positive neighbours of the same kind, or ""."""
+    """Return the name of the larger of a parameter's positive neighbours of its kind, or ""."""
     read = read_name(name)
     assert read.cart is not None
     beside = [f"{read.symbol}_{read.cart + step}" for step in (-1, 1)]
@@ -141,7 +146,7 @@ def _larger_neighbour(name: str, values: Mapping[str, float]) -> str:
 
 
 def _ask_if_there(name: str, *, bench: Bench) -> str:
-    """Return the question that a vanishing parameter raises, and the line to change."""
+    """Return the question to the student about a vanishing parameter, and the line to change."""
     read, n = read_name(name), bench.n
     assert read.cart is not None
     i = read.cart
@@ -190,10 +195,11 @@ def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
 
 
 def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
-    """The further from the motor, the smaller the static displacement."""
+    """Check that a constant input moves a cart less, the further it is from the motor."""
     names = [gain_name(cart, n=chain.n) for cart in range(1, chain.n + 1)]
     gains = [values[name] for name in names]
-    # Without a spring at the far end equal gains are right, and rounding decides the sign.
+    # If no spring holds the far end, all static gains are equal and rounding decides which is
+    # larger.
     rise = max(later / earlier - 1 for earlier, later in pairwise(gains))
     good = rise <= _REDUNDANCY and min(gains) >= 0
     return Check(
@@ -207,11 +213,14 @@ def _gain_order_check(values: Mapping[str, float], *, chain: Chain) -> Check:
 
 
 def _frequency_order_checks(values: Mapping[str, float], *, n: int) -> list[Check]:
-    """Resonances, nulls and the carts alone interlace, except with heavy damping."""
+    """Check the order of resonances, nulls and the carts' own frequencies.
+
+    Heavy damping may change the order, so then it is not checked.
+    """
     damped = any(v > HEAVY_DAMPING for name, v in values.items() if read_name(name).is_ratio)
     checks = []
     for low, middle, high, _ in brackets(n):
-        # Distance outside the bracket, in percent of the value.
+        # Distance of the frequency from its allowed range, in percent of the frequency.
         excess = max(values[low] / values[middle], values[middle] / values[high]) - 1
         good = excess <= _REDUNDANCY
         reason = " (not exact where a damping ratio is above 0.3)" if damped and not good else ""

@@ -1,6 +1,6 @@
 """Checks of single estimates.
 
-Two estimates of one number; decays and steps against their models.
+They compare two estimates of one number, and decays and steps with their models.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from pipeline.words.numbers import abridge
 
 
 def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
-    """Judge every parameter that was measured in two ways; a wide error means no agreement."""
+    """Check that two estimates of a parameter agree; a wide standard error is no agreement."""
     verdicts: dict[bool | None, tuple[CheckOutcome, str]] = {
         True: ("pass", "agree"),
         False: ("fail", "disagree"),
@@ -51,7 +51,7 @@ def check_rows(rows: Sequence[ParameterRow]) -> list[Check]:
 
 
 def _advice(row: ParameterRow) -> str:
-    """Return which recordings to look at, of those behind the two estimates."""
+    """Return which recordings to look at, of those that the two estimates use."""
     name, before, after = read_name(row.name), row.initial, row.final
     assert before is not None
     assert after is not None
@@ -122,10 +122,11 @@ def check_decays(
 def check_steps(
     steps: Sequence[StepGain], *, decays: Sequence[LogDecrement] = (), bench: Bench
 ) -> list[Check]:
-    """Check whether every step has one gain; for a cart that sticks there is at least an interval.
+    """Check whether every step has one static gain, or only an interval because the cart sticks.
 
-    A step with one gain may still be held off by friction, if it stops short equally on the way out
-    and back. So it passes only if several edges agree and nothing shows dry friction on that cart.
+    Friction can shift a step that seems to have one gain, if the cart stops equally short on the
+    way out and back. So the check passes only if several edges agree and nothing shows dry friction
+    on that cart.
     """
     rubs: dict[int, list[str]] = {}
     for decay in decays:
@@ -145,7 +146,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         width = high - low
         outcome, found = (
             "fail",
-            (  # the rest points show the least friction that can hold
+            (  # the shift of the rest points gives the least friction that can hold the cart
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
                 f"{bench.units.gain}, and it may be further off."
             ),

@@ -1,4 +1,4 @@
-"""Checks of loops: the designed one against what was asked for, those that ran with the log."""
+"""Checks of loops: the design against its goal, and the loops that ran against their logs."""
 
 from collections.abc import Sequence
 
@@ -13,10 +13,11 @@ from pipeline.plant.loop.margins import Margins, stability_margins
 from pipeline.plant.loop.sampled_loop import discretise
 from pipeline.results import Check, CheckOutcome, FeedbackDesign, HardwareCheck
 
-# Of the coefficients of a loop's polynomial, relative to their binomials. Rounding leaves 1e-13 of
-# them on realistic plants; gains of another program up to 1e-8.
+# Relative difference up to which two loops are the same: coefficients of their polynomials, each
+# divided by its binomial coefficient. Rounding leaves 1e-13 on realistic plants, and gains from
+# another program up to 1e-8.
 _SAME_LOOP = 1e-6
-_LAST_DIGIT = 12  # smaller differences are rounding, which depends on the linear algebra library
+_LAST_DIGIT = 12  # decimals; rounding beyond them depends on the linear algebra library
 
 
 def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
@@ -36,11 +37,12 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
 
 
 def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
-    """Check that the gains give the loop that was asked for.
+    """Check that the designed gains give the requested loop.
 
-    Its value is the largest difference of a coefficient of the loop's polynomial (poles in z), or
-    the relative error of the static gain if that is larger. The other polynomial is that of the
-    poles asked for, or with LQR that of the loop by scipy's Riccati solver.
+    The check's value is the largest relative difference between coefficients of two polynomials in
+    z, or the relative error of the static gain if that is larger. One polynomial belongs to the
+    designed loop. The other one belongs to the requested poles or, with LQR, to the loop that
+    scipy's Riccati solver gives.
     """
     asked = "the poles asked for" if design.Q is None else "the loop of scipy's Riccati solver"
     try:
@@ -56,7 +58,7 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
 
 
 def check_loops(hardware: Sequence[HardwareCheck]) -> list[Check]:
-    """Return a failed check for each run with a wrong log or a wrong stated controller."""
+    """Return a failed check for each run whose log or stated controller is wrong."""
     notes: dict[str, list[str]] = {}
     for check in hardware:
         if check.contradicted:
@@ -79,7 +81,7 @@ def _check(outcome: CheckOutcome, value: float | None, message: str) -> Check:
 
 
 def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:
-    """Return the polynomials of our loop and of the one asked for, and our static gain."""
+    """Return the polynomials of the designed and the requested loop, and the static gain."""
     phi, gamma = discretise(chain, design.sample_time)
 
     def fed_back(gains: Array) -> Array:
@@ -98,7 +100,7 @@ def _loops(chain: Chain, design: FeedbackDesign) -> tuple[Array, Array, float]:
 
 
 def _riccati_gains(phi: Array, gamma: Array, *, Q: Array, R: float) -> Array:
-    """Return the gains of least cost by another way than that of the design."""
+    """Return the LQR gains by scipy's Riccati solver, independently of the design."""
     cost = solve_discrete_are(phi, gamma[:, None], Q, R)
     return (gamma @ cost @ phi) / (R + gamma @ cost @ gamma)
 

@@ -1,4 +1,4 @@
-"""Checks of the recordings: were they read, do they match their description, which are left out."""
+"""Checks of the recordings: were they read, do they match their description, were they used."""
 
 from collections.abc import Container, Mapping, Sequence
 from itertools import groupby
@@ -25,7 +25,7 @@ from pipeline.words.numbers import abridge
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
-_SPELT_OUT = 3  # records of one kind, if they are the whole kind; more are given by their number
+_SPELT_OUT = 3  # most names to list if they are a whole kind; else only their number
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 
 
@@ -37,7 +37,7 @@ def check_recordings(
     late: Sequence[LateChannel],
     bench: Bench,
 ) -> list[Check]:
-    """Return every check of the recordings as such, the one that spoils most numbers first."""
+    """Return every check of the recordings; the one that spoils most numbers comes first."""
     return [
         *check_signs(data.signs, without={one.experiment for one in left_out if one.is_wrong}),
         *check_files(data.unreadable),
@@ -105,7 +105,7 @@ def _unit_check(kind: CheckKind, message: str, *, n: int | None = None) -> Check
 
 
 def _unknown(unit: str, *, role: str, known: Sequence[str]) -> str:
-    """Return the question about an unknown unit."""
+    """Return the question to the student about an unknown unit."""
     meant = next((one for one in known if one.casefold() == unit.casefold()), None)
     hint = (
         _WORDS.text("did_you_mean", unit=repr(meant))
@@ -120,7 +120,7 @@ def _has_fractions_of_a_count(record: Record) -> bool:
 
 
 def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
-    """Fail if positions or inputs exceed those of any bench: they are in another unit."""
+    """Fail if positions or inputs are larger than on any bench: they must be in another unit."""
     kinds: Mapping[str, CheckKind] = {
         "position_scale": "position_scale",
         "input_scale": "input_scale",
@@ -129,10 +129,10 @@ def check_scales(records: Sequence[Record], *, bench: Bench) -> list[Check]:
 
 
 def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
-    """Return a failed check if records contradict their stated sign.
+    """Return a failed check if records contradict the stated sign of the input.
 
     `without` are records that do not hold what happened, so their sign means nothing. A bench has
-    one sign: if a few dwells contradict the others, a long delay is the cause.
+    only one sign: if just a few dwells contradict it, the cause is a long delay.
     """
     says, wrong = [], 0
     for sign in (1, -1):
@@ -163,7 +163,7 @@ def check_signs(signs: Signs, *, without: Container[str]) -> list[Check]:
 
 
 def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) -> list[Check]:
-    """Return a failed check for each reason for leaving out records."""
+    """Return a failed check for each reason for which records were left out."""
     runs: dict[str, list[str]] = {}
     for one in left_out:
         runs.setdefault(one.reason, []).append(one.experiment)
@@ -186,7 +186,7 @@ def check_left_out(left_out: Sequence[LeftOut], *, records: Sequence[Record]) ->
 
 
 def _named(names: Sequence[str], records: Sequence[Record]) -> str:
-    """Return names of records, with a whole kind as such: "all 29 dwells, step-2"."""
+    """Return the names of records in words, with complete kinds: "all 29 dwells, step-2"."""
     said: list[str] = []
     for kind in dict.fromkeys(record.kind for record in records):
         alike = [record.id for record in records if record.kind == kind]
@@ -197,7 +197,7 @@ def _named(names: Sequence[str], records: Sequence[Record]) -> str:
 
 
 def check_setup(records: Sequence[Record]) -> list[Check]:
-    """Check that the free carts are those that move (if all were measured)."""
+    """Check that the carts that move are the free ones, if all carts were measured."""
     wrong = {fault.run: fault for fault in find_wrong_setups(records)}
     checks = []
     for record in records:
@@ -219,12 +219,12 @@ def check_setup(records: Sequence[Record]) -> list[Check]:
 
 
 def check_held(records: Sequence[Record]) -> list[Check]:
-    """Fail for each record in which a cart that should be held moves much beside the free ones."""
+    """Fail for each record in which a cart that should be held moves as the free carts do."""
     return [fault.check("held") for fault in find_loose_holds(records)]
 
 
 def check_channels(late: Sequence[LateChannel]) -> list[Check]:
-    """Fail for each cart whose channel is late."""
+    """Fail for each cart whose position is read late."""
     kinds = {
         "sine": "the dwells",
         "step": "the steps",
@@ -250,7 +250,7 @@ def check_channels(late: Sequence[LateChannel]) -> list[Check]:
 
 
 def check_dwells(records: Sequence[Record], points: Sequence[SinePoint]) -> list[Check]:
-    """Check that the dwells have their stated frequencies, as a class or one by one."""
+    """Check that the dwells have their stated frequencies, all together or one by one."""
     stated = {record.id: record.omega for record in records if record.omega}
     ratios = {
         point.experiment: stated[point.experiment] / point.omega

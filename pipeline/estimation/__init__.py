@@ -1,1 +1,1 @@
-"""Methods that several stages share: noise, peaks, levels and transforms, least squares."""
+"""Methods that several stages use: noise, peaks, levels, transforms and least squares."""

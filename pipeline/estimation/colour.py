@@ -1,9 +1,9 @@
 """The effect of correlated residuals on standard errors.
 
 A chain fitted to carts with dry friction leaves smooth residuals, and an encoder at rest rounds the
-same way for seconds. Neighbouring samples then carry the same information, and counting each as new
-would make every standard error too small. This module computes the middle factor of the sandwich
-estimator that corrects for it.
+same way for seconds. Neighbouring samples then carry the same information. Counting each sample as
+independent would make every standard error too small. This module computes the middle factor of the
+sandwich estimator, which corrects for it.
 
 Reference: W. Newey & K. West, Econometrica 55, 1987; the lag window is Parzen's.
 """
@@ -14,23 +14,22 @@ import numpy as np
 
 from pipeline.arrays import Array
 
-_LAGS_SHARE = 1 / 3  # of the samples; a rest after a step is correlated as long as it lasts
+_LAGS_SHARE = 1 / 3  # of the samples. At a rest after a step, residuals are correlated all the time
 
 
 def _parzen(x: Array) -> Array:
-    """Return Parzen's window at lags x, relative to the last."""
+    """Return Parzen's window at lags x; the last lag is 1."""
     return np.where(x <= 0.5, 1 - 6 * x**2 * (1 - x), 2 * np.clip(1 - x, 0.0, None) ** 3)
 
 
 def colour(residual: Array, *, angle: float) -> float:
-    """Return the residual's spectral density at `angle` (rad per sample) over its mean; >= 1.
+    """Return the residual's spectral density at `angle` (rad per sample) over its mean.
 
     The variance of a fitted sinusoid's coefficients is that of white noise times this factor. It
-    uses Parzen's lag window, and is never below one, because the fit itself removes power at
-    `angle`.
+    uses Parzen's lag window. It is at least 1, because the fit itself removes power at `angle`.
     """
     n = residual.size
-    # The smallest number of lags of the residual's correlation.
+    # Use at least eight lags of the residual's correlation.
     lags = min(max(8, int(np.sqrt(n))), n // 2)
     power = float(residual @ residual)
     if power == 0 or lags < 2:
@@ -42,14 +41,15 @@ def colour(residual: Array, *, angle: float) -> float:
 
 @cache
 def _window(lags: int) -> Array:
-    """Return Parzen's window at the lags from 1 on."""
+    """Return Parzen's window at the lags 1 to `lags`."""
     return _parzen(np.arange(1, lags) / lags)
 
 
 def long_run_variance(residual: Array) -> float:
-    """Return the variance (of zero-mean residuals (p, n)) that governs the error of a mean.
+    """Return the variance of residuals (p, n) that governs the standard error of their mean.
 
-    The mean square for white residuals, more if neighbours agree, never less.
+    The residuals have mean zero. For white residuals it is the mean square. It is more if
+    neighbouring samples agree, and never less.
     """
     n = residual.shape[1]
     correlation = _tapered_correlation(residual)

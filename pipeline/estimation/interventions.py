@@ -1,9 +1,9 @@
-"""Interventions: stretches in which a force that nobody measured, such as a hand, moves a cart.
+"""Interventions: stretches in which an unmeasured force, such as a hand, moves a cart.
 
-Where a hand acts, the force that the law of motion does not explain bursts. An effect missing from
-the law shows as well, but repeatedly: whenever position, stretch, speed and input are the same. An
-impact of two bodies is over in an instant. So a burst is a hand if it lasts, moves the cart, and
-occurs in a state in which the law holds at other times.
+A hand causes a burst in the force that the law of motion does not explain. An effect that the law
+lacks causes bursts too, but again and again: whenever position, stretch, speed and input are the
+same. An impact of two bodies is over in an instant. So a burst counts as a hand if it lasts, moves
+the cart, and occurs in a state in which the law holds at other times.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,23 +19,23 @@ from pipeline.estimation.law_of_motion import ForceLeft, Seen, forces_left, see
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
 from pipeline.results import Intervention, Record
 
-_BULK = 2.0  # standard deviations, as in the law's fit
-_FAR, _BEGINS = 4.0, 1.5  # times the bulk: for a burst, and for its beginning and end
-_SHARE, _TYPICAL = 0.3, 3.0  # of the force acting on the cart; times the law's residual elsewhere
-_AROUND = 0.15  # s, before and after: the force acting at that time
-_REACH = 0.02  # s to each side of its middle: the effective part of a window
-_GAP = 0.1  # s: closer bursts are merged
-_LASTS = 0.06  # s above half its peak; an impact has 0.04, the width of a window
-_KNOWN = 0.03  # s of a burst in a known state
-_SWINGS = 3  # times that a hand's force changes sides; an effect's does so all the time
-_INSTANT = 0.03  # s: nobody pushes twice at exactly the same time
-_BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range; share, and number, of its quiet windows
+_BULK = 2.0  # standard deviations of the law's residual, as in its fit
+_FAR, _BEGINS = 4.0, 1.5  # multiples of `_BULK`. The second one bounds a burst
+_SHARE, _TYPICAL = 0.3, 3.0  # of the force acting on the cart. Times the law's residual elsewhere
+_AROUND = 0.15  # s before and after. The force acting at that time is the largest within
+_REACH = 0.02  # s to each side of its middle. A window mostly sees this part
+_GAP = 0.1  # s. Closer bursts are merged
+_LASTS = 0.06  # s above half its peak. An impact has 0.04, the width of a window
+_KNOWN = 0.03  # s of a burst that may be in a known state
+_SWINGS = 3  # sign changes of a hand's force. An effect's force has many more
+_INSTANT = 0.03  # s. Nobody pushes twice at the same instant
+_BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range. Share, and number, of its quiet windows
 
 
 def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     """Return the interventions of hands on free carts, by record, cart and time.
 
-    Runs under feedback are skipped: the motor is often driven by something that was not logged.
+    Runs under feedback are skipped: there, part of what drives the motor is often not logged.
     """
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
     first = {record.id: _first_alike(record, open_loop) for record in open_loop}
@@ -54,7 +54,7 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
 
 
 def _first_alike(record: Record, records: Sequence[Record]) -> str:
-    """Return the id of the first record with the same readings, as a file may be listed twice."""
+    """Return the id of the first record with the same readings; a file may be listed twice."""
     return next(other.id for other in records if np.array_equal(other.y, record.y))
 
 
@@ -129,9 +129,9 @@ def _bursts(cart: int, seen: Sequence[Seen]) -> list[Intervention]:
 
 
 def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[str, float]) -> bool:
-    """Return whether it happens at the same instant in another driven run, unlike a hand.
+    """Return whether the same happens at the same instant in another driven run, unlike a hand.
 
-    Driven runs come with their first instant, at which an earlier hand's force begins.
+    `driven` gives for each driven run the time at which its input first acts.
     """
     if one.start == driven.get(one.experiment, one.start):
         return False
@@ -143,17 +143,17 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
 
 
 def _share(force: ForceLeft, size: float) -> Array:
-    """Return the share of the force on the cart at about that time that the law leaves."""
+    """Return the unexplained share of the force on the cart around each time."""
     acting = maximum_filter1d(force.acting, 2 * round(_AROUND / force.hop) + 1)
     return np.abs(force.left) / (acting + size)
 
 
 def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
-    """Return for each window whether the law holds elsewhere in such a state.
+    """Return for each window whether the law holds at other times in the same state.
 
     Position, stretches, velocity and input are checked one by one: most windows at about the same
-    value must be quiet. Friction alone can hold a cart that rests without an input, whatever the
-    state.
+    value must be quiet. A cart that rests without an input is always in a known state, because
+    friction alone can hold it.
     """
     state = np.concatenate([force.state for force in forces], axis=1)
     follows = np.concatenate([force.follows for force in forces])
@@ -170,7 +170,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         calm = np.bincount(at[follows & quiet], minlength=_BINS + 1)
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
-    # A window sees a little of its neighbours.
+    # A window also sees a little of its neighbours.
     parts = [
         minimum_filter1d(known[first:stop].astype(int), 3) > 0 for first, stop in pairwise(bounds)
     ]
@@ -178,7 +178,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
 
 
 def _stretches(above: NDArray[np.bool_], t: Array) -> list[tuple[int, int]]:
-    """Return first and last window of each stretch, merging those with a short gap."""
+    """Return first and last window of each stretch; stretches with a short gap are merged."""
     found: list[tuple[int, int]] = []
     for first, last in _runs(above):
         if found and t[first] - t[found[-1][1]] < _GAP:
@@ -197,9 +197,10 @@ def _runs(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
 def _is_hand(
     left: Array, *, strong: NDArray[np.bool_], known: NDArray[np.bool_], hop: float
 ) -> bool:
-    """Return whether a burst is a hand; below its beginning `left` is negligible.
+    """Return whether a burst is due to a hand.
 
-    Its windows are `hop` s apart.
+    Below the level at which a burst begins, the unexplained force `left` is negligible. The windows
+    are `hop` s apart.
     """
     swings = np.count_nonzero(np.diff(np.sign(left[left != 0.0])))
     lasts = understood = 0

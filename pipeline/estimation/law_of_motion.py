@@ -2,7 +2,7 @@
 
 The acceleration of the cart is regressed on positions, velocities and input, with dry friction and
 drag, over short windows. The problem is linear, so nothing is simulated or searched. The loss
-ignores data that do not follow the law.
+function ignores data that do not follow the law.
 
 Reference: S. Geman and D. E. McClure, Bull. Int. Statistical Institute 52 (1987) 5-21 (the loss).
 """
@@ -19,14 +19,14 @@ from pipeline.estimation.modulating import bump_integral, window_weights
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA, grain
 from pipeline.results import Record
 
-_WINDOW = 0.1  # s; the middle 0.04 s carry most of the weight
-_LAGS = (0.0, 0.02, 0.05)  # s by which the input may be late
-# Columns of the law: rest and gain of a record, positions, inputs; dampers, drag, braking; dry
-# friction, alone and proportional to the input.
+_WINDOW = 0.1  # s. The middle 0.04 s have most of the weight
+_LAGS = (0.0, 0.02, 0.05)  # s. Trial delays of the input
+# Columns of the law, in this order: rest and gain of each record; positions and inputs; dampers,
+# drag and braking; dry friction, constant and proportional to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
-_ROUNDS, _SETTLED = 30, 1e-3  # of reweighting; relative change of the bulk at which it ends
-_BULK = 2.0  # standard deviations of the bulk above which data are ignored
+_ROUNDS, _SETTLED = 30, 1e-3  # of reweighting. Relative change of the bulk at which it ends
+_BULK = 2.0  # standard deviations of the bulk. Data beyond are ignored
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,12 +35,14 @@ class ForceLeft:
 
     Attributes
     ----------
-    left : (n,) unexplained acceleration; for a cart at rest, the part that friction cannot hold
-        either.
-    acting : (n,) size of the acceleration, or of that demanded by springs and input, if larger.
-    state : (5, n) position about the rest, stretches of both springs, velocity, input.
-    moves : the cart moves; `jumps`: so does the input, suddenly, in the window or just before.
-    idle : (n,) the cart rests without an input.
+    left : (n,) unexplained acceleration. For a cart at rest, only the part that static friction
+        cannot hold.
+    acting : (n,) size of the acceleration. If larger, the acceleration due to springs and input.
+    state : (5, n) the variables of the law. Position about the rest, stretches of both springs,
+        velocity, input.
+    moves : (n,) whether the cart moves.
+    jumps : (n,) whether the cart moves and the input jumps. The jump may be just before the window.
+    idle : (n,) whether the cart rests without an input.
     """
 
     record: Record
@@ -54,7 +56,7 @@ class ForceLeft:
 
     @property
     def follows(self) -> NDArray[np.bool_]:
-        """(n,) where the law should hold."""
+        """(n,) whether the law should hold."""
         return self.moves & ~self.jumps
 
     @property
@@ -69,9 +71,10 @@ class Seen:
 
     Attributes
     ----------
-    x, v, acceleration, span : (carts, n) of the carts that were measured; range of the reading.
-    u, on : (3, n) the input at each of `_LAGS`, and the share of the time that it is not zero.
-    gain : of white noise into the acceleration.
+    x, v, acceleration : (carts, n) of the measured carts.
+    span : (carts, n) range of the readings in each window.
+    u, on : (3, n) the input at each of `_LAGS`. Share of the time that it is not zero.
+    gain : standard deviation of the acceleration that white noise of size 1 causes.
     """
 
     record: Record
@@ -88,7 +91,7 @@ class Seen:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Windows:
-    """Means over windows (n,) of one record: `x`, `v` (3, n) of the cart between its neighbours."""
+    """Means over windows (n,) of one record; `x` and `v` (3, n) of a cart and its neighbours."""
 
     record: Record
     t: Array
@@ -102,12 +105,12 @@ class _Windows:
     jumps: NDArray[np.bool_]
 
     def columns(self, *, driven: bool) -> Array:
-        """Return (n, unknowns) the columns of the law: those of `_SPRINGS`, `_DAMPERS`, `_DRY`.
+        """Return the columns (n, unknowns) of the law: those of `_SPRINGS`, `_DAMPERS` and `_DRY`.
 
-        Each record has its own rest and gain, as a drive may treat levels differently.
+        Each record has its own rest and gain, because a drive may treat levels differently.
         """
         v, u = self.v[1], driven * self.u
-        # In a window in which the cart turns, this is its main direction.
+        # In a window in which the cart turns round, this is its main direction.
         turning = np.maximum(np.abs(self.acceleration) * _WINDOW / 4.0, 1e-12 * np.abs(v).max())
         side = np.clip(v / np.maximum(turning, 1e-300), -1.0, 1.0)
         rest = np.ones(v.size)
@@ -117,10 +120,10 @@ class _Windows:
 
 
 def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float]:
-    """Return the force in each record that one law of a cart does not explain, and its usual size.
+    """Return the unexplained force on a cart by record, and its usual size.
 
-    Records in which a free neighbour was not measured are left out. The list is empty if the cart
-    moves too little to fit the law.
+    One law is fitted to all records. Records in which a free neighbour was not measured are left
+    out. The list is empty if the cart moves too little to fit the law.
     """
     cut = [_between_neighbours(one, cart) for one in seen if cart in one.record.free]
     windows = [one for one in cut if one is not None]
@@ -131,7 +134,7 @@ def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float
     parts = [(c[use], w.acceleration[use])
              for c, w, use in zip(columns, windows, usable, strict=True)]  # fmt: skip
     unknowns = columns[0].shape[1] + _OWN * (len(windows) - 1)
-    # Windows, at least.
+    # The fewest windows for a fit: three times the unknowns.
     if sum(target.size for _, target in parts) < 3 * unknowns:
         return [], 0.0
     laws, size = _fit(parts, least=_BULK * float(np.median([w.noise for w in windows])))
@@ -140,7 +143,7 @@ def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float
         asked = column[:, _SPRINGS] @ law[_SPRINGS]
         free = one.acceleration - asked - column[:, _DAMPERS] @ law[_DAMPERS]
         rubs, by_load = np.abs(law[_DRY])
-        # Times dry friction in motion: the largest static friction.
+        # The largest static friction is assumed to be three times the friction in motion.
         holds = 3.0 * (rubs + by_load * np.abs(one.u[0]))
         at_rest = np.sign(free) * np.maximum(np.abs(free) - holds, 0.0)
         offset, stiffness = law[0], -law[_POSITION]
@@ -161,21 +164,21 @@ def forces_left(cart: int, seen: Sequence[Seen]) -> tuple[list[ForceLeft], float
 
 
 def see(record: Record) -> Seen | None:
-    """Return the means over a record's windows, or None if it is shorter than one."""
+    """Return the means over a record's windows, or None if the record is shorter than one."""
     t, interval = record.t, record.sample_time
-    # Samples in a window.
+    # Number of samples in a window.
     width = max(round(_WINDOW / interval) + 1, 9)
     if width >= t.size:
         return None
     first = np.arange(0, t.size - width + 1, _hop(record))
     u = np.zeros(t.size) if record.u is None else record.u
     inputs = np.array([*(np.interp(t - lag, t, u) for lag in _LAGS), u != 0.0])
-    # Windows; more would need much memory in long recordings.
+    # At most 1000 windows at once, to limit the memory for long recordings.
     parts = np.array_split(first, -(-first.size // 1000))
     means = np.hstack([_means(t, record.y, inputs, part[:, None] + np.arange(width))
                        for part in parts])  # fmt: skip
     reach = round(_LAGS[-1] / interval) + 1
-    # Of the input's range from one sample to the next.
+    # A jump is a change by 30 % of the input's range from one sample to the next.
     jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
     lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
     x, v, acceleration, span = means[6:].reshape(4, len(record.carts), -1)
@@ -194,7 +197,7 @@ def see(record: Record) -> Seen | None:
 
 
 def _between_neighbours(seen: Seen, cart: int) -> _Windows | None:
-    """Return what one cart's law is fitted to, or None if a free neighbour was not measured."""
+    """Return the data to which one cart's law is fitted; None if a free neighbour is unmeasured."""
     record, neighbours = seen.record, (cart - 1, cart, cart + 1)
     if any(c in record.free and c not in record.carts for c in neighbours):
         return None
@@ -202,7 +205,7 @@ def _between_neighbours(seen: Seen, cart: int) -> _Windows | None:
     still = np.zeros(seen.t.size)
     row = record.carts.index(cart)
     step = grain(record.t, record.position(cart), step=record.encoder_step(cart))
-    # Smallest changes in a window: below these the cart rests.
+    # Changes in a window below these mean that the cart rests.
     return _Windows(
         record=record,
         t=seen.t,
@@ -219,15 +222,15 @@ def _between_neighbours(seen: Seen, cart: int) -> _Windows | None:
 
 def _hop(record: Record) -> int:
     """Return the number of samples between windows."""
-    # In s, between windows.
+    # Windows are 0.01 s apart.
     return max(1, round(0.01 / record.sample_time))
 
 
 def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
-    """Return (6 + 4 carts, n) means over the windows whose samples are `at` (n, samples).
+    """Return means (6 + 4 carts, n) over the windows whose samples are `at` (n, samples).
 
-    Time, inputs, the acceleration's gain for white noise; then of every cart the position, the
-    velocity, the acceleration, and the range of the reading.
+    The first rows are time, inputs, and the acceleration's gain for white noise. Four rows per cart
+    follow: position, velocity, acceleration, and range of the readings.
     """
     local = t[at]
     w, w1, w2 = window_weights(local)
@@ -248,12 +251,13 @@ def _means(t: Array, y: Array, inputs: Array, at: NDArray[np.int64]) -> Array:
 
 
 def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Array], float]:
-    """Return the law that the bulk of the windows follows, by record, and the size of the rest.
+    """Return the law that the bulk of the windows follows, by record, and its usual residual.
 
     Parameters
     ----------
-    parts : columns (windows, unknowns) and accelerations (windows,) of each record; its first
-        columns are its own.
+    parts : columns (windows, unknowns) and accelerations (windows,) of each record. The first
+        columns are the record's own unknowns.
+    least : the smallest size of the bulk.
     """
     shared = parts[0][0].shape[1] - _OWN
     behind = np.arange(_OWN * len(parts), _OWN * len(parts) + shared)
@@ -270,7 +274,7 @@ def _fit(parts: Sequence[tuple[Array, Array]], *, least: float) -> tuple[list[Ar
             weighed = columns.T * weight**2
             H[np.ix_(place, place)] += weighed @ columns
             b[place] += weighed @ target
-        # Of the normal equations: smaller values count as zero.
+        # Eigenvalues of the normal equations below this share count as zero.
         law = scale * np.linalg.lstsq(H * np.outer(scale, scale), scale * b, rcond=1e-12)[0]
         left = [target - columns @ law[place]
                 for (columns, target), place in zip(parts, places, strict=True)]  # fmt: skip

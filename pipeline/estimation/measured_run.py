@@ -12,7 +12,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Record
 
-_STILL = 0.02  # of its range that a signal may vary while it is constant
+_STILL = 0.02  # share of its range by which a constant signal may vary
 _MIN_STEP_SAMPLES = 10
 
 
@@ -22,11 +22,13 @@ class MeasuredRun:
 
     Attributes
     ----------
-    y : (f, n) readings; zero where a free cart was not measured.
+    y : (f, n) readings. Zero if a free cart was not measured.
     seen : (f,) which carts were measured.
-    noise : (f,) standard deviation of the readings from sample to sample, or a rounding step.
-    quiet : samples from the start until input or reference first change; at least one.
-    rest : (f,) readings at rest. x0 : (2f,) state at the start, about the rest.
+    noise : (f,) standard deviation of the readings from sample to sample. At least that of
+        rounding.
+    quiet : number of samples before input or reference first change, at least one.
+    rest : (f,) readings at rest.
+    x0 : (2f,) state at the start, relative to the rest.
     """
 
     record: Record
@@ -41,26 +43,26 @@ class MeasuredRun:
 
     @property
     def driven(self) -> bool:
-        """There is a logged input that moves the carts.
+        """Whether a logged input moves the carts.
 
-        Its last sample acts only after the record.
+        The last sample of the input acts only after the record, so it does not count.
         """
         return self.record.u is not None and bool(np.any(self.record.u[:-1] != 0))
 
     def forced(self) -> Array:
-        """Return the response (f, n) of the chain, from rest, to the logged input."""
+        """The response (f, n) of the chain, from rest, to the logged input."""
         record = self.record
         if record.u is None:
             raise DataError(f"{record.id}: the hardware check needs a logged input, found none")
         return self._simulated(record.u, x0=np.zeros(2 * len(self.free)))
 
     def unforced(self) -> Array:
-        """Return the readings (f, n) caused by the start alone."""
+        """The readings (f, n) that the start alone causes."""
         return self.rest[:, None] + self._ringing(self.x0)
 
     @property
     def noise_floor(self) -> float:
-        """The misfit of a simulation that is wrong by the noise only."""
+        """The misfit of a simulation whose only error is the noise."""
         return self.misfit(self.y + self.noise[:, None])
 
     def input_scale(self) -> float:
@@ -81,8 +83,8 @@ class MeasuredRun:
     def begun_in_motion(self) -> "MeasuredRun":
         """Return the run with its rest and initial state fitted to the whole record.
 
-        Linear least squares, with a free factor on the input, so that a wrong one does not affect
-        the start.
+        This is a linear least-squares fit. It includes a free factor on the input, so that a wrong
+        input does not affect the start.
         """
         n = self.record.t.size
         states = np.eye(2 * len(self.free))
@@ -91,7 +93,7 @@ class MeasuredRun:
         columns += [np.outer(cart, np.ones(n)) for cart in np.eye(len(self.free))]
         rows = np.array([column[self.seen].ravel() for column in columns])
         size = np.linalg.norm(rows, axis=1)
-        known = size > 0  # an unmeasured cart has no rest to fit
+        known = size > 0  # the rest of an unmeasured cart cannot be fitted
         fitted = np.zeros(len(columns))
         target = self.y[self.seen].ravel()
         fitted[known] = np.linalg.lstsq((rows[known] / size[known, None]).T, target)[0]
@@ -102,8 +104,8 @@ class MeasuredRun:
         """Return the samples from the first step of `signal` (n,) to the next, or None."""
         if signal is None or not np.any(signal):
             return None
-        # Before the record the signal was zero, so one that is on from the start steps there. A
-        # step is this share of its range within one sample.
+        # Before the record the signal was zero, so a signal that is on from the start steps there.
+        # A step is a change by 30 % of the range within one sample.
         edges = np.flatnonzero(np.abs(np.diff(signal, prepend=0.0)) > 0.3 * np.ptp([0.0, *signal]))
         if edges.size == 0:
             return None
@@ -122,7 +124,7 @@ class MeasuredRun:
 
         Raises
         ------
-        DataError : they overflow, as for a chain that fits nothing.
+        DataError : they overflow, because the chain fits nothing.
         """
         record = self.record
         with np.errstate(over="ignore", invalid="ignore"):
@@ -133,7 +135,7 @@ class MeasuredRun:
 
 
 def measured_run(record: Record, chain: Chain) -> MeasuredRun:
-    """Return the run, with its rest from its start or, if it begins in motion, fitted.
+    """Return the run; its rest is read at the start or, if it begins in motion, fitted.
 
     Raises
     ------
@@ -146,19 +148,19 @@ def measured_run(record: Record, chain: Chain) -> MeasuredRun:
             f"found free {list(free)}"
         )
     run = _begin(record, chain, free=free)
-    # Six deviations, or as many encoder steps, are more than chance.
+    # A range of more than six standard deviations is not due to chance.
     at_rest = np.all(np.ptp(run.y[:, : run.quiet], axis=1) <= 6 * run.noise)
-    # The fewest samples that define a rest.
+    # At least five samples are needed to determine a rest.
     if not run.driven or (at_rest and run.quiet >= 5):
         return run
     moving = run.begun_in_motion()
     usual = at_rest and record.kind in ("step", "closed_loop")
-    # Relative to the misfit of a step from rest: the level that a start in motion must reach.
+    # A start in motion is accepted only if it halves the misfit of a start from rest.
     return run if usual and moving.best_misfit() > 0.5 * run.best_misfit() else moving
 
 
 def released_run(record: Record, chain: Chain) -> MeasuredRun:
-    """Return a run in free motion from its first sample, its rest and start fitted to all of it.
+    """Return a run in free motion from its first sample, with rest and start fitted to all of it.
 
     Raises
     ------
@@ -168,7 +170,7 @@ def released_run(record: Record, chain: Chain) -> MeasuredRun:
 
 
 def _begin(record: Record, chain: Chain, *, free: tuple[int, ...]) -> MeasuredRun:
-    """Return the run as if it began at rest."""
+    """Return the run under the assumption that it began at rest."""
     t = record.t
     seen = np.array([cart in record.carts for cart in free])
     y = np.array([record.position(c) if c in record.carts else np.zeros(t.size) for c in free])
@@ -197,5 +199,5 @@ def _quiet_samples(record: Record) -> int:
             changes = np.abs(signal - signal[0]) > _STILL * np.ptp(signal)
             quiet = min(quiet, int(np.argmax(changes)) if changes.any() else quiet)
             if abs(signal[0]) > _STILL * np.max(np.abs(signal)):
-                quiet = 1  # it acts from the first sample on
+                quiet = 1  # the input acts from the first sample
     return max(quiet, 1)

@@ -1,4 +1,4 @@
-"""Nonlinear least squares with residual and Jacobian from one evaluation."""
+"""Nonlinear least squares that gets residual and Jacobian from one evaluation."""
 
 from collections.abc import Callable
 from typing import Any, Literal, TypeVar
@@ -22,9 +22,8 @@ def minimise(
 ) -> OptimizeResult:
     """Minimise the sum of squares of the residual, starting from `start` (n_p,).
 
-    `at` returns the residual (n,) and the Jacobian (n, n_p) at p.
-
-    `tolerance` is the relative change of the cost at which it stops.
+    `at` returns the residual (n,) and the Jacobian (n, n_p) at p. `tolerance` is the relative
+    change of the cost at which the search stops.
     """
     once = evaluated_once(at)
     return least_squares(
@@ -39,7 +38,7 @@ def minimise(
 
 
 def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
-    """Return `at`, evaluated once for the same p (n_p,) in a row.
+    """Return `at` with its last result cached, for repeated calls with the same p (n_p,).
 
     Scipy asks for the residual at p, and then often for its derivatives there.
     """
@@ -47,7 +46,7 @@ def evaluated_once(at: Callable[[Array], T]) -> Callable[[Array], T]:
 
     def once(p: Array) -> T:
         if not (last and np.array_equal(last[0][0], p)):
-            own = p.copy()  # MINPACK continues in the array it hands over
+            own = p.copy()  # MINPACK goes on to change its array
             last[:] = [(own, at(own))]
         return last[0][1]
 

@@ -14,25 +14,26 @@ from pipeline.arrays import Array
 
 
 def bump(s: Array, *, span: Array | float) -> tuple[Array, Array, Array]:
-    """Return (s (1 - s))⁴ for s from 0 to 1 over `span` s, and two derivatives by time."""
+    """Return (s (1 - s))⁴ for s from 0 to 1 over `span` seconds, and two time derivatives."""
     b, slope = s * (1 - s), 1 - 2 * s
     return b**4, 4 * b**3 * slope / span, (12 * b**2 * slope**2 - 8 * b**3) / span**2
 
 
 def motion_period(x: Array) -> float:
-    """Return the period, in samples, of a sine with the speed of this motion."""
+    """Return the period, in samples, of a sine as fast as this motion for its size."""
     return float(2 * np.pi * np.std(x) / np.sqrt(np.mean(np.diff(x) ** 2)))
 
 
 def bump_integral(s: Array) -> Array:
-    """Return the integral of the bump from 0 to s, for an input that is held between samples."""
+    """Return the integral of the bump from 0 to s; it weights an input that is held."""
     return s**5 * np.polyval([1 / 9, -1 / 2, 6 / 7, -2 / 3, 1 / 5], s)
 
 
 def window_weights(t: Array) -> tuple[Array, Array, Array]:
-    """Return the weights (windows, samples) that give mean, minus mean slope and mean curvature.
+    """Return weights (windows, samples) that give mean, minus mean slope and mean curvature.
 
-    Few samples integrate the bump's derivatives badly, so the weights are made exact for parabolas.
+    With few samples the bump's derivatives are integrated badly. So the weights are corrected to be
+    exact for parabolas.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 from pipeline.arrays import Array
 
 _NEIGHBOURS = (-3, -2, -1, 1, 2, 3)  # a quintic through these follows any sampled motion
-MEDIAN_TO_SIGMA = 1.4826  # median absolute value to standard deviation, normal noise
+MEDIAN_TO_SIGMA = 1.4826  # standard deviation over median absolute value, for normal noise
 
 
 def local_noise(t: Array, y: Array) -> float:
@@ -22,13 +22,13 @@ def local_noise(t: Array, y: Array) -> float:
     weights, size = _weights(t.tobytes())
     predicted = np.einsum("jn,jn->n", weights, _neighbours(y))
     scaled = (y[3:-3] - predicted) / size
-    moving = scaled[scaled != 0]  # a cart at rest on one count does not show its noise
+    moving = scaled[scaled != 0]  # the zeros of a cart at rest on one count do not show its noise
     return float(MEDIAN_TO_SIGMA * np.median(np.abs(moving))) if moving.size else 0.0
 
 
-@lru_cache(2)  # the carts of a record share its clock
+@lru_cache(2)  # the carts of a record share their times
 def _weights(clock: bytes) -> tuple[Array, Array]:
-    """Return Lagrange's weights (6, n - 6) of the neighbours, and how they scale white noise."""
+    """Return Lagrange's weights (6, n - 6) of the neighbours, and their gain for white noise."""
     t = np.frombuffer(clock)
     nodes = _neighbours(t) - t[3:-3]
     weights = np.empty_like(nodes)
@@ -46,20 +46,20 @@ def _neighbours(x: Array) -> Array:
 def difference_noise(y: Array, *, order: int) -> Array:
     """Return the noise's standard deviation of evenly sampled signals (…, n), by differences.
 
-    The higher the order, the less of a smooth motion remains. The median ignores jumps, and shows
-    no noise for a cart that rests on one count.
+    The higher the order, the less of a smooth motion remains. The result comes from the median,
+    which ignores jumps. It is zero for a cart that rests on one count.
     """
     differences = np.diff(y, n=order, axis=-1)
     return MEDIAN_TO_SIGMA * np.median(np.abs(differences), axis=-1) / difference_gain(order)
 
 
 def difference_gain(order: int) -> float:
-    """Return the ratio of a difference's standard deviation to that of the white noise."""
+    """Return the standard deviation of a difference of white noise, relative to the noise."""
     return float(np.sqrt(comb(2 * order, order)))
 
 
 def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
-    """Estimate the white part of a residual, which a moving quadratic cannot follow."""
+    """Return the noise (standard deviation) of a residual that a moving quadratic cannot follow."""
     width = 2 * half_width + 1
     if residual.size < 2 * width:
         return float(residual.std())
@@ -73,24 +73,24 @@ def high_frequency_noise(residual: Array, *, half_width: int = 4) -> float:
 
 
 def grain(t: Array, y: Array, *, step: float) -> float:
-    """Return the smallest significant change: encoder step or noise, if larger.
+    """Return the smallest significant change: the encoder step, or the noise if larger.
 
-    Noise counts as the step that would round as coarsely, sqrt(12) sigma. `step` is the encoder
+    Noise counts as the step with the same rounding error, sqrt(12) sigma. `step` is the encoder
     step, 0 if unknown.
     """
-    arithmetic = 1e-6 * float(np.ptp(y))  # a noise-free simulation has neither
+    arithmetic = 1e-6 * float(np.ptp(y))  # for a simulation, which has neither noise nor steps
     return max(step, float(np.sqrt(12) * local_noise(t, y)), arithmetic)
 
 
 def rounding_left(sigma: float, *, step: float) -> float:
-    """Return the share (0 to 1) of the rounding error that averaging leaves, with noise `sigma`.
+    """Return the share (0 to 1) of the rounding error that remains after averaging.
 
-    Noise before the rounding acts as dither: the first harmonic of the rounding error shrinks
-    by exp(-2 pi² sigma²/step²) (Widrow & Kollár, Quantization Noise, 2008, chapter 4).
+    Noise `sigma` before the rounding acts as dither: the first harmonic of the rounding error
+    shrinks by exp(-2 pi² sigma²/step²) (Widrow & Kollár, Quantization Noise, 2008, chapter 4).
     """
     return float(np.exp(-2 * (np.pi * sigma / step) ** 2)) if step > 0 else 0.0
 
 
 def noise_beyond_rounding(rms: float, *, step: float) -> float:
-    """Return the noise in a residual's root-mean-square beyond the rounding."""
+    """Return the noise that remains when rounding is subtracted from a residual's rms."""
     return float(np.sqrt(max(rms**2 - step**2 / 12, 0.0)))

@@ -1,4 +1,4 @@
-"""Where a measured signal turns, and where an input is constant."""
+"""Find the turning points of a signal, and stretches of constant input."""
 
 import numpy as np
 
@@ -7,17 +7,17 @@ from pipeline.estimation.noise import difference_noise
 
 
 def extrema(y: Array, *, prominence: float) -> list[int]:
-    """Return the indices of the turning points, maxima and minima in turn, ends included.
+    """Return the indices of the turning points, ends included; maxima and minima alternate.
 
-    A turning point counts once the signal has gone back by `prominence`. On a flat top the
-    middle sample is taken.
+    A turning point counts once the signal has gone back by `prominence`. On a flat top the middle
+    sample is taken.
     """
     found: list[int] = []
-    first = last = low = high = 0  # the running extreme is y[first] .. y[last]
+    first = last = low = high = 0  # the current extreme is y[first] .. y[last]
     direction = 0
-    values = y.tolist()  # read one by one, Python's own numbers take a third of the time
+    values = y.tolist()  # Python floats: read one by one, they take a third of the time
     for i, value in enumerate(values):
-        if direction == 0:  # until the first move shows which way it goes
+        if direction == 0:  # until the first move shows the direction
             low = i if value < values[low] else low
             high = i if value > values[high] else high
             if values[high] - values[low] >= prominence:
@@ -35,7 +35,7 @@ def extrema(y: Array, *, prominence: float) -> list[int]:
             first = last = i
             direction = -direction
     if direction:
-        found.append(first)  # a cart that has come to rest: the sample at which it did
+        found.append(first)  # for a cart that has come to rest, the sample at which it did
     return found
 
 
@@ -46,7 +46,7 @@ def plateaus(u: Array) -> list[tuple[int, int]]:
     stretches, a slow edge a few; the caller decides how long a stretch must be.
     """
     noise = float(difference_noise(u, order=2)) if u.size > 2 else 0.0
-    # Of the input's range: smaller changes are noise of the logged input.
+    # Changes below 2 % of the range are noise of the logged input.
     tolerance = max(0.02 * float(np.ptp(u)), 6 * noise)
     found, start, held = [], 0, u[0]
     for i, value in enumerate(u.tolist()):

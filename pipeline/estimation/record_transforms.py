@@ -1,7 +1,7 @@
-"""The transfer ratio of one step or sweep record, whatever its ends.
+"""The transfer ratio of one step or sweep record, with any motion at its ends.
 
-A record that begins and ends at rest, even displaced, needs no window: the transforms of the
-derivatives, FT(y')/FT(u'), are exact. Any other record is evaluated by local polynomials: the
+A record that begins and ends at rest, even displaced, needs no window: the ratio FT(y')/FT(u') of
+the derivatives' transforms is exact. Any other record is evaluated by local polynomials. The
 unknown motion before and after the record adds a smooth term in frequency, which is fitted too.
 
 Reference: Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed.,
@@ -18,19 +18,20 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import difference_gain
 from pipeline.results import Record
 
-_LEAST_INPUT_SHARE = 0.01  # of its strongest line; below this the input does not excite the plant
-# … and of its strongest neighbour: in a null of the input's spectrum (every second harmonic of a
-# step on and off) any nonlinearity would be divided by almost zero.
+_LEAST_INPUT_SHARE = 0.01  # of its strongest line. A weaker input does not excite the plant
+# The same relative to its strongest neighbour. At a null of the input's spectrum (every second
+# harmonic of a step on and off), any nonlinearity would be divided by almost zero.
 _LEAST_NEIGHBOUR_SHARE = 0.25
 _NEIGHBOURS = 2  # frequencies on each side
-# A step at the first sample has moved its cart by u t²/2m after two: 3 % of the travel even with
-# samples as far apart as 9 ms and a mode at 20 rad/s.
+# Share of the travel that a cart may have moved in the first samples of a record. After a step at
+# the first sample it moves by u t²/2m in two samples: 3 % with samples 9 ms apart and a mode at 20
+# rad/s.
 _START_SWING = 0.03
 _HALF_WINDOWS, _DEGREE = (4, 6), 2  # lines to each side, and degree, of the local polynomials
 
 
 class TransferRatio(NamedTuple):
-    """G (n_carts, n_w) and its standard error per component; infinite where not excited."""
+    """G (n_carts, n_w), and its standard error per component; infinite if not excited."""
 
     G: ComplexArray
     std: Array
@@ -46,14 +47,14 @@ def transfer_ratio(run: Record, *, omega: Array) -> TransferRatio:
 def visible_band(run: Record) -> float:
     """Return the highest frequency, rad/s, at which some cart's motion exceeds its noise.
 
-    It is only a bound for a grid, so it uses the mean sample interval.
+    It only limits a grid of frequencies, so the mean sample interval is accurate enough.
     """
     dt, duration = run.sample_time, run.t[-1] - run.t[0]
     omega = 2 * np.pi * np.fft.rfftfreq(run.t.size - 1, dt)
     floor = _noise(run)[:, None] * omega * np.sqrt(dt * duration)
-    # Noise alone passes three sigma on a line in e^-9: too rarely to matter.
+    # On a line, noise alone exceeds three sigma with probability e^-9: too rare to matter.
     visible = np.any(np.abs(np.fft.rfft(np.diff(run.y))) > 3 * floor, axis=0)
-    # Of the Nyquist frequency; above, aliases of the unfiltered encoders come in.
+    # Share of the Nyquist frequency to use; above it the encoders alias, as they have no filter.
     visible &= omega <= 0.4 * np.pi / dt
     return float(np.max(omega[visible], initial=0.0))
 
@@ -63,8 +64,8 @@ def _derivative_transforms(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return FT(u') (n_w,) and FT(y') (n_carts, n_w) over the record, at its own sample times."""
     between = _turning((run.t[1:] + run.t[:-1]) / 2, omega)
-    # Straight lines between the samples: FT = sum of increments times sinc, over sinc² for what
-    # the straight lines take away from a smooth signal.
+    # Between the samples y is taken as straight lines, so FT is the sum of increments times a sinc.
+    # Dividing by sinc² makes up for the part of a smooth signal that straight lines lose.
     smooth = 1.0 / np.sinc(omega * run.sample_time / (2 * np.pi))
     y_transform = np.diff(run.y) @ between * smooth
     if run.hold == "band_limited":
@@ -79,14 +80,14 @@ def _turning(t: Array, omega: Array) -> ComplexArray:
 
 
 def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
-    """Return FT(y')/FT(u') of a record that begins and ends at rest; None for any other."""
+    """Return FT(y')/FT(u') of a record that begins and ends at rest; None for any other record."""
     travel = np.ptp(run.y, axis=1)
     noise = _noise(run)
-    # The part of a record at its end that must be at rest.
+    # The last tenth of the record must be at rest.
     tail = run.t >= run.t[-1] - 0.1 * (run.t[-1] - run.t[0])
     ring = np.ptp(run.y[:, tail], axis=1)
-    quiet = np.maximum(8 * noise, 2 * run.resolution)  # peak to peak of a cart that stands still
-    # At rest: to a hundredth of the whole travel.
+    quiet = np.maximum(8 * noise, 2 * run.resolution)  # range of a cart that stands still
+    # At rest also means within a hundredth of the whole travel.
     moving = np.ptp(u[tail]) > 0 or np.any(ring > np.maximum(quiet, 0.01 * travel))
     starts_moving = np.any(np.ptp(run.y[:, :3], axis=1) > np.maximum(quiet, _START_SWING * travel))
     if moving or starts_moving:
@@ -96,7 +97,7 @@ def _at_rest_ratio(run: Record, u: Array, omega: Array) -> TransferRatio | None:
     U, Y = _derivative_transforms(run, u, omega, u_before=float(u[0]) if waits else 0.0)
     excess = np.maximum(ring - quiet, 0.0) / 2
     duration = run.t[-1] - run.t[0]
-    # A remaining swing r at the end errs by up to r / 2ζ, here with ζ = 0.05.
+    # A remaining swing r at the end causes an error of up to r / 2ζ, here with ζ = 0.05.
     std = np.sqrt(
         noise[:, None] ** 2 * (2 + omega**2 * run.sample_time * duration) / 2
         + (10.0 * excess[:, None]) ** 2
@@ -113,16 +114,16 @@ def _ratio(Y: ComplexArray, U: ComplexArray, *, std: Array) -> TransferRatio:
 
 
 def _noise(run: Record) -> Array:
-    """Standard deviation (n_carts,) of what changes from sample to sample, or the encoder's."""
+    """Return the standard deviation (n_carts,) of the noise, or of encoder rounding."""
     white = np.std(np.diff(run.y, n=3, axis=1), axis=1) / difference_gain(3)
     return np.maximum(white, run.resolution / np.sqrt(12.0))
 
 
 def _local_ratio(run: Record, u: Array, omega: Array) -> TransferRatio:
-    """Return G by local polynomials: FT(y') = G FT(u') + the effect of the ends, both smooth.
+    """Return G by local polynomials: FT(y') = G FT(u') + effect of the ends; both are smooth.
 
-    The difference between two widths of the polynomials is added to the error: near a sharp
-    resonance of a short record it is the larger part.
+    The difference between two widths of the polynomials is added to the standard error. Near a
+    sharp resonance of a short record it is the larger part.
     """
     base = 2 * np.pi / (run.t[-1] - run.t[0])
     lines = np.arange(1, int(omega[-1] / base) + max(_HALF_WINDOWS) + 2)
@@ -140,7 +141,7 @@ def _line_transforms(
 ) -> tuple[ComplexArray, ComplexArray]:
     """Return FT(u') and FT(y') at harmonics of the record length; by FFT if time is uniform."""
     dt, base = run.sample_time, 2 * np.pi / (run.t[-1] - run.t[0])
-    # Of an interval: the rounding error of a uniform time axis.
+    # Differences up to this share of an interval are rounding of a uniform time axis.
     if np.max(np.abs(np.diff(run.t) - dt)) > 1e-3 * dt:
         return _derivative_transforms(run, u, lines * base, u_before=float(u[0]))
     smooth = 1.0 / np.sinc(lines * base * dt / (2 * np.pi))
@@ -153,7 +154,7 @@ def _line_transforms(
 def _local_polynomials(
     U: ComplexArray, Y: ComplexArray, *, place: Array, half: int
 ) -> TransferRatio:
-    """Fit the lines (1, 2, …) around each `place` (n_w,), `half` to each side where there are."""
+    """Fit the lines (1, 2, …) around each `place` (n_w,), up to `half` lines to each side."""
     width = 2 * half + 1
     first = np.clip(np.rint(place).astype(int) - 1 - half, 0, U.size - width)
     window = first[:, None] + np.arange(width)  # (n_w, width)
@@ -166,6 +167,6 @@ def _local_polynomials(
     found = np.einsum("wpj,cwj->cwp", inverse, measured)
     misfit = measured - np.einsum("wjp,cwp->cwj", regressors, found)
     freedom = width - 2 * (_DEGREE + 1)
-    variance = np.sum(np.abs(misfit) ** 2, axis=2) / freedom / 2  # per component
+    variance = np.sum(np.abs(misfit) ** 2, axis=2) / freedom / 2  # per real or imaginary part
     gain = np.sum(np.abs(inverse[:, 0, :]) ** 2, axis=1)
     return TransferRatio(G=found[:, :, 0], std=np.sqrt(variance * gain))

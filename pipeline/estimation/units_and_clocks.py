@@ -1,7 +1,7 @@
-"""Typical factors, with words, of a log in another unit or with a wrong clock."""
+"""Factors that appear when a log is in another unit or its clock is wrong, with their names."""
 
 LENGTH_SCALES = (10.0, 100.0, 1000.0, 2.54, 25.4)  # between mm, cm, m and inches
-# Factors of a time column that counts in other units: in full, and as in headings.
+# Factors of a time column in another unit; the unit's name in full, and as in headings.
 TIME_UNITS = {1e3: ("milliseconds", "ms"), 1e6: ("microseconds", "us")}
 TIME_FACTORS = {
     **{factor: f"its time seems to be in {unit}" for factor, (unit, _) in TIME_UNITS.items()},
@@ -10,4 +10,4 @@ TIME_FACTORS = {
     2.0: "its clock seems to run twice too fast",
     0.5: "its clock seems to run at half its speed",
 }
-FASTEST = 1e-4  # s between samples: no bench reads its encoders faster
+FASTEST = 1e-4  # s between samples. No bench reads its encoders faster

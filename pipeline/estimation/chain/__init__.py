@@ -1,1 +1,1 @@
-"""Fitting one chain: its parameters, its response, and the residuals of records."""
+"""Fit a chain: its parameters, its response, and the residuals of records."""

@@ -1,4 +1,4 @@
-"""The data of the Bode fit: the measured points in one row, and the chain's response at them."""
+"""The data of the Bode fit: all measured points in one array, and the chain's response there."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,10 +17,11 @@ Scale = Literal["log", "magnitude", "polar"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Points:
-    """All measured points in one row (N,); `at` and `cart` index frequency and cart (from 0).
+    """All measured points of the frequency responses in one array (N,).
 
-    `decays`: estimates of a cart's own damping ratio from decays, by cart (from 1), one more point
-    each.
+    `at` and `cart` give each point's frequency and cart, as indices from 0. `decays` holds
+    estimates of a cart's own damping ratio from decays, by cart (from 1). Each counts as one more
+    point.
     """
 
     omega: Array  # (n_w,) the distinct frequencies
@@ -28,14 +29,14 @@ class Points:
     cart: NDArray[np.intp]
     magnitude: Array
     std: Array
-    unit: ComplexArray  # exp(-i phase), 1 where not known
-    phase_std: Array  # infinite where not known
+    unit: ComplexArray  # exp(-i phase), 1 if the phase is unknown
+    phase_std: Array  # infinite if the phase is unknown
     from_table: bool
     decays: Mapping[int, Estimate] = field(default_factory=dict)
 
     @classmethod
     def collect(cls, responses: Sequence[FrequencyResponse], *, n: int) -> "Points":
-        """Gather the responses of some of the n carts; numbers without a standard error get one."""
+        """Gather the responses of some of the n carts; fill in missing standard errors."""
         if not responses:
             raise DataError("Bode fit: needs a frequency response, found none")
         for response in responses:
@@ -49,7 +50,7 @@ class Points:
             raise DataError("Bode fit: frequencies and magnitudes must be finite numbers")
         std = np.concatenate([r.magnitude_std for r in responses])
         stated = np.isfinite(std) & (std > 0)
-        # Relative error of a magnitude that comes without one.
+        # The relative error to assume for a magnitude without a standard error is 1 %.
         std = np.where(stated, std, 0.01 * np.maximum(magnitude, np.median(magnitude) / 1e3))
         phase = [np.zeros(r.omega.size) if r.phase is None else r.phase for r in responses]
         phase_std = [
@@ -57,7 +58,7 @@ class Points:
         ]
         spread = np.concatenate(phase_std)
         distinct, at = np.unique(omega, return_inverse=True)
-        # In rad: a phase with a larger error is not used.
+        # A phase with a standard error above this (rad) is not used.
         return cls(
             omega=distinct,
             at=at,
@@ -81,17 +82,17 @@ class Points:
 
     @property
     def level(self) -> Array:
-        """ln|G|; a magnitude below its error counts as half that error."""
+        """ln|G|; a magnitude below its standard error counts as half that error."""
         return np.log(np.maximum(self.magnitude, self.std / 2))
 
     @property
     def level_weight(self) -> Array:
-        """One over the error of the level, (N,)."""
-        # Added to the error of ln|G|: early in the fit no point should dominate.
+        """One over the standard error of the level, (N,)."""
+        # 5 % are added to the error of ln|G|, so that no point dominates early in the fit.
         return 1.0 / np.hypot(self.std / np.exp(self.level), 0.05)
 
     def widened(self, share: float) -> "Points":
-        """Return the points with a relative error added to their own."""
+        """Return the points with a relative error added to their standard errors."""
         return replace(
             self,
             std=np.hypot(self.std, share * self.magnitude),
@@ -99,7 +100,7 @@ class Points:
         )
 
     def of_cart(self, cart: int) -> NDArray[np.bool_]:
-        """Return which points are those of a cart (from 1), (N,)."""
+        """Return which points (N,) belong to a cart (from 1)."""
         return self.cart == cart - 1
 
 
@@ -112,7 +113,7 @@ def response_at(
     Z = ((powers * physical)[:, None, :] * b.T) @ b  # Σ p s^order b bᵀ
     try:
         inverse = np.linalg.inv(Z).astype(np.complex128, copy=False)
-    except np.linalg.LinAlgError:  # a step of the fit went astray: no number, so it steps back
+    except np.linalg.LinAlgError:  # a step of the fit went astray; NaN makes it step back
         inverse = np.full_like(Z, np.nan)
     G = inverse[:, :, 0]
     stretch = (G @ b.T) * -powers  # (n_w, n_p)
@@ -135,7 +136,10 @@ def weighted_residuals(
 def _decay_residuals(
     P: Parametrisation, decays: Mapping[int, Estimate], physical: Array
 ) -> tuple[Array, Array]:
-    """Return ln ζ_i minus the decay's, in standard errors, and its derivatives; ζ² = c² / 4mk."""
+    """Return ln ζ_i minus that of each decay, in standard errors; also its derivatives.
+
+    ζ² = c² / 4mk.
+    """
     chain = P.chain(physical)
     residuals, jacobian = [], []
     for cart, measured in decays.items():

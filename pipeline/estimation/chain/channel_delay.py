@@ -1,14 +1,14 @@
 """The delay of one channel against its neighbour's, from the carts' own law of motion.
 
 A cart without a motor is moved by its neighbours alone, whatever the input is and however late it
-comes:
+arrives. Its law of motion is
 
-    k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}
+    k_i x_{i-1} = m_i x_i'' + c_i x_i' + (k_i + k_{i+1}) x_i - k_{i+1} x_{i+1}.
 
-So each cart's channel has one delay against that of the cart before it for which this law fits
-best. No derivative is taken: both sides are weighted with a bump that slides along the records
-(`modulating`). The coefficients are free in sign and size, so a cart in another unit, or reversed,
-has the same delay.
+So the best delay of each cart's channel against that of the cart before it is the one for which
+this law fits best. No data are differentiated: both sides are averaged with a bump that slides
+along the records (`modulating`). The coefficients may have any sign and size. So a cart in another
+unit, or with a reversed sign, gives the same delay.
 """
 
 from collections.abc import Sequence
@@ -22,8 +22,8 @@ from pipeline.estimation.modulating import bump, motion_period
 from pipeline.results import Record
 
 _FEWEST_PLACES = 30
-_MOST_LATE = 15  # grid steps that are tried to either side
-_PARTS = 8  # smallest number of records, or parts of them, for a standard error
+_MOST_LATE = 15  # grid steps tried in each direction
+_PARTS = 8  # fewest records, or parts of records, for a standard error
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,9 +32,11 @@ class ChannelDelay:
 
     Attributes
     ----------
-    delay, std : s; positive if it is read later; standard error by jackknife over records.
+    delay, std : delay in s and its standard error by jackknife over records. The delay is positive
+        if
+        the channel is read later.
     better : factor by which this delay lowers the residual of the carts' law. Friction, play and
-        stops look like a small delay, but no delay removes them.
+        stops look like a small delay, but no delay removes their residual.
     experiments : the records used.
     """
 
@@ -46,9 +48,9 @@ class ChannelDelay:
 
 
 def find_channel_delays(records: Sequence[Record], *, n: int) -> dict[int, ChannelDelay]:
-    """Return, by cart, the delay of its channel against that of the cart before, if it shows.
+    """Return by cart the delay of its channel against that of the cart before, if significant.
 
-    The last cart comes first: the law of the one before needs its true times.
+    The last cart comes first, because the law of the cart before it needs its true times.
     """
     found: dict[int, ChannelDelay] = {}
     for cart in range(n, 1, -1):
@@ -65,7 +67,9 @@ class _Normal:
 
     Attributes
     ----------
-    power : (n_d,) of the left side; cross : (n_d, 4) with the right; square : (4, 4) of the right.
+    power : (n_d,) sum of squares of the left side.
+    cross : (n_d, 4) products of the left with the right side.
+    square : (4, 4) products of the right side's columns.
     """
 
     power: Array
@@ -73,7 +77,7 @@ class _Normal:
     square: Array
 
     def without(self, other: "_Normal") -> "_Normal":
-        """Return the equations without one part."""
+        """Return these equations minus those of one part."""
         return _Normal(
             power=self.power - other.power,
             cross=self.cross - other.cross,
@@ -95,7 +99,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     periods = [motion_period(one.position(cart)) * one.sample_time for one in usable]
     if not usable:
         return None
-    # Grid steps in a period of the motion, if it is sampled more often.
+    # The grid has 240 steps in a period of the motion, unless the samples are closer.
     finest = float(np.median(periods)) / 240
     step = max(float(np.median([record.sample_time for record in usable])), finest)
     parts = -(-_PARTS // len(usable))
@@ -114,7 +118,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     )
     left = total.left()
     best, least = _lowest(left)
-    if abs(best) >= _MOST_LATE:  # the longer the better: not a delay, but motion outside the law
+    if abs(best) >= _MOST_LATE:  # longer always fits better: not a delay but other motion
         return None
     others = np.array([_lowest(total.without(one).left())[0] for one in equations])
     spread = float(np.sum((others - others.mean()) ** 2))
@@ -128,12 +132,15 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
 
 
 def _tells(record: Record, cart: int) -> bool:
-    """Return whether every force on a cart was measured, and it and the one before move far."""
+    """Return whether the record can show the delay.
+
+    All forces on the cart must have been measured, and both it and the cart before must move far.
+    """
     if any(c not in record.carts or c not in record.free for c in (cart - 1, cart)):
         return False
     if cart + 1 in record.free and cart + 1 not in record.carts:
         return False
-    # Encoder steps of motion above which a channel's delay shows.
+    # The motion must span at least this many encoder steps.
     return all(np.ptp(record.position(c)) > 20.0 * record.encoder_step(c) for c in (cart - 1, cart))
 
 
@@ -142,8 +149,9 @@ def _equations(
 ) -> list[_Normal]:
     """Return the equations of each part of a record; none if it is too short."""
     t = np.arange(record.t[0], record.t[-1], step)
-    # In periods of the motion: wider bumps would suppress the fast motion, which is most
-    # informative. Below a number of samples under a bump only the encoder's steps would be seen.
+    # A bump lasts a quarter of the motion's period, because wider bumps would suppress the fast
+    # motion, the most informative part. With fewer than 16 samples under a bump, only the encoder's
+    # steps would count.
     width = max(round(0.25 * period / step), 16)
     first, last = _MOST_LATE, t.size - width - _MOST_LATE
     places = np.arange(first, last, max(width // 6, (last - first) // 400, 1))
@@ -179,7 +187,7 @@ def _equations(
 
 
 def _lowest(left: Array) -> tuple[float, float]:
-    """Return the delay in grid steps with the least residual, interpolated, and that residual."""
+    """Return the delay (in grid steps, interpolated) with the least residual, and that residual."""
     i = int(np.argmin(left))
     between = 0.0
     if 0 < i < left.size - 1 and (bend := left[i - 1] - 2 * left[i] + left[i + 1]) > 0:

@@ -1,8 +1,7 @@
-"""How well records follow a chain, and how a record must be read differently to follow it.
+"""How well records follow a chain, and what correction would make a record follow it.
 
-Apart from start and encoder zeros, the chain's residual of a record is linear in the record's
-columns. So the best factors on the columns show at once which column is reversed or in another
-unit.
+Apart from start and encoder zeros, the residual of a record is linear in the record's columns. So
+the best factors on the columns show at once which column has the wrong sign or unit.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -28,14 +27,14 @@ _ModesOf = Callable[[tuple[int, ...]], Modes]
 
 @dataclass(frozen=True, kw_only=True)
 class Followed:
-    """How a record follows a chain.
+    """How well a record follows a chain.
 
     Attributes
     ----------
-    lost : by cart, the share of its motion's power explained by neither chain nor noise.
-    missed : by cart, (n,) simulated minus read position.
-    reach : by cart, the ratio of its motion to the chain's, root-mean-square.
-    friction : by cart, the most dry friction that is compatible with this, in input units.
+    lost : by cart, the share of its motion's power. Neither chain nor noise explains this share.
+    missed : by cart, (n,) simulated minus measured position.
+    reach : by cart, the root-mean-square of its motion. Relative to that of the chain.
+    friction : by cart, the most dry friction that is compatible with `lost`. In input units.
     """
 
     lost: dict[int, float]
@@ -45,22 +44,26 @@ class Followed:
 
     @property
     def share(self) -> float:
-        """Their mean."""
+        """The mean of `lost` over the carts."""
         return float(np.mean(list(self.lost.values())))
 
     @property
     def belongs(self) -> bool:
-        """Whether the record follows."""
+        """Whether the record follows the chain."""
         return self.share <= FOLLOWED
 
 
 @dataclass(frozen=True, kw_only=True)
 class Misread:
-    """What makes a record follow: `words` say it; a `legal` one need not be a mistake.
+    """The correction that makes a record follow the chain.
 
-    `remedy` : the fix if all records of a bench are so. `scale` : the ratio of its motion to that
-        of the input, if nothing else differs. `clock` : the ratio of its time to the true one, if
-        nothing else differs.
+    Attributes
+    ----------
+    words : description of the mistake.
+    legal : whether the record may be right as it is.
+    remedy : the correction to make. Applies if all records of a bench need it.
+    scale : the ratio of the motion's unit to the input's. Given if nothing else differs.
+    clock : the ratio of the record's time to the true time. Given if nothing else differs.
     """
 
     words: str
@@ -71,7 +74,7 @@ class Misread:
 
 
 def is_driven(record: Record) -> bool:
-    """Return whether a logged input, not chosen by a controller, moves the carts."""
+    """Return whether the carts are moved by a logged input that no controller chose."""
     driven = record.kind in ("step", "sine", "sweep") and 1 in record.free
     return driven and record.u is not None and bool(np.ptp(record.u) > 0)
 
@@ -82,25 +85,25 @@ def measured(record: Record) -> list[int]:
 
 
 def follow(records: Sequence[Record], chain: Chain) -> dict[str, Followed]:
-    """Compare every driven record in which measured carts move with the chain, by id."""
+    """Compare with the chain every driven record in which measured carts move; by record id."""
     modes = _modes(chain)
     found = {r.id: _hold_against(r, chain, modes) for r in records if is_driven(r)}
     return {name: fit for name, fit in found.items() if fit}
 
 
 def most_follow(fits: Mapping[str, Followed]) -> bool:
-    """Return whether at least half of some records follow, if there are any."""
+    """Return whether there are records and at least half of them follow the chain."""
     return 2 * sum(fit.belongs for fit in fits.values()) >= len(fits)
 
 
 def near(record: Record, chain: Chain) -> list[Followed]:
-    """Return how a record follows carts like those of the chain, a little slower or faster.
+    """Return how well a record follows slightly slower or faster copies of the chain.
 
-    A spring that stiffens, or a late input, shifts resonances by some percent. At a resonance that
-    is the whole motion.
+    A spring that stiffens, or a late input, shifts resonances by some percent. For a dwell at a
+    resonance this changes the whole motion.
     """
     modes = _modes(chain)
-    # A spring that stiffens, or a late input, shifts resonances by some percent.
+    # Scaling the time of the record is the same as scaling the chain's frequencies.
     detuned = [replace(record, t=factor * record.t) for factor in np.linspace(0.85, 1.15, 13)]
     return [fit for other in detuned if (fit := _hold_against(other, chain, modes))]
 
@@ -108,23 +111,24 @@ def near(record: Record, chain: Chain) -> list[Followed]:
 def find_misread(
     record: Record, chain: Chain, fit: Followed, *, better: float = 10.0
 ) -> Misread | None:
-    """Return how a record must be read to follow the chain better by the given factor.
+    """Return the correction with which a record follows the chain better by a given factor.
 
     Parameters
     ----------
-    fit : how it follows unchanged.
+    fit : how the record follows without correction.
+    better : smallest factor by which the residual must fall.
     """
     found, least = None, min(fit.share / better, FOLLOWED)
-    # The residual of a good record is friction, which no other reading removes.
+    # The rest of the residual of a good record is friction, which no correction removes.
     if better > 1 and fit.share < 0.005:
         return None
-    # In the bench's counting: a record's own sign was found by what it holds.
+    # Use the sign convention of the bench: this record's own sign was found from its data.
     record = replace(record, u=0.0 - record.u) if record.turned and record.u is not None else record
     modes = _modes(chain)
     for misread, other in _readings(record, modes):
         held = _hold_against(other, chain, modes)
-        # The largest residual of a record that counts the other way; that of a long delay is
-        # larger.
+        # A different sign is legal, but then the residual must be below 2 %, as a long delay gives
+        # a larger one.
         if held and held.share <= (min(least, 0.02) if misread.legal else least):
             found, least = misread, held.share
     return found
@@ -140,13 +144,13 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
         remedy = f'state columns = {{ x{i} = "x{j}", x{j} = "x{i}" }} for each'
         yield Misread(words=words, remedy=remedy), other
     for factor, words in TIME_FACTORS.items():
-        if record.sample_time >= factor * FASTEST:  # too short a time is any short curve
+        if record.sample_time >= factor * FASTEST:  # any curve fits a time that is too short
             yield Misread(words=words, clock=factor), replace(record, t=record.t / factor)
     try:
         window = open_window(record)
     except DataError:
         return
-    # Encoder steps of motion: rounding can change a smaller one by any factor.
+    # The smallest motion, in encoder steps: rounding can change a smaller motion by any factor.
     if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
         return
     if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
@@ -160,7 +164,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
 
 
 def _weights(window: FitWindow, modes: Modes) -> Array:
-    """Return the factors (p,) on the columns with which the record follows best."""
+    """Return the factors (p,) on the columns of the record for which it follows the chain best."""
     driven = compare(replace(window, y=0 * window.y), modes).residual.ravel()
     alone = [
         compare(replace(window, drive_u=None, y=window.y * row[:, None]), modes).residual.ravel()
@@ -171,15 +175,16 @@ def _weights(window: FitWindow, modes: Modes) -> Array:
 
 
 def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
-    """Describe the mistake that needs about these factors on the columns; None if it is unknown.
+    """Describe the mistake that these factors on the columns would correct; None if unknown.
 
-    A unit applies to the whole file: one cart near its null may move too little by any factor.
+    A wrong unit applies to the whole file. A single cart with a small motion is not a wrong unit:
+    it may just be near its null.
     """
     sign, size = np.sign(weights), np.abs(weights)
-    # An amplifier at its limit reduces the input by a factor of 2 or 3.
+    # Smaller factors do not count, since an amplifier at its limit reduces the input by 2 or 3.
     scales = [scale for scale in LENGTH_SCALES if scale >= 10.0]
     for scale in (*scales, *(1 / scale for scale in scales)):
-        # Relative, of a unit's factor: known factors are at least 2.5 apart.
+        # A factor may be off by 10 %, as the known factors are at least 2.5 apart.
         if np.all(np.abs(size * scale - 1) < 0.1) and len(set(sign)) == 1:
             words = (
                 "its positions or its input seem to be in another unit: they move "
@@ -194,11 +199,11 @@ def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     return None
 
 
-# ------------------------------------------------------- one record and the chain
+# ---------------------------------------------------------- one record and the chain
 
 
 def _modes(chain: Chain) -> _ModesOf:
-    """Return a function that finds the chain's modes by its free carts, without derivatives."""
+    """Return a function that finds the chain's modes for given free carts, without derivatives."""
     P = Parametrisation(bench=Bench(springs=tuple(bool(k) for k in chain.k)))
 
     @cache
@@ -225,8 +230,9 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
     excess = np.mean(residual**2, axis=1) - window.stated_sigma**2  # beyond encoder steps and noise
     lost = np.maximum(excess, 0.0) / power
     reach = np.sqrt(power) / np.maximum(np.std(window.y + residual, axis=1), window.stated_sigma)
-    # Simulated carts with dry friction F under a force of amplitude A leave at least (F / 5A)² if
-    # they move at all, doubled here; encoder and noise hide smaller shares.
+    # In simulations, carts with dry friction F under a force of amplitude A leave a share of at
+    # least (F / 5A)² if they move at all. This is doubled here. Encoder steps and noise hide
+    # smaller shares.
     return Followed(
         lost=dict(zip(window.carts, lost.tolist(), strict=True)),
         missed=dict(zip(window.carts, residual, strict=True)),
@@ -240,7 +246,7 @@ def _hold_against(record: Record, chain: Chain, modes: _ModesOf) -> Followed | N
 
 
 def force_on(record: Record, chain: Chain, *, cart: int) -> Array | None:
-    """Return the force on a cart (n,) by input and neighbours; None if one is unknown."""
+    """Return the force (n,) of input and neighbours on a cart; None if one of them is unknown."""
     assert record.u is not None
     force = record.u if cart == 1 else np.zeros_like(record.u)
     for neighbour, k in ((cart - 1, chain.k[cart - 1]), (cart + 1, chain.k[cart])):

@@ -1,8 +1,8 @@
 """Exact response of a chain to a measured input, and its Jacobian by the fit vector, by modes.
 
-In modal coordinates every state is alone, z' = lambda z + b u. So a held input gives an exact
-scalar recursion at any sample times. The derivatives by any number of parameters need only one more
-recursion for each mode (by lambda) and constant matrices.
+In modal coordinates the states are uncoupled: z' = lambda z + b u. So a held input gives an exact
+scalar recursion at any sample times. The derivatives by all parameters need only one more recursion
+for each mode (the derivative by lambda) and constant matrices.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,12 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.chain.parametrisation import Parametrisation
 from pipeline.plant.linear.chain import Chain
 
-# Below this |lambda dt| the derivative of expm1(z)/z is taken from its series: rounding would leave
-# 1e-16/|z|, the series errs by z²/8.
+# Below this |lambda dt| the derivative of expm1(z)/z is computed from its series: rounding would
+# cost 1e-16/|z|, while the series errs by z²/8.
 _SMALL_EXPONENT = 1e-6
-# Poles closer than this (relative) lose the third power of it in the Jacobian. More damping on one
-# cart, too little to show in a record, separates them by twice its root.
+# Poles closer than this (relative) lose accuracy in the Jacobian, by the third power of their
+# distance. They are separated by more damping on one cart, too little to show in a record. It moves
+# them apart by twice its square root.
 _MEETING = 1e-3
 _PARTING = 1e-5
 
@@ -29,11 +30,14 @@ class Modes:
 
     Attributes
     ----------
-    poles : (n_m,), rad/s; `shapes` (f, n_m) the positions in each mode, doubled for a pair so
-        that a position is Re(shapes @ z).
-    entry : (n_m, 2f), z(0) = entry @ x(0), with the state (x1, v1, x2, v2, …).
-    drive : (n_m,), z' = poles z + drive u.
-    d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m).
+    poles : (n_m,) rad/s.
+    shapes : (f, n_m) the positions in each mode. Doubled for a conjugate pair, so that a position
+        is
+        Re(shapes @ z).
+    entry : (n_m, 2f) with z(0) = entry @ x(0). The state is (x1, v1, x2, v2, …).
+    drive : (n_m,) with z' = poles z + drive u.
+    d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m) :
+        derivatives by theta.
     """
 
     poles: ComplexArray
@@ -52,8 +56,8 @@ def find_modes(
     """Decompose the free part of a chain into modes.
 
     `dp_dtheta` (n_p,) is that of `Parametrisation`. If two poles meet (a critically damped cart)
-    there are no separate modes, and nearby rounding spoils the derivatives: such poles are first
-    separated.
+    there are no separate modes, and rounding near such a point spoils the derivatives. So these
+    poles are moved apart first.
     """
     A, B, _, _ = chain.state_space(free=free)
     if _poles_meet(A):
@@ -64,7 +68,7 @@ def find_modes(
         A, B, _, _ = chain.state_space(free=free)
     dA, dB = _state_space_derivatives(chain, free, parametrisation)
     dA, dB = dp_dtheta[:, None, None] * dA, dp_dtheta[:, None] * dB
-    poles, V = map(np.asarray, np.linalg.eig(A))  # of a real matrix: exact conjugate pairs
+    poles, V = map(np.asarray, np.linalg.eig(A))  # of a real matrix, so conjugate pairs are exact
     poles, V = poles.astype(np.complex128), V.astype(np.complex128)
     W = np.asarray(np.linalg.inv(V), dtype=np.complex128)
     # No mode of a passive chain grows; a positive real part is rounding error.
@@ -89,7 +93,7 @@ def find_modes(
 
 
 def _poles_meet(A: Array) -> bool:
-    """Return whether two poles are too close for separate modes."""
+    """Return whether two poles are too close to be separate modes."""
     poles = np.linalg.eigvals(A)
     gap = np.abs(poles - poles[:, None]) + np.diag(np.full(poles.size, np.inf))
     return bool(np.min(gap) < _MEETING * np.max(np.abs(poles)))
@@ -113,9 +117,9 @@ def _state_space_derivatives(
 
 
 def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, ComplexArray]:
-    """Return q (n_m, n) with q' = pole q + u from zero, and dq/dpole, at `t`.
+    """Return q (n_m, n) at `t` with q' = pole q + u and q(0) = 0, and dq/dpole.
 
-    u (n,) is held from sample to sample. Exact for any sample times.
+    u (n,) is held from sample to sample. The result is exact for any sample times.
     """
     dt = np.diff(t)
     uniform = np.ptp(dt) <= 1e-9 * dt[0]  # sample times differ only by rounding
@@ -132,10 +136,10 @@ def drive_modes(poles: ComplexArray, t: Array, u: Array) -> tuple[ComplexArray, 
 
 
 def _accumulate(growth: ComplexArray, forced: ComplexArray) -> ComplexArray:
-    """Return q (n_m, n) of q[0] = 0, q[i + 1] = growth[i] q[i] + forced[i].
+    """Return q (n_m, n) with q[0] = 0 and q[i + 1] = growth[i] q[i] + forced[i].
 
-    By doubling: after s steps each entry holds the sum over its last 2^s inputs. `growth` is
-    (n_m, 1) for a uniform clock or (n_m, n - 1).
+    By doubling: after s steps each entry holds the sum over its last 2^s inputs. `growth` is (n_m,
+    1) for uniform sample times, otherwise (n_m, n - 1).
     """
     q = np.zeros((forced.shape[0], forced.shape[1] + 1), dtype=np.complex128)
     total = q[:, 1:]

@@ -1,8 +1,8 @@
-"""Chain and fit vector: what the frequency-domain and the time-domain fit share.
+"""Chain and fit vector, shared by the frequency-domain and the time-domain fit.
 
-A fit moves a vector theta: log m, log c and log k, so that no step leaves the physical range and
-all entries are of order one. Only the spring wall-1 enters linearly: it may be zero, as in the
-paper's plants, if the far wall holds the carts.
+A fit searches a vector theta of log m, log c and log k, so that no step leaves the physical range
+and all entries are of order one. Only the spring wall-1 is not a logarithm: it may be zero, as in
+the paper's plants, if the far wall holds the carts.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,12 +19,12 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.results import Estimate
 from pipeline.set_up import Bench
 
-# Initial damping ratios if they are not measured:
-START_ZETA = 0.05  # of each cart alone: what a cart on bearings has
-ASSUMED_ZETA = 0.1  # of a mode or a null: the usual guess of the paper
-_FARTHEST = 100.0  # of a logarithm: a step that goes astray must not overflow
-# A start must be a chain: what a measured table implies below this share of the largest spring
-# (or mass) is raised to it.
+# Initial damping ratios for those that were not measured:
+START_ZETA = 0.05  # of each cart alone. Typical of a cart on bearings.
+ASSUMED_ZETA = 0.1  # of a resonance or a null. The usual guess of the paper.
+_FARTHEST = 100.0  # largest logarithm. A step that goes astray must not overflow.
+# A fit must start from a possible chain: springs below this share of the largest one (or masses)
+# that a measured table implies are raised to it.
 _SMALLEST_SHARE = 0.02
 
 
@@ -34,8 +34,8 @@ class Parametrisation:
 
     Attributes
     ----------
-    bench : which springs there are.
-    zero : names of parameters held at zero ("c_2", "k_1"): a fit found them at their bound.
+    bench : the carts and springs that exist.
+    zero : names of parameters held at zero ("c_2", "k_1"), because a fit found them at their bound.
 
     Raises
     ------
@@ -61,14 +61,14 @@ class Parametrisation:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The free parameters, "m_1" … "k_n": the order of theta and of its covariance."""
+        """The free parameters, "m_1" … "k_n", in the order of theta and of its covariance."""
         names = [f"{symbol}_{i}" for symbol in "mc" for i in range(1, self.n + 1)]
         names += [f"k_{j}" for j, present in enumerate(self.bench.stiff, start=1) if present]
         return tuple(name for name in names if name not in self.zero)
 
     @cached_property
     def logarithmic(self) -> NDArray[np.bool_]:
-        """(n_p,) bool: False for the one spring that enters as it is and may be zero."""
+        """(n_p,) whether each parameter enters as its logarithm; only wall-1 does not."""
         may_vanish = "k_1" if self.n > 1 and f"k_{self.n + 1}" in self.names else None
         return np.array([name != may_vanish for name in self.names])
 
@@ -79,7 +79,7 @@ class Parametrisation:
 
     @cached_property
     def places(self) -> tuple[tuple[str, int], ...]:
-        """The free parameters as "m", "c" or "k" and the index among those of a chain."""
+        """The free parameters as "m", "c" or "k" and the index within the chain's m, c or k."""
         return tuple(_place(name) for name in self.names)
 
     @cached_property
@@ -93,13 +93,13 @@ class Parametrisation:
         return np.concatenate([chain.m, chain.c, chain.k])[self._places]
 
     def chain(self, physical: Array) -> Chain:
-        """Return the chain of the free parameters (n_p,), all others zero."""
+        """Return the chain with these free parameters (n_p,) and all others zero."""
         flat = np.zeros(3 * self.n + 1)
         flat[self._places] = physical
         return Chain(m=flat[: self.n], c=flat[self.n : 2 * self.n], k=flat[2 * self.n :])
 
     def pack(self, chain: Chain) -> Array:
-        """Return theta (n_p,) of a chain whose free parameters are positive (k_1: not negative)."""
+        """Return theta (n_p,) of a chain with positive free parameters (k_1 may be zero)."""
         p = self.physical(chain)
         return np.where(self.logarithmic, np.log(np.where(self.logarithmic, p, 1.0)), p)
 
@@ -112,14 +112,14 @@ class Parametrisation:
         return np.where(self.logarithmic, np.exp(exponent), theta)
 
     def dp_dtheta(self, theta: Array) -> Array:
-        """Return dp/dtheta (n_p,): p itself for a logarithm, 1 for the linear spring."""
+        """Return dp/dtheta (n_p,): p itself for a logarithm, 1 for the spring wall-1."""
         return np.where(self.logarithmic, self._physical_of(theta), 1.0)
 
     @cached_property
     def directions(self) -> Array:
-        """Rows b (n_p, n): a parameter p enters the impedance as p s^order b bᵀ.
+        """Rows b (n_p, n): a parameter p enters the impedance matrix as p s^order b bᵀ.
 
-        b picks the cart of a mass or damper, and the stretch of a spring.
+        b selects the cart of a mass or damper, and the stretch of a spring.
         """
         eye = np.eye(self.n)
         stretch = np.diff(np.vstack([np.zeros(self.n), eye, np.zeros(self.n)]), axis=0)
@@ -140,7 +140,7 @@ class Parametrisation:
         return mass, damping, stiffness
 
     def holding_at_zero(self, *names: str) -> "Parametrisation":
-        """Return the same with further parameters held at zero."""
+        """Return this parametrisation with further parameters held at zero."""
         return replace(self, zero=(*self.zero, *names))
 
 
@@ -158,21 +158,22 @@ def named_estimates(
 
     Parameters
     ----------
-    names : the physical parameters ("m_1", …) that have an error; all others are known exactly.
-    covariance : (n_p, n_p) of those, in physical units.
+    names : the physical parameters ("m_1", …) with an error. All others are known exactly.
+    covariance : (n_p, n_p) of these parameters, in physical units.
 
     Returns
     -------
-    By name; a damping of zero is no measurement and is returned as `at_bound`.
+    The estimates by name. A damping of zero is not a measurement and is marked as `at_bound`.
 
     Raises
     ------
-    DataError : several carts that no spring ties to a wall have no static gains.
+    DataError : there are several carts and no spring to a wall, so static gains do not exist.
     """
     values = chain.parameters()
     J = parameter_jacobian(chain, names)
     variance = np.einsum("ij,jk,ik->i", J, covariance, J)
-    # Far below any bench's, above the rounding of a pole on the imaginary axis.
+    # A damping ratio up to this limit is zero. It is far below any bench's, and above the rounding
+    # of a pole on the imaginary axis.
     return {
         name: Estimate(value=0.0, std=None, source=source, at_bound=True)
         if read_name(name).is_damping and value <= 1e-10
@@ -188,7 +189,7 @@ def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
     for name in names:
         symbol, i = _place(name)
         values: Array = getattr(chain, symbol)
-        # Relative step; a forward difference errs by as much, rounding by 1e-9.
+        # The step is 1e-6 relative: the forward difference errs by as much, rounding by 1e-9.
         step = 1e-6 * (values[i] or np.max(values) or critical_damping(chain))
         moved = {"m": chain.m.copy(), "c": chain.c.copy(), "k": chain.k.copy()}
         moved[symbol][i] += step
@@ -198,17 +199,17 @@ def parameter_jacobian(chain: Chain, names: Sequence[str]) -> Array:
 
 
 def critical_damping(chain: Chain) -> float:
-    """Return of what order a damping would be that takes a mode's swing at once."""
+    """Return the order of magnitude of a damping that stops a mode's swing at once."""
     m, k = float(np.max(chain.m)), float(np.max(chain.k))
-    return float(np.sqrt(m * k)) or m  # on no spring: in one second
+    return float(np.sqrt(m * k)) or m  # without a spring, the damping that stops it within a second
 
 
 def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> Chain:
-    """Return a proper chain near one that a measured table implies.
+    """Return a possible chain near the one that a measured table implies.
 
-    `found` may hold what no real chain has (a negative spring, a mass far too small): such values
-    are clipped. Dampings are set from `zeta`, as a table's are too uncertain to keep; but a cart
-    on no spring keeps its own.
+    `found` may hold impossible values (a negative spring, a mass far too small); these are clipped.
+    Dampings are set from `zeta`, because those of a table are too uncertain. But a cart without a
+    spring keeps its own damping.
     """
     k = np.where(bench.stiff, _raised(found.k), 0.0)
     m = _raised(found.m)
@@ -217,15 +218,15 @@ def physical_start(found: Chain, *, bench: Bench, zeta: float = START_ZETA) -> C
 
 
 def _raised(values: Array) -> Array:
-    """Return values raised to a small share of the largest."""
+    """Return the values, with the smallest raised to a given share of the largest."""
     return np.maximum(values, _SMALLEST_SHARE * np.max(np.abs(values)))
 
 
 def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
     """Return a chain of equal carts and springs with the gain and mean frequency of `values`.
 
-    A start for a fit when too few estimates are at hand to recover a chain from. `values` needs
-    the first cart's gain (`K` or `K_1`) and at least one resonance (`omega_n`, `omega_a`, …).
+    It starts a fit if there are too few estimates to compute a chain from. `values` needs the first
+    cart's gain (`K` or `K_1`) and at least one resonance (`omega_n`, `omega_a`, …).
     """
     omegas = [
         value
@@ -240,7 +241,7 @@ def even_chain(values: Mapping[str, float], *, bench: Bench) -> Chain:
         )
     n = bench.n
     unit = Chain(m=np.ones(n), c=np.zeros(n), k=np.array(bench.stiff, dtype=float))
-    modes = np.sort(np.abs(unit.poles))[::2]  # each resonance appears twice, with its conjugate
+    modes = np.sort(np.abs(unit.poles))[::2]  # each resonance appears twice, as a conjugate pair
     stretch = np.exp(
         np.mean(np.log(np.sort(omegas))) - np.mean(np.log(modes[modes > 0][: len(omegas)]))
     )

@@ -1,7 +1,7 @@
-"""The paper's way through the Bode plots: the last cart first, then the numerators one by one.
+"""The paper's way to fit the Bode plots: the last cart first, then the numerators one by one.
 
-The last cart's transfer function has no zeros, so it gives the common denominator; each cart
-before it then adds its gain and its zeros. Magnitudes alone are used, on a logarithmic scale.
+The last cart's transfer function has no zeros, so it gives the common denominator. Each cart before
+it then adds its gain and its zeros. Only magnitudes are used, on a logarithmic scale.
 
 Reference: Throne (2005), sections on the two and three degree of freedom systems.
 """
@@ -17,8 +17,8 @@ from pipeline.names import NULLS, gain_name, mode_suffixes, mode_zeta, own_omega
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.recovery import recover_chain
 
-_FARTHEST = 50.0  # of a logarithm: a step that goes astray must not overflow
-_ZETA_RANGE = (0.01, 1.0)  # of a start: outside it the fit would not find its way back
+_FARTHEST = 50.0  # bound of a logarithm, so that a step that goes astray does not overflow
+_ZETA_RANGE = (0.01, 1.0)  # allowed damping ratios of a start; others do not converge
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +33,7 @@ class LogMagnitude:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StagedFit:
-    """Static gains (n,), T_1 … T_n as in `Chain.tails`, and the parameters they stand for."""
+    """Static gains (n,), polynomials T_1 … T_n as in `Chain.tails`, and the named parameters."""
 
     gains: Array
     tails: list[Array]
@@ -43,13 +43,13 @@ class StagedFit:
 def fit_stage_by_stage(
     measured: Mapping[int, LogMagnitude], *, n: int, initial: Mapping[str, float], like: Chain
 ) -> StagedFit:
-    """Fit the transfer functions cart by cart, n first.
+    """Fit the transfer functions cart by cart, cart n first.
 
     Parameters
     ----------
-    measured : by cart; a cart that is missing keeps the start.
-    initial : named parameters to start from, as far as there are any.
-    like : a chain that replaces missing ones.
+    measured : magnitudes by cart. A missing cart keeps its start values.
+    initial : the named parameters to start from, as far as they are known.
+    like : a chain that supplies start values for the others.
     """
     known = {**like.parameters(), **initial}
     gains = np.array([known[gain_name(i, n=n)] for i in range(1, n + 1)])
@@ -69,7 +69,10 @@ def fit_stage_by_stage(
 
 
 def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
-    """Return ln omega and ln zeta (2, n - i) of T_{i+1}: the poles, or the zeros of cart i."""
+    """Return ln omega and ln zeta (2, n - i) to start T_{i+1} from.
+
+    They belong to the poles for i = 0, else to the zeros of cart i.
+    """
     roots = like.poles if i == 0 else like.zeros(i)
     omega, zeta = quadratic_factors(roots)
     for j, suffix in enumerate(_suffixes(i, n=n)):
@@ -79,7 +82,7 @@ def _start(known: Mapping[str, float], i: int, *, n: int, like: Chain) -> Array:
 
 
 def _suffixes(i: int, *, n: int) -> list[str]:
-    """Name the quadratic factors of T_{i+1}; none for those that the tables do not list."""
+    """Return the suffixes of T_{i+1}'s quadratic factors; empty if the tables do not list them."""
     if i == 0:
         return mode_suffixes(n)
     if i == n - 1:
@@ -103,13 +106,13 @@ def _fit(
     start = np.concatenate([[np.log(gain)], factors.ravel()])
     if points.omega.size < start.size:
         return gain, factors  # too few points for this stage; the joint fit sees all carts
-    # A stage that gets there takes about ten.
+    # A fit that succeeds takes about ten evaluations.
     found = minimise(
         evaluate,
         start,
         max_evaluations=100,
     ).x
-    # Of a logarithm, a factor 1000: a stage that got there has lost its way.
+    # A logarithm that changed by 7 is a factor of 1000: the fit has gone astray.
     if np.max(np.abs(found - start)) > 7.0:
         return gain, factors
     return float(np.exp(found[0])), found[1:].reshape(shape)
@@ -126,7 +129,7 @@ def _log_factors(omega: Array, factors: Array) -> tuple[Array, Array]:
 
 
 def _polynomial(factors: Array) -> Array:
-    """Multiply s² + 2ζωs + ω² out, monic, in falling powers."""
+    """Multiply the factors s² + 2ζωs + ω² into a monic polynomial, highest power first."""
     product = np.array([1.0])
     for omega, zeta in np.exp(factors).T:
         product = np.polymul(product, np.array([1.0, 2 * zeta * omega, omega**2]))
@@ -134,7 +137,10 @@ def _polynomial(factors: Array) -> Array:
 
 
 def _named(gains: Array, factors: list[Array], tails: list[Array]) -> dict[str, float]:
-    """Name what was fitted, and the carts' own frequencies recomputed from it where they exist."""
+    """Return the fitted values by name, with the carts' own frequencies computed from them.
+
+    A frequency is left out if it does not exist.
+    """
     n = gains.size
     values = {gain_name(i, n=n): float(gain) for i, gain in enumerate(gains, start=1)}
     for i, factor in enumerate(factors):

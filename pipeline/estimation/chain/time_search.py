@@ -1,4 +1,4 @@
-"""Search for the chain that follows a set of windows: from a regression, by Gauss-Newton."""
+"""Search for the chain that follows a set of windows: Gauss-Newton from a regression's result."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,32 +16,32 @@ from pipeline.estimation.minimise import minimise
 from pipeline.plant.linear.chain import Chain
 from pipeline.results import EXPLAINED
 
-# The share of a record's power (about its mean) that a chain may leave: carts with dry friction
-# leave some 2 %, a wrong chain most.
+# Share of a record's power (about its mean) that a chain may leave unexplained: carts with dry
+# friction leave some 2 %, a wrong chain most of it.
 FOLLOWED = 0.1
-# A damping or spring that is not there sends its logarithm towards minus infinity: e^-15 of a
-# start is nothing, and no step may overflow.
+# Farthest that a logarithm may move from its start. The logarithm of a damping or spring that does
+# not exist goes towards minus infinity; e^-15 of a start counts as zero, and no step overflows.
 _LOG_REACH = 15.0
-# Relative change of the cost at which a search ends: with n samples, 1/n is one standard error.
+# Relative change of the cost at which a search ends. With n samples, 1/n is one standard error.
 _SEARCH_TOLERANCE = 1e-6
 _MOST_EVALUATIONS = 60
-# Of a chain with a record, in all starts together, about 1 ms each. With all carts measured a
-# search takes some 200 at most; with a cart unmeasured some 3000 until the noise is reached, and
-# 5000 through all starts where dry friction or play keep it from there. Records that no chain
-# explains would take as many as there are starts and records.
+# Most comparisons of a chain with a record, in all starts together, at about 1 ms each. With all
+# carts measured, a search takes up to 200. With an unmeasured cart, it takes some 3000 to reach the
+# noise. If dry friction or play prevents that, all starts together take 5000. Without this limit,
+# records that no chain explains would take any number.
 _MOST_COMPARISONS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Attempt:
-    """A chain held against all windows.
+    """One chain compared with all windows.
 
     Attributes
     ----------
-    theta : (n_p,), see `Parametrisation`.
+    theta : (n_p,) see `Parametrisation`.
     misfits : one for each window.
-    converged : True where a search ended here by itself.
-    n_evaluations : how many chains the search compared on its way here.
+    converged : whether a search ended at this chain by itself.
+    n_evaluations : number of chains that the search compared on the way.
     """
 
     parametrisation: Parametrisation
@@ -63,17 +63,17 @@ class Attempt:
 
     @property
     def n_points(self) -> int:
-        """Number of positions."""
+        """The number of measured positions."""
         return sum(window.y.size for window in self.windows)
 
     @property
     def dof(self) -> int:
-        """Degrees of freedom: positions less all that was fitted, nuisance parameters included."""
+        """Degrees of freedom: positions minus all fitted and nuisance parameters."""
         return self.n_points - self.theta.size - sum(misfit.n_nuisance for misfit in self.misfits)
 
     @cached_property
     def lost(self) -> float:
-        """Share of the motion's power (about its mean) that the chain does not explain."""
+        """The share of the motion's power (about its mean) that the chain does not explain."""
         power = sum(
             float(np.sum(((w.y - w.y.mean(axis=1, keepdims=True)) / w.sigma[:, None]) ** 2))
             for w in self.windows
@@ -82,7 +82,7 @@ class Attempt:
 
     @property
     def follows(self) -> bool:
-        """True where the chain explains the motion, down to its noise or nearly all of it."""
+        """Whether the chain explains the motion down to the noise, or nearly all of it."""
         return self.lost < FOLLOWED or self.cost < EXPLAINED * self.dof
 
 
@@ -104,7 +104,7 @@ def descend(
     *,
     tolerance: float = _SEARCH_TOLERANCE,
 ) -> Attempt:
-    """Minimise the sum of squared residuals from theta on, to a relative `tolerance`."""
+    """Minimise the sum of squared residuals, starting from theta, to a relative `tolerance`."""
     reach = np.where(parametrisation.logarithmic, _LOG_REACH, np.inf)
     lower = np.maximum(parametrisation.bounds[0], theta - reach)
     upper = np.minimum(parametrisation.bounds[1], theta + reach)
@@ -131,8 +131,8 @@ def descend(
 def condense(misfits: Sequence[Misfit]) -> Array:
     """Condense Jacobians and residuals to (n_p + 1, n_p + 1), the residuals in the last column.
 
-    The triangle of their QR decomposition: its columns have the products of the long ones, so
-    least squares sees the same problem with n_p + 1 residuals instead of thousands.
+    The result is the triangle of a QR decomposition. Its columns have the same products as the long
+    columns. So least squares has the same solution with n_p + 1 rows instead of thousands.
     """
     triangles = []
     for misfit in misfits:
@@ -144,12 +144,12 @@ def condense(misfits: Sequence[Misfit]) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SearchOutcome:
-    """What a search came to.
+    """The result of a search.
 
     Attributes
     ----------
-    best : the attempt that leaves least, on the whole windows.
-    cut_short : True where starts were left untried though none before explained the records.
+    best : the attempt with the lowest cost on the whole windows.
+    cut_short : whether starts were left untried although no chain explained the records.
     """
 
     best: Attempt
@@ -164,7 +164,12 @@ def search(
     given: Chain | None,
     most_comparisons: int = _MOST_COMPARISONS,
 ) -> SearchOutcome:
-    """Return the best chain from as many starts as it takes, or as it may take.
+    """Return the best chain from several starts; stop early if one explains the records.
+
+    Parameters
+    ----------
+    given : a chain to start from, or None.
+    most_comparisons : limit on the comparisons of a chain with a record.
 
     Raises
     ------
@@ -172,7 +177,7 @@ def search(
     """
     bench = parametrisation.bench
     regressed = [regress_chain(windows, bench=bench, width=width) for width in WIDTHS]
-    # Of a record; the search needs no more to come close.
+    # 700 samples per record are enough for the search to come close.
     full, windows = windows, [window.thinned(700) for window in windows]
     near = [parametrisation.pack(chain) for chain in (given, *regressed) if chain is not None]
     near.sort(key=lambda theta: look(windows, parametrisation, theta).cost)
@@ -186,8 +191,8 @@ def search(
         found = descend(windows, parametrisation, theta)
         tried, comparisons = tried + 1, comparisons + found.n_evaluations * len(windows)
         best = found if best is None or found.cost < best.cost else best
-        # Even chains are far from the truth: the search may end beside it, so all are tried unless
-        # one explains the records down to their noise.
+        # Chains of equal carts are far from the truth, so a search from them may end at a wrong
+        # chain. All of them are tried, unless one explains the records down to their noise.
         if best.follows if tried <= len(near) else best.cost < EXPLAINED * best.dof:
             break
     if best is None:

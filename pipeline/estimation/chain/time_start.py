@@ -1,11 +1,13 @@
-"""A chain to start the time-domain fit from, found by linear regression alone.
+"""A start for the time-domain fit, found by linear regression alone.
 
-Each cart's equation of motion is multiplied by a bump φ and integrated by parts (`modulating`):
+Each cart's equation of motion is multiplied by a bump φ and integrated by parts (`modulating`). The
+result is
 
-    m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ
+    m_i ∫ x_i φ'' - c_i ∫ x_i φ' + k_i ∫ (x_i - x_{i-1}) φ + k_{i+1} ∫ (x_i - x_{i+1}) φ = ∫ u φ.
 
-Cart 1's equation gives its mass, damping and springs in input units; each further cart's gives
-its own relative to the spring before it. The encoder zeros act as a constant force in a record.
+Cart 1's equation gives its mass, damping and springs in input units. The equation of each further
+cart gives them relative to the spring before it. An encoder zero acts as a constant force in its
+record.
 """
 
 from collections.abc import Sequence
@@ -20,22 +22,22 @@ from pipeline.estimation.modulating import bump, bump_integral
 from pipeline.plant.linear.chain import Chain
 from pipeline.set_up import Bench
 
-WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s; a bump should span about one period of the carts
-_HOP = 0.25  # of the width, from one bump to the next: they overlap, so closer adds little
-_MOST_BUMPS = 400  # in a record; more only cost time
-_FEWEST_SAMPLES = 8  # in a bump; fewer do not integrate φ'' well
-_FEWEST_PERIODS = 2  # of the slowest resonance worth looking for, in the longest record
+WIDTHS = (0.15, 0.3, 0.6, 1.2)  # s. A bump should last about one period of the carts
+_HOP = 0.25  # distance of bumps over their width. They overlap, so closer bumps add little
+_MOST_BUMPS = 400  # bumps in a record. More only cost time
+_FEWEST_SAMPLES = 8  # samples in a bump. Fewer do not integrate φ'' well
+_FEWEST_PERIODS = 2  # periods of the slowest resonance to try, in the longest record
 _FEWEST_PER_PERIOD = 8  # samples in a period of the fastest
-_FREQUENCY_STEP = 1.5  # from one even chain to the next: the fit finds its way over a third
-_SWING_OVER_GAIN = 1.6  # of a lightly damped cart after a step
-_SMALLEST_ZETA = 0.005  # noise may well make a regressed damping negative
+_FREQUENCY_STEP = 1.5  # frequency ratio of successive chains. The fit converges from a third away
+_SWING_OVER_GAIN = 1.6  # range of a lightly damped cart after a step, over its static change
+_SMALLEST_ZETA = 0.005  # noise may make a regressed damping negative
 
 
 def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -> Chain | None:
     """Regress a chain from the windows, with bumps of `width` (s).
 
-    None where some cart's equation cannot be had (it needs the cart and its free neighbours
-    measured) or makes no sense (a negative mass or coupling).
+    The result is None if some cart's equation cannot be set up (the cart and its free neighbours
+    must be measured) or gives an impossible value (a negative mass or coupling).
     """
     n = bench.n
     m, c, k = np.zeros(n), np.zeros(n), np.zeros(n + 1)
@@ -69,17 +71,18 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -
 
 
 def _tells_of(window: FitWindow, cart: int, n: int) -> bool:
-    """Tell whether a cart's equation can be set up: it moves, and who pulls at it is known."""
+    """Return whether a cart's equation can be set up: it moves, and all forces on it are known."""
     near = {j for j in (cart - 1, cart, cart + 1) if 1 <= j <= n and j in window.free}
     driven = cart > 1 or window.drive_u is not None
     return driven and cart in window.free and near <= set(window.carts)
 
 
 def _equation(cart: int, bench: Bench, x: Array, force: Array) -> tuple[Array, Array]:
-    """Return the columns of m, c, the spring after (and for cart 1 that before), and the target.
+    """Return the columns of m, c and the springs of a cart's equation, and its right side.
 
-    `x` (3, n + 2, n_b) holds the moments with φ, φ', φ'' of walls and carts, `force` (n_b,) that
-    of the input.
+    The spring before the cart is a column only for cart 1; otherwise it is the right side. `x` (3,
+    n + 2, n_b) holds the moments of walls and carts with φ, φ', φ''; `force` (n_b,) is that of the
+    input.
     """
     stretch = x[0, cart] - x[0, cart - 1], x[0, cart] - x[0, cart + 1]
     columns = [x[2, cart], -x[1, cart], stretch[1] * bench.stiff[cart]]
@@ -92,8 +95,9 @@ def _equation(cart: int, bench: Bench, x: Array, force: Array) -> tuple[Array, A
 def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] | None:
     """Return the moments (3, n + 2, n_b) of the positions with φ, φ', φ'', and (n_b,) of the input.
 
-    φ = (τ (1 - τ))⁴, τ from 0 to 1 over the bump. None where the record is shorter than two
-    bumps or a bump holds too few samples. Walls, held and unmeasured carts are at zero.
+    φ = (τ (1 - τ))⁴, with τ from 0 to 1 over the bump. Walls, held and unmeasured carts are at
+    zero. The result is None if the record is shorter than two bumps or a bump holds too few
+    samples.
     """
     t, duration = window.t, window.t[-1]
     if duration < 2 * width or t.size * width / duration < _FEWEST_SAMPLES:
@@ -103,7 +107,7 @@ def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] 
     around = _around(t, starts, width)
     tau = np.clip((t[around] - starts[:, None]) / width, 0.0, 1.0)
     bumps = np.stack(bump(tau, span=width))
-    bumps *= np.gradient(t)[around]  # trapezoid rule: a bump ends smoothly, so it is accurate
+    bumps *= np.gradient(t)[around]  # trapezoid rule, accurate because a bump ends smoothly
     x = np.zeros((3, n + 2, count))
     for cart, y in zip(window.carts, window.y, strict=True):
         x[:, cart] = np.einsum("dbi,bi->db", bumps, y[around])
@@ -111,33 +115,33 @@ def _moments(window: FitWindow, *, n: int, width: float) -> tuple[Array, Array] 
     if window.drive_u is not None:
         around = _around(window.drive_t, starts, width)
         tau = np.clip((window.drive_t[around] - starts[:, None]) / width, 0.0, 1.0)
-        # ∫ φ: the input is held between samples, so its moment is exact.
+        # ∫ φ between samples. The input is held between samples, so its moment is exact.
         area = width * bump_integral(tau)
         force = np.sum(window.drive_u[around][:, :-1] * np.diff(area, axis=1), axis=1)
     return x, force
 
 
 def _around(t: Array, starts: Array, width: float) -> np.ndarray:
-    """Return indices (n_b, n_k) of the samples in each bump, one beyond it on either side."""
+    """Return indices (n_b, n_k) of the samples in each bump, and of one sample on either side."""
     first = np.searchsorted(t, starts, side="right") - 1
     last = np.searchsorted(t, starts + width, side="left")
     return np.minimum(first[:, None] + np.arange(np.max(last - first) + 1), t.size - 1)
 
 
 def even_chains(windows: Sequence[FitWindow], *, bench: Bench) -> list[Chain]:
-    """Return chains of equal carts, from slow to fast, with about the gain the records show.
+    """Return chains of equal carts, from slow to fast, with about the static gain of the records.
 
-    For records a regression cannot use, as where a cart was not measured. The range of
-    frequencies is what the records can hold.
+    They serve for records that a regression cannot use, such as one with an unmeasured cart. The
+    frequencies cover all that the records can show.
     """
     driven = [window for window in windows if window.drive_u is not None]
-    # The input may stand from the first sample on: it counts from zero.
+    # The input may be on from the first sample, so its range includes zero.
     ranges = [np.ptp(np.append(0.0, w.drive_u)) for w in driven if w.drive_u is not None]
     swing = np.median([np.ptp(w.y[0]) / u for w, u in zip(driven, ranges, strict=True)])
     slowest = 2 * np.pi * _FEWEST_PERIODS / max(w.t[-1] for w in driven)
     fastest = 2 * np.pi / (_FEWEST_PER_PERIOD * min(float(np.median(np.diff(w.t))) for w in driven))
     if not swing > 0 or fastest <= slowest or not bench.tied:
-        return []  # with no spring to a wall nothing sets a gain
+        return []  # without a spring to a wall there is no static gain
     ratio = fastest / slowest
     count = int(np.log(ratio) / np.log(_FREQUENCY_STEP)) + 1
     chains = []

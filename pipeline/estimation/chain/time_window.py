@@ -11,28 +11,30 @@ from pipeline.estimation.noise import local_noise, noise_beyond_rounding, roundi
 from pipeline.plant.linear.simulate import OVERSAMPLING, interpolate_band_limited
 from pipeline.results import Kind, Record
 
-# A free decay is used from where its largest swing has fallen by half: whatever released the
-# cart has let go of it by then.
+# A free decay is used after its largest swing has fallen to this share: by then the hand or stop
+# has let go of the cart.
 _RELEASED_BELOW = 0.5
 _FEWEST_SAMPLES = 16
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FitWindow:
-    """What the fit uses of a record.
+    """The part of a record that the fit uses.
 
     Attributes
     ----------
-    t : (n,) s, from 0; y : (p, n) positions of the free measured carts.
-    drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t; drive_u is
-        None where no input acts on a free cart.
-    carts, free : as in `Record`; the held carts are gone from both.
-    stated_sigma : (p,) standard error of a position, by encoder step and local noise.
-    sigma : (p,) standard error to weigh with; at least the stated one.
-    step : (p,) of the encoders, position units; 0 if unknown.
-    at_rest : True where the carts start at rest, else position and speed at t = 0 are unknown.
-    shared : (p,) of the readings before the input begins, the variance of the error they have in
-        common over sigma²: what an encoder rounds off while nothing moves is one error.
+    t : (n,) s, from 0.
+    y : (p, n) positions of the free measured carts.
+    drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t. Without an
+        input on
+        a free cart, drive_u is None.
+    carts, free : as in `Record`. The held carts are removed.
+    stated_sigma : (p,) standard error of a position, from encoder step and local noise.
+    sigma : (p,) standard error for the weights. At least the stated one.
+    step : (p,) encoder steps, position units. Zero if unknown.
+    at_rest : whether the carts start at rest. Otherwise position and speed at t = 0 are unknown.
+    shared : (p,) for the readings before the input begins, the variance of their common error over
+        sigma². While nothing moves, the encoder's rounding is one common error.
     """
 
     id: str
@@ -58,19 +60,21 @@ class FitWindow:
         return int(np.searchsorted(self.t, self.drive_t[np.flatnonzero(self.drive_u)[0]]))
 
     def rms_in_motion(self, residual: Array) -> Array:
-        """Return the root mean square (p,) of residuals (p, n) from the input's beginning on.
+        """Return the root mean square (p,) of residuals (p, n) after the input begins.
 
         At rest it is chance whether an encoder flickers between two counts or stays on one.
         """
         return np.sqrt(np.mean(residual[:, self.n_resting :] ** 2, axis=1))
 
     def informed(self, residual: Array, *, at_rest: bool) -> "FitWindow":
-        """Return the same with its errors as a fit has left them, nowhere below the stated ones.
+        """Return this window with its standard errors taken from the residuals of a fit.
+
+        No standard error falls below the stated one.
 
         Parameters
         ----------
         residual : (p, n) position units.
-        at_rest : the carts start at rest.
+        at_rest : whether the carts start at rest.
         """
         sigma = np.maximum(self.stated_sigma, np.sqrt(np.mean(residual**2, axis=1)))
         moving = self.rms_in_motion(residual)
@@ -82,20 +86,21 @@ class FitWindow:
         return replace(self, sigma=sigma, at_rest=at_rest, shared=shared)
 
     def thinned(self, most: int) -> "FitWindow":
-        """Return the same with at most twice as many samples as `most`; the input keeps all."""
+        """Return this window with at most 2 × `most` samples; the input keeps all."""
         step = max(self.t.size // most, 1)
         return replace(self, t=self.t[::step], y=self.y[:, ::step], stride=self.stride * step)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Misfit:
-    """How a chain misses one window, its nuisance parameters (start, encoder zeros) at their best.
+    """Residuals of a chain in one window, with the best start and encoder zeros.
 
     Attributes
     ----------
     residual : (p, n) model minus measured, over sigma.
-    jacobian : (n_p, p, n) of the residual by theta, with the nuisance parameters following.
-    n_nuisance : how many nuisance parameters were eliminated.
+    jacobian : (n_p, p, n) of the residual by theta. The nuisance parameters (start and encoder
+        zeros) are adjusted along.
+    n_nuisance : number of eliminated nuisance parameters.
     """
 
     residual: Array
@@ -106,8 +111,8 @@ class Misfit:
 def usable_segment(record: Record) -> slice:
     """Return the samples of a record that a linear chain can explain.
 
-    All of a driven record. Of a decay the part after the release: from where the largest swing
-    about the final rest has fallen to half, when hand and stop have surely let go.
+    For a driven record this is all of them. For a decay it is the part after the release. It begins
+    when the largest swing about the final rest has halved, as hand and stop have let go by then.
 
     Raises
     ------
@@ -119,7 +124,7 @@ def usable_segment(record: Record) -> slice:
     swing = np.max(np.abs(record.y - rest[:, None]), axis=0)
     if not np.max(swing) > 3 * np.max(record.resolution, initial=0.0):
         raise DataError(f"{record.id}: time fit needs a cart that moves, found none")
-    # Of the largest swing: the end of the hold.
+    # The hold ends when the swing falls below 95 % of its largest value.
     held_until = int(np.flatnonzero(swing >= 0.95 * swing.max())[-1])
     released = np.flatnonzero(swing[held_until:] < _RELEASED_BELOW * swing.max())
     start = held_until + int(released[0]) if released.size else record.t.size
@@ -136,8 +141,8 @@ def open_window(record: Record) -> FitWindow:
 
     Raises
     ------
-    DataError : no free cart was measured, one of them stands still (it sticks, or its encoder is
-        dead), or too few samples are usable.
+    DataError : no free cart was measured, a cart stands still (it sticks, or its encoder is dead),
+        or too few samples are usable.
     """
     carts = tuple(cart for cart in record.carts if cart in record.free)
     used = usable_segment(record)
@@ -155,12 +160,13 @@ def open_window(record: Record) -> FitWindow:
         drive_u = record.u[used]
         if record.hold == "band_limited":
             fine_t, fine_u = interpolate_band_limited(drive_t, drive_u)
-            # Held at the middle of a step eight times finer: errs by (omega dt / 8)² / 24.
+            # Holding the value at the middle of an eight times finer step errs by (omega dt / 8)² /
+            # 24.
             drive_t, stride = fine_t, OVERSAMPLING
             drive_u = np.append((fine_u[1:] + fine_u[:-1]) / 2, fine_u[-1])
     steps = np.array([record.encoder_step(cart) for cart in carts])
     noise = np.array([local_noise(t, position) for position in y])
-    # Of the motion: the error to assume where neither noise nor steps are seen.
+    # The error to assume if the data show neither noise nor encoder steps, from the motion's range.
     least = 1e-6 * float(np.max(np.ptp(y, axis=1)))
     sigma = np.maximum(np.maximum(noise, steps / np.sqrt(12)), least)
     return FitWindow(
@@ -183,9 +189,9 @@ def open_window(record: Record) -> FitWindow:
 def compare(window: FitWindow, modes: Modes) -> Misfit:
     """Compare a chain, given by its modes, with a window.
 
-    Start and encoder zeros enter linearly and are eliminated: residual and jacobian are projected
-    off them (variable projection in Kaufman's form, G. Golub & V. Pereyra, Inverse Problems 19,
-    2003, section 3).
+    Start and encoder zeros enter linearly and are eliminated: residual and Jacobian are projected
+    onto the rest of the space. This is variable projection in Kaufman's form (G. Golub & V.
+    Pereyra, Inverse Problems 19, 2003, section 3).
     """
     p, n = window.y.shape
     rows = [window.free.index(cart) for cart in window.carts]
@@ -200,11 +206,11 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
     scale[scale == 0] = 1.0
     Q, R = np.linalg.qr(local / scale)
     U, s, Vt = np.linalg.svd(R)
-    # Relative singular value below which two nuisance parameters are one.
+    # Below this relative singular value, two nuisance parameters have the same effect.
     kept = s > 1e-9 * s[0]
     basis = Q @ U[:, kept]
 
-    signals, d_weights = [], []  # modal signals, and their weights in the jacobian
+    signals, d_weights = [], []  # modal signals, and their weights in the Jacobian
     rest = -window.y
     if window.drive_u is not None:
         q, dq = drive_modes(modes.poles, window.drive_t, window.drive_u)
@@ -238,10 +244,10 @@ def compare(window: FitWindow, modes: Modes) -> Misfit:
 
 
 def weighed(values: Array, window: FitWindow) -> Array:
-    """Return values (…, p, n) over sigma, the mean of the first rest for no more than it tells.
+    """Return values (…, p, n) over sigma, with less weight on the mean of the first rest.
 
-    The whitening of n readings with an error in common: of their covariance 1 + shared, the
-    vector of ones has the eigenvalue 1 + n shared and all else one.
+    This whitens n readings that share an error. Their covariance is 1 + shared: along the vector of
+    ones its eigenvalue is 1 + n shared, in all other directions 1.
     """
     scaled = values / window.sigma[:, None]
     if np.any(window.shared) and (n := window.n_resting):

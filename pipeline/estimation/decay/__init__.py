@@ -1,1 +1,1 @@
-"""Damped sinusoids and dry friction in free motion: found and fitted."""
+"""Find and fit damped sinusoids and dry friction in free motion."""

@@ -1,7 +1,8 @@
-"""Dry friction in a free decay: the exact piecewise solution, fitted and tested.
+"""Dry friction in a free decay: fit and test its exact piecewise solution.
 
-With viscous damping and dry friction F the cart swings about d = F/k to one side while it moves one
-way, and about d to the other side while it moves back. So A_{j+1} = rho A_j - (1 + rho) d.
+With viscous damping and dry friction F, the cart swings about a point d = F/k to one side while it
+moves one way, and about a point d to the other side on the way back. So successive amplitudes
+follow A_{j+1} = rho A_j - (1 + rho) d.
 
 Reference: B. F. Feeny and J. W. Liang, J. Sound and Vibration 195 (1996) 149-154.
 """
@@ -19,15 +20,15 @@ from pipeline.estimation.decay.ringing import Ringing
 from pipeline.estimation.decay.separable import fit_separable
 from pipeline.results import FrictionTest
 
-_THRESHOLD = 10.8  # F(1, many) exceeds this once in a thousand decays without friction
+_THRESHOLD = 10.8  # the F-statistic of 1 in 1000 decays without friction is larger
 _UNKNOWNS = 7
-_MOST_LOSS = 50.0  # of an exponent during the fit: larger ones overflow
-_LESS_DAMPING = (1.0, 0.3)  # starts: shares of the fitted damping that are assumed to be friction
+_MOST_LOSS = 50.0  # bound of an exponent during the fit, against overflow
+_LESS_DAMPING = (1.0, 0.3)  # starts: shares of the fitted damping to keep, the rest being friction
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FrictionFit:
-    """The test's outcome and the decay with friction, as a function of time."""
+    """The outcome of the friction test, and the decay with friction as a function of time."""
 
     test: FrictionTest
     model: Callable[[Array], Array]
@@ -45,9 +46,10 @@ def fit_friction(
     ----------
     t, y : (n,) one free decay.
     viscous : the fit without friction, to the same samples.
-    turning : s, an approximate turning point; `falling`: y decreases after it.
-    floor : the least significant residual (root-mean-square); a friction band within it is not
-        called present.
+    turning : time of a turning point, s. Approximate.
+    falling : whether y decreases after it.
+    floor : the smallest significant residual (root-mean-square). A smaller friction band does not
+        count as present.
 
     Returns
     -------
@@ -57,7 +59,8 @@ def fit_friction(
     if t.size <= _UNKNOWNS + 1 or pole.imag <= 0:
         return None
     cut = partial(_Swings.at, direction=-1.0 if falling else 1.0)
-    # Up to 1.5 times the noise without friction, there is little of it, if any.
+    # If the viscous fit already leaves at most 1.5 times the noise, there is little friction or
+    # none.
     fits = [
         fit_separable(
             y,
@@ -92,7 +95,7 @@ def fit_friction(
 
 
 def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
-    """Return (7, 7) the inverse of J'J, J by the nonlinear, then the linear unknowns."""
+    """Return the inverse (7, 7) of J'J; J has the nonlinear unknowns first."""
     full = np.column_stack([fitted.derivatives(linear), fitted.columns])
     size = np.maximum(np.linalg.norm(full, axis=0), np.finfo(float).tiny)
     inverse = np.linalg.pinv(np.linalg.qr(full / size, mode="r")) / size[:, None]
@@ -101,19 +104,21 @@ def _inverse_normal(fitted: "_Swings", linear: Array) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Swings:
-    """A decay, cut into half cycles at its turning points; those before the first one count too.
+    """A decay cut into half cycles at its turning points, also before the turning point of the fit.
 
-    In each, y = rest + drift + (amplitude kept + friction pushed) swing - friction side, with the
-    friction band d on the side the cart moves to.
+    In each half cycle, y = rest + drift + (amplitude kept + friction pushed) swing - friction side.
+    Friction is the friction band d; it lies on the side that the cart moves to.
 
     Attributes
     ----------
-    p : turning point s, decay rate and damped frequency rad/s.
-    since : (n,) s since the turning point; tau (n,) s since the half cycle began.
-    swing : (n,) from 1 at the half cycle's start to -1 at its end; sine (n,): its quadrature.
-    cycle : (n,) the half cycle of each sample.
-    number : (n_cycles,) their numbers, 0 after the turning point.
-    kept, pushed, side : (n_cycles,) see above.
+    p : turning point in s, decay rate and damped frequency in rad/s.
+    since : (n,) s since the turning point.
+    tau : (n,) s since the half cycle began.
+    swing : (n,) a cosine. It goes from 1 at the start of the half cycle to -1 at its end.
+    sine : (n,) the quadrature of `swing`.
+    cycle : (n,) index of the half cycle. One for each sample.
+    number : (n_cycles,) numbers of the half cycles. The one after the turning point has 0.
+    kept, pushed, side : (n_cycles,) see the equation above.
     """
 
     p: Array
@@ -129,7 +134,7 @@ class _Swings:
 
     @classmethod
     def at(cls, t: Array, p: Array, *, direction: float) -> "_Swings":
-        """Cut the samples `t`; the cart moves to `direction` (1, -1) after the turning point."""
+        """Cut the samples `t`; after the turning point the cart moves in `direction` (1 or -1)."""
         turning, decay, omega_d = p
         since, half = t - turning, np.pi / omega_d
         k = np.floor(since / half)
@@ -157,7 +162,7 @@ class _Swings:
 
     @property
     def columns(self) -> Array:
-        """Return the factors of rest point, drift, amplitude and friction band, (n, 4)."""
+        """The factors of rest point, drift, amplitude and friction band, (n, 4)."""
         kept, pushed, side = (part[self.cycle] for part in (self.kept, self.pushed, self.side))
         one = np.ones_like(self.tau)
         return np.array([one, self.since, kept * self.swing, pushed * self.swing - side]).T
@@ -170,7 +175,7 @@ class _Swings:
         per_tau = -(decay**2 + omega_d**2) / omega_d * sine
         per_decay = sine / omega_d - tau * swing
         per_omega_d = ratio * (tau * swing - sine / omega_d) - (1 + ratio**2) * tau * sine
-        # The sizes of the half cycles by their logarithmic loss, decay pi / omega_d.
+        # The sizes of the half cycles depend on the logarithmic loss, pi decay / omega_d.
         rho, number = np.exp(-np.clip(np.pi * ratio, -_MOST_LOSS, _MOST_LOSS)), self.number
         geometric = (self.pushed / self.side - 1) / (1 + rho)
         per_loss = (

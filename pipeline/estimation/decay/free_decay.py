@@ -12,17 +12,18 @@ from pipeline.estimation.decay.ringing import Ringing, fit_ringing
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record
 
-# The ratio of residual to noise below which a model is complete: with 50 samples chance moves it by
+# Ratio of residual to noise below which a model is complete. With 50 samples, chance changes it by
 # a tenth.
 _ADEQUATE = 1.5
-# Swings are counted in grains: the encoder step, or the step that would round as coarsely as the
-# noise.
+# Smallest swing to count, in grains. A grain is the encoder step, or the step whose rounding error
+# equals the noise if that is larger.
 _PROMINENCE = 6.0
 _SMALLEST_SWING = 8.0
-_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points attributed to the hand, if enough others remain
+_BASE_SKIPS, _BASE_NEEDS = 2, 4  # turning points that may be the hand, if enough others remain
 _MIN_SAMPLES = 12
-# Extended backwards, a fit may be off by this many of its own residuals. A share of the amplitude
-# is added while it rests on the smaller swings only, or if its residual exceeds the noise anyway.
+# Continued back in time, a fit may be off by this many of its own residuals. A share of the
+# amplitude is added while only the smaller swings were fitted, or if the residual exceeds the noise
+# anyway.
 _BACK_SIGMAS = 4.0
 _BACK_SHARES = (0.05, 0.0, 0.0)
 _REAL_SHARE = 0.15
@@ -31,7 +32,7 @@ _RELEASE_MARGIN = 1 / 40  # of a period, in which the fingers leave the cart
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stretch:
-    """Samples [first, stop) with constant input; its level, or None without an input."""
+    """Samples [first, stop) with constant input; `level` is the input, or None without one."""
 
     first: int
     stop: int
@@ -63,7 +64,7 @@ class FreeDecay:
 def find_decay(record: Record, *, cart: int, size: float) -> tuple[Stretch, list[int]]:
     """Return the turning points of the record's largest free decay, and the stretch it is in.
 
-    `size` is the smallest significant change. The part without input is preferred.
+    `size` is the smallest significant change. Parts without input are preferred.
 
     Raises
     ------
@@ -96,17 +97,17 @@ def _stretches(record: Record) -> list[list[Stretch]]:
         if b - a >= _MIN_SAMPLES
     ]
     largest = float(np.max(np.abs(u)))
-    # Of the largest input.
+    # Below 2 % of the largest input, the input counts as zero.
     off = [part for part in parts if abs(part.level or 0.0) <= 0.02 * largest]
     on = [part for part in parts if part not in off]
     return [off, on, [whole]] if record.kind == "decay" else [off, on]
 
 
 def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[int]:
-    """Return the turning points of the largest run of decreasing swings in equal times."""
+    """Return the turning points of the largest run of decreasing swings at regular times."""
     part = y[stretch.first : stretch.stop]
-    # The first is where the stretch begins, no turning point. The last is where the cart came to
-    # rest, and counts if it did so in time.
+    # The first one is the start of the stretch, not a turning point. The last one is where the cart
+    # came to rest; it counts if the cart did so in time.
     turning = [i + stretch.first for i in extrema(part, prominence=_PROMINENCE * size)][1:]
     swings = np.abs(np.diff(y[turning]))
     times = np.diff(t[turning])
@@ -114,8 +115,8 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
     start = 0
     while start < swings.size:
         end = start + 1
-        # A swing may exceed the one before by this factor. For times, of the intervals so far; a
-        # hand is not more regular.
+        # A swing may exceed the one before by this factor. The second factor bounds each interval
+        # by the intervals so far; motion by hand is not regular enough.
         while (
             end < swings.size
             and _SMALLEST_SWING * size <= swings[end] <= 1.02 * swings[end - 1]
@@ -128,7 +129,7 @@ def _decaying_run(t: Array, y: Array, stretch: Stretch, *, size: float) -> list[
 
 
 def _score(y: Array, run: list[int]) -> float:
-    """Rank runs: first by the kind of their number of swings (one, several), then by size."""
+    """Rank a run: first by whether it has one swing or several, then by size."""
     if len(run) < 2:
         return 0.0
     travelled = float(np.sum(np.abs(np.diff(y[run]))))
@@ -138,24 +139,24 @@ def _score(y: Array, run: list[int]) -> float:
 def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: float) -> FreeDecay:
     """Fit the free decay from its release to its last turning point.
 
-    The later swings are fitted first and extended back over the earlier ones as long as they agree.
-    This separates the hand from the cart. If not even the later swings fit to the noise (real
-    friction is not ideal), all of them count.
+    The later swings are fitted first. The fit is then extended back over the earlier ones as long
+    as they agree. This separates the hand from the cart. If not even the later swings fit to the
+    noise (real friction is not ideal), all swings count.
 
     Parameters
     ----------
     run : the turning points.
-    floor : the least significant residual (root-mean-square).
+    floor : the smallest significant residual (root-mean-square).
     """
     interval = float(np.median(np.diff(t[run])))
     stop = run[-1] + 1
-    # With fewer, the rest after them is needed too.
+    # With fewer turning points, the fit also needs the rest that follows.
     if len(run) < 5:
         stop = int(np.searchsorted(t[: stretch.stop], t[run[-1]] + 2 * interval))
     pole = complex(-np.log(_ratio(y, run)) / interval, np.pi / interval)
 
     def fit_from(first: int, *, near: complex = pole, last: bool = False) -> FreeDecay:
-        """Fit with dry friction if the residual of the viscous fit exceeds the noise."""
+        """Fit with dry friction only if the viscous fit's residual exceeds the noise."""
         own = slice(first, stop)
         fit = fit_ringing(t[own], y[own], poles=np.array([near]), drift=True)
         friction = None
@@ -177,7 +178,8 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
     latest = min(run[min(_BASE_SKIPS, max(len(run) - _BASE_NEEDS, 0))], enough)
     decay = fit_from(latest)
     if decay.rms(t, y) > _ADEQUATE * floor:
-        # The start of a real cart's motion is not part of the model: begin at its first passage.
+        # The model does not cover the start of a real cart's motion, so begin at the first passage
+        # through rest.
         decay = fit_from(min(run[0], enough))
         passage = int(np.searchsorted(t, t[run[0]] - interval / 2))
         held = _carried_back(t, y, decay, latest=decay.first, share=_REAL_SHARE, floor=floor)
@@ -197,7 +199,7 @@ def fit_decay(t: Array, y: Array, *, stretch: Stretch, run: list[int], floor: fl
 def _carried_back(
     t: Array, y: Array, decay: FreeDecay, *, latest: int, share: float, floor: float
 ) -> int:
-    """Return the first sample, not after `latest`, from which the decay's model holds."""
+    """Return the first sample from which the decay's model holds, at most `latest`."""
     head = slice(decay.stretch.first, latest)
     size = abs(decay.fit.amplitudes[0]) * decay.fit.growth(t[head])[0]
     tolerance = _BACK_SIGMAS * max(decay.rms(t, y), floor) + share * size
@@ -206,6 +208,6 @@ def _carried_back(
 
 
 def _ratio(y: Array, run: list[int]) -> float:
-    """Return the mean ratio of one swing to the one before; for two turning points a guess."""
+    """Return the mean ratio of a swing to the one before; a guess for only two turning points."""
     swings = np.abs(np.diff(y[run]))
     return float((swings[-1] / swings[0]) ** (1 / (swings.size - 1))) if swings.size > 1 else 0.3

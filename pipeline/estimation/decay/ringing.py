@@ -1,4 +1,4 @@
-"""Damped sinusoids about a level: the least-squares fit that decays and steps share."""
+"""Least-squares fit of damped sinusoids about a level, for decays and steps."""
 
 from dataclasses import dataclass
 
@@ -9,19 +9,21 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.decay.separable import fit_separable
 
 _MAX_EVALUATIONS = 100
-_MOST_GROWTH = 50.0  # of an exponent: larger ones overflow
+_MOST_GROWTH = 50.0  # bound of an exponent, against overflow
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ringing:
-    """y = level + slope (t - t0) + sum of Re(amplitude exp(pole (t - t0))).
+    """A fit y = level + slope (t - t0) + sum of Re(amplitude exp(pole (t - t0))).
 
     Attributes
     ----------
-    poles : (n_modes,) upper half plane, rad/s; `amplitudes` (n_modes,) complex, at `t0`.
-    covariance : of (level, slope, decay rates, frequencies), allowing for a correlated residual;
-        the slope's row is zero if it was not fitted.
-    rms : of the residual; `converged` is False if the fit ran out of steps.
+    poles : (n_modes,) in the upper half plane, rad/s.
+    amplitudes : (n_modes,) complex, at `t0`.
+    covariance : of (level, slope, decay rates, frequencies). Allows for a correlated residual. The
+        row of the slope is zero if it was not fitted.
+    rms : root-mean-square of the residual.
+    converged : False if the fit ran out of steps.
     """
 
     t0: float
@@ -40,14 +42,14 @@ class Ringing:
         return self.level + self.slope * tau + (self.amplitudes[:, None] * waves).real.sum(0)
 
     def growth(self, t: Array) -> Array:
-        """Return the size of each mode relative to that at `t0`, (n_modes, n); at most e^50."""
+        """Return the size of each mode relative to its size at `t0`, (n_modes, n); at most e^50."""
         return np.exp(np.minimum(self.poles.real[:, None] * (t - self.t0), _MOST_GROWTH))
 
 
 def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ringing:
-    """Fit damped sinusoids, a level and (with `drift`) a straight drift, starting from these poles.
+    """Fit damped sinusoids, a level and (with `drift`) a linear drift, starting from given poles.
 
-    The level, slope and amplitudes are linear, so that only decay rates and frequencies are
+    The problem is linear in level, slope and amplitudes, so only decay rates and frequencies are
     searched.
 
     Parameters
@@ -59,7 +61,7 @@ def fit_ringing(t: Array, y: Array, *, poles: ComplexArray, drift: bool) -> Ring
     tau = scale * (t - t[0])
     level = np.array([np.ones_like(t), t - t[0]] if drift else [np.ones_like(t)])
     k = len(level)
-    # Of the frequency: the least damping of a start.
+    # A start has at least this decay rate, as a share of the frequency.
     fit = fit_separable(
         y,
         lambda p: _Waves.at(tau, p, level=level),
@@ -101,7 +103,7 @@ class _Waves:
 
     @classmethod
     def at(cls, tau: Array, p: Array, *, level: Array) -> "_Waves":
-        """Return those with decay rates and frequencies p (2 n_modes,)."""
+        """Return the waves with decay rates and frequencies p (2 n_modes,)."""
         decay, frequency = p.reshape(2, -1, 1)
         growth = np.minimum(-decay * tau, _MOST_GROWTH)
         return cls(tau=tau, level=level, waves=np.exp(growth + 1j * frequency * tau))
@@ -119,9 +121,9 @@ class _Waves:
 def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     """Return rough poles of `n_modes` damped sinusoids about a level, upper half plane, rad/s.
 
-    Matrix pencil on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38, 1990); the
-    level is one more pole, near zero. Fewer poles come back where the data do not oscillate in
-    so many modes.
+    Uses the matrix pencil method on evenly interpolated samples (Hua & Sarkar, IEEE Trans. ASSP 38,
+    1990). The level appears as one more pole, near zero. Fewer poles are returned if the data do
+    not oscillate in so many modes.
     """
     # The matrix pencil only starts the fit; more samples would only cost time.
     n = min(t.size, 300)
@@ -130,5 +132,5 @@ def find_poles(t: Array, y: Array, *, n_modes: int) -> ComplexArray:
     rows = np.linalg.svd(hankel, full_matrices=False)[2][: 2 * n_modes + 1].T
     z = np.linalg.eigvals(np.linalg.lstsq(rows[:-1], rows[1:], rcond=None)[0])
     s = np.log(z.astype(np.complex128)) / (grid[1] - grid[0])
-    # Imaginary part over size: below this a pole is real except for rounding.
+    # Below this ratio of imaginary part to size, a pole is real except for rounding.
     return s[s.imag > 1e-3 * np.abs(s)]

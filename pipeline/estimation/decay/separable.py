@@ -1,4 +1,4 @@
-"""Least squares in which most unknowns are linear: those are solved for at every step.
+"""Least squares in which most unknowns are linear: these are solved for at every step.
 
 Reference: G. H. Golub and V. Pereyra, SIAM J. Numer. Anal. 10 (1973) 413-432, in Kaufman's form.
 """
@@ -13,12 +13,12 @@ from scipy.optimize import leastsq
 from pipeline.arrays import Array
 from pipeline.estimation.minimise import evaluated_once
 
-_PRECISION = 1e-8  # relative: of the sum of squares, of p, and of its slope
+_PRECISION = 1e-8  # relative tolerance of the sum of squares, of p, and of the slope
 _FOUND = (1, 2, 3, 4)  # MINPACK's codes for convergence
 
 
 class SeparableModel(Protocol):
-    """A model at some values of its nonlinear unknowns."""
+    """A model at given values of its nonlinear unknowns."""
 
     @property
     def columns(self) -> Array:
@@ -34,7 +34,7 @@ class SeparableModel(Protocol):
 class SeparableFit:
     """The nonlinear unknowns p (n_p,) and the linear ones at the least residual.
 
-    `residual` (n,) is model - y; `converged` False where the fit ran out of steps.
+    `residual` (n,) is model - y; `converged` is False if the fit ran out of steps.
     """
 
     p: Array
@@ -51,15 +51,18 @@ def fit_separable(
     max_evaluations: int,
     scale: Array | float = 1.0,
 ) -> SeparableFit:
-    """Fit a model of p to y (n,) from `start` (n_p,) on; `scale` is the size of p."""
+    """Fit a model with nonlinear unknowns p to y (n,), starting from `start` (n_p,).
+
+    `scale` is the typical size of p.
+    """
 
     def jacobian(point: _Point) -> Array:
         J = point.model.derivatives(point.linear)
         return J - point.basis @ (point.basis.T @ J)
 
     at = evaluated_once(lambda p: _solved(y, model(p)))
-    # `least_squares` runs the same MINPACK routine, but takes as long again to prepare each call.
-    with np.errstate(over="ignore"):  # in its covariance of p, which is not used
+    # `least_squares` runs the same MINPACK routine, but needs as long again to prepare each call.
+    with np.errstate(over="ignore"):  # from the covariance of p, which is not used
         p, *_, status = leastsq(
             lambda p: at(p).residual,
             start,
@@ -77,7 +80,7 @@ def fit_separable(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Point:
-    """The model at some p (n_p,), with its linear unknowns solved; `basis` spans the columns."""
+    """The model at some p (n_p,) with its best linear unknowns; `basis` spans the columns."""
 
     model: SeparableModel
     basis: Array
@@ -86,10 +89,10 @@ class _Point:
 
 
 def _solved(y: Array, model: SeparableModel) -> _Point:
-    """Return the model with the linear unknowns of least residual."""
+    """Return the model with the linear unknowns that give the least residual."""
     X = model.columns
     basis, sizes, turn = np.linalg.svd(X, full_matrices=False)
-    # Columns that are nearly equal, far from the fit, share their contribution.
+    # Far from the solution, columns may be nearly equal; these share their contribution.
     apart = np.maximum(sizes, np.finfo(np.float64).eps * len(X) * sizes[0])
     linear = (y @ basis / apart) @ turn
     return _Point(model=model, basis=basis, linear=linear, residual=X @ linear - y)
