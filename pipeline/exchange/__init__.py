@@ -1,1 +1,1 @@
-"""An analysis as people go on with it elsewhere: tables for pandas, variables for MATLAB."""
+"""Export an analysis for other programs: tables for pandas, variables for MATLAB, models."""

@@ -21,24 +21,24 @@ from pipeline.results import (
 )
 
 if TYPE_CHECKING:
-    import pandas as pd  # a fifth of a second: imported where it is used
+    import pandas as pd  # takes a fifth of a second, so it is imported on use
 
 
 def parameters(analysis: Analysis) -> "pd.DataFrame":
-    """Return initial and final estimates, one row a parameter; the index is its name."""
+    """Return initial and final estimates, one row per parameter; the index is its name."""
     frame = _frame(_rows(analysis.rows), keys(ParameterRow), analysis=analysis)
     frame["consistent"] = frame["consistent"].astype("boolean")  # missing values stay missing
     return frame.set_axis(frame["name"].to_list(), axis="index")
 
 
 def checks(analysis: Analysis) -> "pd.DataFrame":
-    """Return one row a consistency check; the index is its id."""
+    """Return the consistency checks, one row per check; the index is its id."""
     frame = _frame(_rows(analysis.checks), keys(Check), analysis=analysis)
     return frame.set_axis(frame["id"].to_list(), axis="index")
 
 
 def decays(analysis: Analysis) -> "pd.DataFrame":
-    """Return one row a decay; the friction test is in columns `friction_…`."""
+    """Return the decays, one row each; the friction test is in columns `friction_…`."""
     rows = [
         row | {f"friction_{key}": value for key, value in (row["friction"] or {}).items()}
         for row in _rows(analysis.log_decrements)
@@ -49,7 +49,7 @@ def decays(analysis: Analysis) -> "pd.DataFrame":
 
 
 def steps(analysis: Analysis) -> "pd.DataFrame":
-    """Return one row a step and cart: its static gain."""
+    """Return the static gains, one row per step recording and cart."""
     rows = []
     for row in _rows(analysis.step_gains):
         low, high = row["interval"] or (None, None)
@@ -59,12 +59,12 @@ def steps(analysis: Analysis) -> "pd.DataFrame":
 
 
 def dwells(analysis: Analysis) -> "pd.DataFrame":
-    """Return one row a sine dwell and cart: amplitudes, their ratio, the phase."""
+    """Return the sine dwells, one row per dwell and cart: amplitudes, their ratio, the phase."""
     return _frame(_rows(analysis.sine_points), keys(SinePoint), analysis=analysis)
 
 
 def frequency_response(analysis: Analysis) -> "pd.DataFrame":
-    """Return one row a cart and frequency: the points of the Bode plots."""
+    """Return the points of the Bode plots, one row per cart and frequency."""
     rows = []
     for values in _rows(analysis.frequency_responses):
         for i in range(len(values["omega"])):
@@ -73,13 +73,13 @@ def frequency_response(analysis: Analysis) -> "pd.DataFrame":
 
 
 def tables(analysis: Analysis) -> "dict[str, pd.DataFrame]":
-    """Return every table of results by its name; the records are not among them."""
+    """Return every table of results by its name, without the records."""
     made = (parameters, checks, decays, steps, dwells, frequency_response)
     return {make.__name__: make(analysis) for make in made}
 
 
 def record_frame(record: Record, *, analysis: Analysis) -> "pd.DataFrame":
-    """Return one record: the index is `time`, the columns those of `record_series`."""
+    """Return one record as a table; the index is `time`, the columns are as in `record_series`."""
     import pandas as pd
 
     series, units = record_series(record), analysis.bench.units
@@ -91,21 +91,21 @@ def record_frame(record: Record, *, analysis: Analysis) -> "pd.DataFrame":
 
 
 def record_series(record: Record) -> dict[str, Array]:
-    """Return `time`, `u` and `reference` where there are any, and positions `x1`, …: (n,) each."""
+    """Return arrays (n,): `time`, `u` and `reference` if the record has them, and `x1`, …."""
     series = {"time": record.t, "u": record.u, "reference": record.reference}
     positions = {f"x{cart}": record.position(cart) for cart in record.carts}
     return {name: values for name, values in series.items() if values is not None} | positions
 
 
 def _rows(results: Sequence[object]) -> list[dict[str, Any]]:
-    """Return what the results write, with all the digits that they have."""
+    """Return the written members of the results, with all digits."""
     return [plain(one, digits=17) for one in results]
 
 
 def _frame(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[str], *, analysis: Analysis
 ) -> "pd.DataFrame":
-    """Return the rows as a table whose columns are there, and numbers, also where it is empty."""
+    """Return the rows as a table; its columns and number types exist even if there are no rows."""
     import pandas as pd
 
     frame = pd.DataFrame(rows, columns=list(columns))

@@ -10,21 +10,21 @@ from pipeline.json_files import keys, plain
 from pipeline.results import Analysis
 
 if TYPE_CHECKING:
-    import pandas as pd  # a fifth of a second: imported where it is used
+    import pandas as pd  # takes a fifth of a second, so it is imported on use
 
 _PARAMETER = ("effect", "cart", "spring", "parameter", "value", "std", "unit")
 _LEFT = ("experiment", "time", "cart", "position", "velocity", "input", "force")
 
 
 def effects(gap: Gap) -> "pd.DataFrame":
-    """Return one row an effect, in the order found."""
+    """Return the effects in the order found, one row each."""
     import pandas as pd
 
     return pd.DataFrame(plain(gap.effects, digits=17), columns=keys(FoundEffect))
 
 
 def parameters(gap: Gap) -> "pd.DataFrame":
-    """Return one row a parameter; `cart` or `spring` is where its effect acts."""
+    """Return the effects' parameters, one row each; `cart` or `spring` is where the effect acts."""
     import pandas as pd
 
     rows = [
@@ -54,7 +54,7 @@ def simulated(gap: Gap, experiment: str) -> "pd.DataFrame":
 
 
 def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
-    """Return the force that the model does not explain, one row a cart and short window."""
+    """Return the force that the model does not explain, one row per cart and short window."""
     import pandas as pd
 
     parts = [
@@ -74,7 +74,7 @@ def residual(gap: Gap, *, analysis: Analysis) -> "pd.DataFrame":
     frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=list(_LEFT))
     position, drive = analysis.bench.units.position, analysis.bench.units.input
     driven = any(np.any(one.u) for one in gap.left_forces)
-    force = drive if driven else f"{position}/s^2"  # the first mass is one
+    force = drive if driven else f"{position}/s^2"  # without an input, mass 1 is the unit
     frame.attrs["units"] = {
         "time": "s", "position": position, "velocity": f"{position}/s", "input": drive,
         "force": force,

@@ -1,6 +1,6 @@
-"""An analysis saved for other programs: `tables/*.csv`, and `results.mat` for MATLAB.
+"""Save an analysis for other programs: `tables/*.csv`, and `results.mat` for MATLAB.
 
-Same input, same bytes.
+The same analysis always gives the same bytes.
 """
 
 import re
@@ -20,8 +20,8 @@ from pipeline.results import Analysis, Estimate, FrequencyResponse
 if TYPE_CHECKING:
     import pandas as pd
 
-_HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own holds the time of day
-_LONGEST_NAME = 63  # of a variable in MATLAB
+_HEADER = b"MATLAB 5.0 MAT-file".ljust(116)  # scipy's own header contains the time
+_LONGEST_NAME = 63  # characters in the name of a MATLAB variable
 _RESERVED = set(
     "break case catch classdef continue else elseif end for function global if otherwise parfor "
     "persistent return spmd switch try while".split()
@@ -29,7 +29,7 @@ _RESERVED = set(
 
 
 def save_tables(analysis: Analysis, out: Path) -> None:
-    """Write one `tables/*.csv` a table of results, and `results.mat`, into the folder `out`."""
+    """Write each table of results as `tables/*.csv`, and `results.mat`, into the folder `out`."""
     folder = own_folder(out, "tables")
     folder.mkdir(parents=True, exist_ok=True)
     for name, frame in tables(analysis).items():
@@ -38,7 +38,7 @@ def save_tables(analysis: Analysis, out: Path) -> None:
 
 
 def _csv(frame: "pd.DataFrame") -> str:
-    """Return the table as text; a heading holds its column's unit in brackets."""
+    """Return the table as text; each heading ends with the column's unit in brackets."""
     units = frame.attrs["units"]
     head = [f"{name} [{units[name]}]" if name in units else name for name in frame.columns]
     rows = frame.astype(object).where(frame.notna(), None)
@@ -48,10 +48,16 @@ def _csv(frame: "pd.DataFrame") -> str:
 def matlab_file(analysis: Analysis) -> bytes:
     """Return a MAT-file (level 5) whose variables are named as in `results.json`.
 
-    `parameters.initial.K_1`, `parameters.initial_std.K_1`, the same for `final`; `A`, `B`, `C`,
-    `D`, and `m`, `c`, `k` of the chain; `gains`, `prefilter`, `sample_time`, `margins`; one
-    structure per cart in `frequency_response`; `records.ID` with `time`, `u`, `x1`, …; `units`. A
-    number that could not be computed is NaN; a result that was not found at all is left out.
+    The variables are:
+
+    - `parameters.initial.K_1`, `parameters.initial_std.K_1`, … and the same for `final`.
+    - `A`, `B`, `C`, `D`, and `m`, `c`, `k` of the chain.
+    - `gains`, `prefilter`, `sample_time`, `margins`.
+    - `frequency_response`. One structure per cart.
+    - `records.ID` with `time`, `u`, `x1`, ….
+    - `units`.
+
+    A number that could not be computed is NaN. A result that was not found is left out.
     """
     chain, design, bench = analysis.chain, analysis.feedback, analysis.bench
     variables: dict[str, Any] = {
@@ -96,8 +102,8 @@ def _std(estimate: Estimate | None) -> float:
 
 
 def _responses(responses: Sequence[FrequencyResponse]) -> Any:
-    """Return an array of structures (1, n), as MATLAB has them; a phase not known is empty."""
-    names = keys(FrequencyResponse)[:-1]  # their source is no number
+    """Return a MATLAB array of structures (1, n); an unknown phase is an empty array."""
+    names = keys(FrequencyResponse)[:-1]  # without `source`, which is not a number
     array = np.empty((1, len(responses)), dtype=[(name, object) for name in names])
     for i, response in enumerate(responses):
         values = (getattr(response, name) for name in names)
@@ -106,7 +112,7 @@ def _responses(responses: Sequence[FrequencyResponse]) -> Any:
 
 
 def _named(records: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the records under names that MATLAB takes, one each: `step-1` as `step_1`."""
+    """Return the records under unique names that MATLAB allows: `step-1` as `step_1`."""
     named: dict[str, Any] = {}
     for id_, record in records.items():
         plain = re.sub(r"\W", "_", id_, flags=re.ASCII)

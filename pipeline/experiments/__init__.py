@@ -1,1 +1,1 @@
-"""Choosing experiments: what to record, with which controller, in which size."""
+"""Choose experiments: what to record, with which controller and which amplitude."""

@@ -1,4 +1,4 @@
-"""A recording that a person wants, described by a few numbers."""
+"""Make a recording for the plan from the few numbers that a person types."""
 
 from dataclasses import dataclass
 from math import ceil, floor
@@ -21,10 +21,10 @@ _WAVES: dict[RecordingKind, Literal["square", "chirp", "sine"]] = {
     "sine": "sine",
 }
 _SHORTEST = 1.0  # s
-# s; three carts at 1 kHz take 1 s and 0.5 GB to evaluate, 600 s take 20 s and 2 GB
+# s. With three carts at 1 kHz, 120 s take 1 s and 0.5 GB to evaluate, 600 s take 20 s and 2 GB.
 _LONGEST = 120.0
-_ROUNDING = 1e-9  # relative: 100 s at 0.07 Hz are 7 periods, however the product is rounded
-# The numbers that define a recording of each kind, as keys of plan.toml, and their other names.
+_ROUNDING = 1e-9  # relative. 100 s at 0.07 Hz are 7 periods, however the product is rounded
+# The numbers that define a recording of each kind, as keys of plan.toml, and the words for them.
 NEEDED: dict[RecordingKind, tuple[str, ...]] = {
     "step": ("amplitude",),
     "sweep": ("amplitude", "frequency", "frequency_end"),
@@ -40,9 +40,10 @@ class WantedRecording:
 
     Attributes
     ----------
-    seconds : duration, 1 to 120; rounded to whole periods of a dwell or sweep.
+    seconds : duration, 1 to 120. Rounded to whole periods of a dwell or sweep.
     amplitude : input units.
-    frequency, frequency_end : Hz, of a dwell, or start and end of a sweep.
+    frequency : of a dwell, or at the start of a sweep. Hz.
+    frequency_end : at the end of a sweep. Hz.
     cart : the released cart of a decay.
     """
 
@@ -55,7 +56,9 @@ class WantedRecording:
 
 
 def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submission) -> Recording:
-    """Return the recording, with all carts free unless one is released, and the plan's rest time.
+    """Return the recording; all carts are free unless one is released by hand.
+
+    The rest before it is as long as before the plan's other driven recordings.
 
     Raises
     ------
@@ -88,7 +91,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
             frequency=wanted.frequency if kind != "step" else cycles / seconds,
             frequency_end=wanted.frequency_end if kind == "sweep" else None,
             cycles=cycles,
-            settle=driven[-1] if driven else 5.0,  # s, if the plan has no rest time
+            settle=driven[-1] if driven else 5.0,  # s. Used if the plan has no rest time
         )
     for key, what in recording_problems(made, plan.limits, submission.system):
         raise ConfigError(f"{TYPED.get(key, key)}: {what}")
@@ -96,7 +99,7 @@ def make_recording(wanted: WantedRecording, *, plan: Plan, submission: Submissio
 
 
 def _count_periods(seconds: float, frequency: float) -> int:
-    """Return the number of whole periods of this length or a little more, within the limit."""
+    """Return how many whole periods last `seconds` or slightly longer, within the limit."""
     most = floor(_LONGEST * frequency * (1 + _ROUNDING))
     if not most:
         raise ConfigError(
@@ -107,7 +110,7 @@ def _count_periods(seconds: float, frequency: float) -> int:
 
 
 def add_recording(folder: Path, recording: Recording) -> Recording:
-    """Put a recording at the end of a submission's plan; return it with the id it has there.
+    """Append a recording to a submission's plan; return it with the id that it gets there.
 
     Raises
     ------

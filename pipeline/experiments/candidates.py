@@ -1,4 +1,4 @@
-"""The candidate experiments, each as large as the travel allows."""
+"""The candidate experiments, each as large as the travel limit allows."""
 
 from collections.abc import Collection, Iterator
 from math import ceil
@@ -13,22 +13,22 @@ from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.propose import FURTHEST, rounded, rounded_down
 from pipeline.plant.linear.dwells import SETTLED, SETTLED_DWELL, dwell_frequencies, settling_wait
 
-_PERIODS = 2  # of a multisine in it
+_PERIODS = 2  # periods of a multisine in its record
 _BAND = (0.4, 1.6)  # times the first and the last resonance
-_DWELLS = 40  # frequencies at which to dwell
+_DWELLS = 40  # number of frequencies for dwells
 
 
 def propose_candidates(
     known: Knowledge, *, limits: PlanLimits, commands: Collection[str], goal: Goal
 ) -> list[Recording]:
-    """Return what could be recorded next, with all carts free.
+    """Return the recordings that could come next, with all carts free.
 
-    Dwells if the carts are identified from dwells; else chirps, square waves and multisines, if the
-    bench knows their `commands`.
+    These are dwells if the carts are identified from dwells. Otherwise they are chirps, square
+    waves and multisines, as far as the bench knows their `commands`.
 
     Raises
     ------
-    DataError : no candidate has an input within the limits, or settles.
+    DataError : no candidate has an input within the limits, or no candidate settles.
     """
     made = list(_dwells(known) if known.dwells else _broadband(known, limits, commands, goal))
     settle = rounded(settling_wait(known.chain, time_constants=SETTLED))
@@ -49,9 +49,10 @@ def propose_candidates(
 
 
 def _dwells(known: Knowledge) -> Iterator[Recording]:
-    """Dwells that last as long again as the wait for their steady state.
+    """Yield dwells, each twice as long as the wait for its steady state.
 
-    None if that takes too long: a transient would be taken for a steady state.
+    Nothing is yielded if that takes too long, because a transient would be mistaken for a steady
+    state.
     """
     wait = settling_wait(known.chain, time_constants=SETTLED_DWELL)
     if wait * np.min(-known.chain.poles.real) < SETTLED:

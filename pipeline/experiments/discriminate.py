@@ -1,12 +1,12 @@
-"""The experiment that distinguishes two explanations: where they differ most after any refit.
+"""Choose the experiment that distinguishes two explanations: where they differ even after a refit.
 
-T-optimal design: the difference of two predictions counts only as far as the other model cannot
-absorb it. That model may adjust its parameters, as far as all earlier records allow, its start and
-the encoder zeros. With several models each pair counts by the product of their probabilities, which
-bounds the expected fall of entropy.
+This is a T-optimal design: the difference of two predictions counts only as far as the other model
+cannot absorb it. That model may adjust its parameters, as far as all earlier records allow, its
+start and the encoder zeros. With several models, each pair counts by the product of their
+probabilities. This bounds the expected decrease of entropy.
 
-References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box,
-W. J. Hill, Technometrics 9 (1967), 57-71.
+References: A. C. Atkinson, V. V. Fedorov, Biometrika 62 (1975), 57-70 and 289-303; G. E. P. Box, W.
+J. Hill, Technometrics 9 (1967), 57-71.
 """
 
 from collections.abc import Iterator, Sequence
@@ -42,20 +42,20 @@ from pipeline.submission import Submission
 Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
-_PERIOD = 5e-3  # s between samples, with several in a cycle
-_PER_CYCLE, _BEYOND = 10, 2.0  # … and up to at least this multiple of the highest resonance
-_TIME = 12.0  # s of a record, about …
-_LONGEST = 4  # … and this many times longer, if it would not settle the pair that it separates best
-_STEP = 1e-3  # relative, of an effect's parameter for a difference
-_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # of the likeliest's weight: below it a model is no contender
-_DECIDED = CLOSE_BIC * THINNING  # square sum that settles a pair
-_LEAST_WEIGHT = 0.1  # of the others: a swinging residual exaggerates the certainty of the criterion
-_SAME = 1e-9  # of the largest: a smaller change of the parameters is not visible
+_PERIOD = 5e-3  # s between samples. Several samples fall in a period
+_PER_CYCLE, _BEYOND = 10, 2.0  # samples per period. Up to this multiple of the last resonance
+_TIME = 12.0  # s. Approximate duration of a record
+_LONGEST = 4  # times as long at most. Used if the record would not settle its best pair
+_STEP = 1e-3  # relative. Change of an effect's parameter for a difference
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # A model with a smaller share of the best weight is out
+_DECIDED = CLOSE_BIC * THINNING  # Sum of squares that settles a pair
+_LEAST_WEIGHT = 0.1  # Smallest share. Correlated residuals make the criterion look too certain
+_SAME = 1e-9  # Of the largest effect on the motion. Smaller ones are not visible
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """The value of a recording, the pair of models that it separates best, and by how much."""
+    """A recording with its value, the pair of models that it separates best, and by how much."""
 
     worth: tuple[float, float]
     recording: Recording
@@ -67,10 +67,10 @@ class _Weighed:
 
 
 def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording] = ()) -> Gap:
-    """Return the gap with a proposal within the limits of the submission's plan.
+    """Return the gap with a proposed recording within the limits of the submission's plan.
 
-    The proposal resembles none of those in `without`. If none can be made, for example because
-    plan.toml is broken, a note says why and the gap stays as it is.
+    The recording resembles none of those in `without`. If no proposal is possible, for example
+    because plan.toml is broken, a note says why.
     """
     try:
         return with_proposal(gap, limits=current_plan(submission).limits, without=without)
@@ -79,7 +79,9 @@ def propose_for(gap: Gap, submission: Submission, *, without: Sequence[Recording
 
 
 def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] = ()) -> Gap:
-    """Return the gap with the recording that best distinguishes its contenders, if there are two.
+    """Return the gap with the recording that best distinguishes its contenders.
+
+    A gap with fewer than two contenders gets no proposal.
 
     Raises
     ------
@@ -91,7 +93,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
         return gap
     weight = np.array([one.weight for one in gap.contenders])
     weight = np.where(weight < _HOPELESS * weight.max(), 0.0, np.maximum(weight, _LEAST_WEIGHT))
-    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the chosen one, whatever the criterion prefers
+    weight[0] = max(weight[0], _LEAST_WEIGHT)  # the chosen model always counts
     if np.count_nonzero(weight) < 2:
         return gap
     sigma, pinned = _noise(gap), _pinned(gap)
@@ -105,7 +107,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
         score = counted * told
         i, j = divmod(int(np.argmax(score)), len(models))
         return _Weighed(
-            # First, settle as many pairs as possible; then, separate them as far as possible.
+            # First settle as many pairs as possible, then separate them as far as possible.
             worth=(float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())),
             recording=recording,
             pair=(i, j),
@@ -131,7 +133,7 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
 
 
 def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
-    """Return a recording as a gap proposes it, with the cart on which the pair differs most."""
+    """Return the proposal for a recording, with the cart on which the pair differs most."""
     one, other = best.pair
     cart = int(np.argmax(np.abs(best.predicted[one] - best.predicted[other]).max(axis=1)))
     return Proposal(
@@ -145,7 +147,7 @@ def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
 
 
 def _noise(gap: Gap) -> Array:
-    """Return the noise (n,) of each cart, from its runs: the floor is a share of it."""
+    """Return the noise (n,) of each cart from the noise floors of its runs."""
     floor = {(row.experiment, row.cart): row.noise_floor for row in gap.by_record}
     found: dict[int, list[float]] = {}
     for trace in gap.traces:
@@ -158,11 +160,11 @@ def _noise(gap: Gap) -> Array:
 
 
 def _pinned(gap: Gap) -> Array:
-    """Return how far the records let each parameter of the chain vary, as `_predict` uses it."""
+    """Return how far each parameter of the chain may vary according to the records."""
     chain = gap.model.chain
     return np.array(
         [
-            # Each standard error belongs to one explanation: a parameter may be off by three.
+            # A standard error holds for one explanation only, so three standard errors are allowed.
             3.0 * gap.chain_std.get(f"{letter}_{i + 1}", np.inf)
             for letter, values in (("m", chain.m), ("c", chain.c), ("k", chain.k))
             for i in np.flatnonzero(values).tolist()
@@ -174,9 +176,9 @@ def _pinned(gap: Gap) -> Array:
 
 
 def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, float]]:
-    """Steps to either side, triangles and chirps in several sizes, each cart released at heights.
+    """Yield steps to either side, triangles, chirps and releases of each cart, in several sizes.
 
-    Each comes with the height (position units) at which its cart is released, or 0.
+    Each comes with the height (position units) from which its cart is released, or 0.
     """
     resonances = np.sort(np.abs(chain.poles)) / (2 * np.pi)
     settle = rounded(settling_wait(chain, time_constants=SETTLED))
@@ -196,7 +198,8 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         ("triangle", "sweep", slow, None),
         ("triangle", "sweep", rounded(float(resonances[0])), None),
         ("chirp", "sweep", low, high),
-        # Carts move little there, under the motor's full input: delays and soft laws show.
+        # At high frequency with the motor's full input the carts move little. This shows delays and
+        # laws that matter only for small motions.
         ("chirp", "sweep", high, fastest),
         ("chirp", "sweep", rounded(float(np.sqrt(high * fastest))), fastest),
     )
@@ -216,7 +219,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
         t, u = sampled_input(whole, period=_PERIOD)
         reach = float(np.max(np.abs(simulate_linear(chain, t, u))))
         largest = min(FURTHEST * limits.travel / reach, limits.input)
-        # Laws differ in their growth with the motion.
+        # Several sizes, because laws differ in how they grow with the motion.
         for size in (1.0, 0.5, 0.2):
             for sign in (1, -1) if wave == "square" else (1,):
                 amplitude = sign * rounded_down(size * largest)
@@ -232,7 +235,7 @@ def _candidates(chain: Chain, limits: PlanLimits) -> Iterator[tuple[Recording, f
 
 
 def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
-    """Return the sweep through the resonances that swings the carts as far as allowed."""
+    """Return a sweep through the resonances that moves the carts as far as allowed."""
     every = (recording for recording, _ in _candidates(chain, limits))
     return next(one for one in every if one.wave == "chirp").model_copy(update={"id": "sweep"})
 
@@ -248,10 +251,10 @@ def _tell_apart(
     sigma: Array,
     pinned: Array,
 ) -> tuple[Array, Array, Array, Array] | None:
-    """Return (models, models) the separation of each pair, times, input and predictions.
+    """Return the separation (models, models) of each pair, with times, input and predictions.
 
-    A separation is the square sum over the noise that neither model can absorb; None if a model's
-    motion cannot be computed.
+    A separation is the sum of squares over the noise that neither model can absorb. The result is
+    None if the motion of a model cannot be computed.
     """
     t, u = sampled_input(recording, period=_PERIOD)
     u = recording.amplitude * u
@@ -277,7 +280,7 @@ def _tell_apart(
 def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
     """Return whether two models differ only in effects on an input, such as a lag and a delay.
 
-    Any remaining difference of their free motions is chance, such as a contact's bounces.
+    Their free motions should then agree; any difference is chance, such as bounces at a contact.
     """
     mine, others = ({(t.effect.key, t.place): t for t in m.terms} for m in (one, other))
     lone = [(mine | others)[key] for key in mine.keys() ^ others.keys()]
@@ -285,10 +288,10 @@ def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:
 
 
 def _left(difference: Array, by: Array, pinned: Array) -> float:
-    """Return the square sum of a difference (n,) that no change of the parameters absorbs.
+    """Return the sum of squares of a difference (n,) that no change of parameters absorbs.
 
-    The chain's parameters, which come first, are `pinned` (n_p,) by all earlier records: a change
-    by this much costs one.
+    `by` holds its derivatives by the parameters, those of the chain first. All earlier records hold
+    these within `pinned` (n_p,): a change by this much costs one.
     """
     columns = by.reshape(len(by), -1).T
     held = np.zeros((pinned.size, len(by)))
@@ -307,11 +310,12 @@ def _predict(
 ) -> tuple[Array, Array]:
     """Return the readings (n, samples) and their derivatives (., n, samples) by free parameters.
 
-    These are all parameters of the chain and its effects, the start of a released cart, the zeros.
+    The free parameters are those of the chain and its effects, the start of a released cart, and
+    the encoder zeros.
     """
     n, k = model.chain.n, model.chain.k
     variants = [model, *_changed(model)]
-    # A constant force or cogging holds the carts elsewhere if it, or a spring, changes.
+    # With a constant force or cogging, the rest position changes if the force or a spring changes.
     stiffer = [
         replace(model, chain=replace(model.chain, k=k * (1 + _STEP * (np.arange(n + 1) == j))))
         for j in np.flatnonzero(k)
@@ -349,7 +353,7 @@ def _predict(
 
 
 def _changed(model: AugmentedChain) -> Iterator[AugmentedChain]:
-    """Yield the model with each parameter of an effect slightly increased."""
+    """Yield copies of the model, each with one parameter of an effect slightly larger."""
     for at, term in enumerate(model.terms):
         for i, value in enumerate(term.values):
             moved = (*term.values[:i], value * (1 + _STEP), *term.values[i + 1 :])

@@ -1,9 +1,9 @@
 """The controller of a recording in the bench's own numbers, checked for safety.
 
-The bench computes in duty counts and encoder counts, once a period, by the laws of
-`plant.loop.sampled_loop`: state feedback with velocities at constant velocity and one period of
-delay, PID without delay. A design has a sample time of its own and predicts with a model. So the
-loop is simulated as the bench will run it before any gain is sent.
+The bench computes in duty counts and encoder counts, once per period, by the laws in
+`plant.loop.sampled_loop`. State feedback assumes constant velocity between samples and one period
+of delay; PID has no delay. A design may have another sample time and predict with a model. So the
+loop is simulated as the bench will run it, before any gain is sent.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ from pipeline.submission import Design, Submission
 
 Table: TypeAlias = dict[str, Any]
 
-_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # of the carts' own stiffness that a proposed kp adds
+_PID_SHARES = (1.0, 0.5, 0.25, 0.1)  # a proposed kp adds such a share of the carts' own stiffness
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,7 +42,7 @@ class CountScales:
 
     Attributes
     ----------
-    input : input units per duty count; negative if a positive duty drives cart 1 to negative x.
+    input : input units per duty count. Negative if a positive duty drives cart 1 to negative x.
     position : position units per encoder count.
     """
 
@@ -51,7 +51,9 @@ class CountScales:
 
 
 def bench_scales(submission: Submission, *, bench: Description, analysis: Analysis) -> CountScales:
-    """Return the scales stated by the submission or else the bench; the sign is that of the data.
+    """Return the scales stated by the submission or, if missing, by the bench.
+
+    The sign of the input is the one found in the data.
 
     Raises
     ------
@@ -87,11 +89,11 @@ def bench_gains(
 ) -> StateGains | PidGains:
     """Return the gains to send to the bench before a closed-loop recording.
 
-    Errors do not name the recording, which the caller adds.
+    Errors do not name the recording; the caller adds its name.
 
     Raises
     ------
-    DataError : the carts are not identified; or on the bench the loop would be unstable, pass a
+    DataError : the carts are not identified, or the loop on the bench would be unstable, pass a
         limit, or miss its design goal.
     """
     trial = _Trial.of(
@@ -106,7 +108,7 @@ def bench_gains(
     law = _law(loop, analysis.feedback)
     goal = None if loop.gains else submission.design or Design(cart=loop.cart)
     trial.refuse_state(law, cart=loop.cart, goal=goal, design=analysis.feedback)
-    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # encoders without a cart
+    spare = [0.0] * (2 * (bench.encoders - trial.chain.n))  # zero gains for encoders without a cart
     return StateGains(
         gains=(*(per_count * law.gains).tolist(), *spare), prefilter=per_count * law.prefilter
     )
@@ -120,9 +122,10 @@ def propose_pid(
     bench: Description,
     limits: PlanLimits,
 ) -> PidLoop:
-    """Return gains on cart 1 for a bench without state feedback: stiffer, damped, to the level.
+    """Return PID gains on cart 1 for a bench without state feedback.
 
-    A PID on a further cart soon becomes unstable, on the driven cart hardly ever.
+    They add stiffness and damping, and bring the cart to the reference. On a further cart a PID
+    soon becomes unstable, on the driven cart hardly ever.
 
     Raises
     ------
@@ -136,7 +139,7 @@ def propose_pid(
     refused = ""
     for damped, share in product((True, False), _PID_SHARES):
         kp = share * stiffness
-        # A damping ratio of 0.5, of all carts as one mass.
+        # This gives a damping ratio of 0.5, with all carts as one mass.
         damping = 2 * 0.5 * float(np.sqrt((stiffness + kp) * chain.m.sum()))
         loop = PidLoop(
             kp=_typed(counts * kp),
@@ -155,9 +158,9 @@ def propose_pid(
 def controller_table(
     gains: StateGains | PidGains, *, cart: int, scales: CountScales, carts: int
 ) -> Table:
-    """Return the `controller` entry for submission.toml after these gains ran.
+    """Return the `controller` entry of submission.toml for a recording with these gains.
 
-    A PID's `scale` is for a data file in encoder counts.
+    The `scale` of a PID applies to a data file in encoder counts.
     """
     if isinstance(gains, PidGains):
         table = {"kp": gains.kp, "ki": gains.ki, "kd": gains.kd}
@@ -179,7 +182,7 @@ def _typed(value: float) -> float:
 
 
 def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
-    """Return the gains stated in the plan, or those of the design, as the bench runs them."""
+    """Return the gains stated in the plan, else those of the design, in the bench's form."""
     if loop.gains and loop.prefilter is not None:
         return StateFeedback(gains=np.array(loop.gains), prefilter=loop.prefilter)
     if design is None:
@@ -194,7 +197,7 @@ def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class _Trial:
-    """The step of a recording on the identified carts, as the bench will run it."""
+    """The step of a recording, simulated on the identified carts as the bench will run it."""
 
     recording: Recording
     chain: Chain
@@ -239,9 +242,9 @@ class _Trial:
         y, judged = x[cart - 1], {"before": 0.0, "level": np.float64(reference)}
         overshoot = float(step_response.overshoot_percent(y, **judged))
         settling = float(step_response.settling_time(t, y, **judged))
-        # An encoder cannot distinguish two counts of overshoot from its own flicker.
+        # An overshoot of two counts cannot be distinguished from the encoder's flicker.
         unseen = 100 * 2 * self.scales.position / abs(reference)
-        # The report already says so if the design itself cannot meet its goal.
+        # If the design itself misses its goal, the report already says so.
         most = max(goal.overshoot_percent, design.overshoot_percent) + unseen
         longest = max(goal.settling_time, design.settling_time or np.inf)
         if overshoot > most or not settling <= longest + design.sample_time:
@@ -276,9 +279,9 @@ class _Trial:
         return f": set design.sample_time = {self.period:g} in submission.toml"
 
     def _step(self, law: Controller, *, delay: int) -> tuple[Array, Array]:
-        """Return t (n,) and positions (n_carts, n) of the step; refuse one that passes a limit."""
+        """Return t (n,) and positions (n_carts, n) of the step; refuse one beyond a limit."""
         run = self.recording
-        seconds = min(run.duration, 10.0)  # s of a simulated step
+        seconds = min(run.duration, 10.0)  # s of the step to simulate
         motion = simulate_loop(
             self.chain,
             law,
@@ -306,9 +309,9 @@ class _Trial:
 
 
 def _pid_matrix(chain: Chain, pid: Pid, *, period: float) -> Array:
-    """Return the map of (x, ∫e, last e) from tick to tick without a reference or delay.
+    """Return the map of (x, ∫e, last e) from one sample to the next, without reference or delay.
 
-    Without ki the integral does nothing and is left out, as it would be an eigenvalue of one.
+    Without ki the integral has no effect and is left out; it would be an eigenvalue of one.
     """
     phi, gamma = discretise(chain, period)
     row = np.zeros(gamma.size)

@@ -1,4 +1,4 @@
-"""The goal of a next experiment: one number of the parameters' covariance to reduce."""
+"""The goal of the next experiments: a single number that measures the parameters' errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,9 @@ from pipeline.plant.loop.sampled_loop import LoopSetup, simulate_loop
 from pipeline.results import FeedbackDesign
 from pipeline.submission.complaints import nearest
 
-GAP = "gap"  # distinguishing the explanations of a gap
+GAP = "gap"  # the goal of distinguishing the explanations of a gap
 DESIGN, WORST, MEAN, VOLUME = "design", "worst", "mean", "volume"
-_STEP = 1e-4  # relative change of a parameter, for differences of the loop's overshoot
+_STEP = 1e-4  # relative change of a parameter for a numerical derivative
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,10 +27,12 @@ class Goal:
     ----------
     name : as `--for` takes it.
     words : the number in words, "the error of zeta_2".
-    rows : (k, n_p) derivatives of the goal by the relative parameters; of overshoot, as shares of
-        the step. One row: c-optimal.
-    mean : for several errors the "largest" (E-optimal in named parameters), the "root mean square"
-        (A-optimal) or the "volume" of the confidence region, as its mean radius (D-optimal).
+    rows : (k, n_p) derivatives of the wanted numbers by the relative parameters. For overshoot, as
+        a
+        share of the step. One row is a c-optimal design.
+    mean : how several errors become one number. The "largest" is E-optimal in named parameters, the
+        "root mean square" A-optimal. The "volume" of the confidence region, as its mean radius, is
+        D-optimal.
     """
 
     name: str
@@ -39,10 +41,7 @@ class Goal:
     mean: Literal["largest", "root mean square", "volume"] = "largest"
 
     def of(self, told: Array) -> Array:
-        """Return the error (…,) for information H and S (…, 2, n_p, n_p).
-
-        Inf if it is unbounded.
-        """
+        """Return the error (…,) for information H and S (…, 2, n_p, n_p); inf if unbounded."""
         H, S = told[..., 0, :, :], told[..., 1, :, :]
         if self.mean == "volume":
             (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
@@ -60,12 +59,12 @@ class Goal:
         return np.einsum("...kp,...pq,...kq->...k", half, S, half)
 
     def worst(self, told: Array) -> int:
-        """Return the index of the worst-known row."""
+        """Return the index of the row with the largest error."""
         return int(np.argmax(self._variances(*told)))
 
 
 def check_goal(name: str, *, names: Sequence[str]) -> None:
-    """Refuse an unknown goal for carts with parameters of these names.
+    """Refuse a goal that carts with these parameters do not have.
 
     Raises
     ------
@@ -77,12 +76,12 @@ def check_goal(name: str, *, names: Sequence[str]) -> None:
 
 
 def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -> Goal:
-    """Return the goal of a name: a parameter's, "design", "worst", "mean" or "volume".
+    """Return the goal of a name: a parameter, "design", "worst", "mean" or "volume".
 
     Raises
     ------
     ConfigError : there is no such goal.
-    DataError : "design" without one.
+    DataError : the goal is "design", but no feedback was designed.
     """
     values, rows = known.chain.parameters(), known.by_parameters()
     check_goal(name, names=[*values])
@@ -111,7 +110,7 @@ def find_goal(name: str, known: Knowledge, *, feedback: FeedbackDesign | None) -
 def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
     """Return the derivative (1, n_p) of the loop's peak by the parameters, as share of the step.
 
-    The controller is fixed while the carts vary.
+    The controller stays the same while the carts vary.
     """
     P, chain = known.parametrisation, known.chain
     controller = feedback.controller(chain)
@@ -135,10 +134,10 @@ def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
 
 
 def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
-    """Return which `n` of the candidates (m, 2, n_p, n_p) give the smallest error, the best first.
+    """Return the `n` candidates (m, 2, n_p, n_p) that give the smallest error, the best first.
 
-    One may be chosen several times. They are added one by one. Then each in turn is replaced by a
-    better one, until no replacement helps: the exchange algorithm.
+    One candidate may be chosen several times. First, candidates are added one by one. Then each one
+    in turn is replaced by a better one, until no replacement helps (the exchange algorithm).
 
     Parameters
     ----------
@@ -149,7 +148,7 @@ def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, 
     V. V. Fedorov, Theory of Optimal Experiments, 1972, chapter 3; A. C. Atkinson, A. N. Donev,
     R. D. Tobias, Optimum Experimental Designs, with SAS, 2007, chapter 12.
     """
-    enough = 1 - 1e-6  # of an error: a smaller gain is rounding
+    enough = 1 - 1e-6  # a smaller relative improvement is rounding
     chosen: list[int] = []
     total = told
     for _ in range(n):

@@ -1,9 +1,9 @@
-"""The Fisher information on the carts in a record that does not exist yet.
+"""The Fisher information that a record will give on the carts, predicted before it is made.
 
-It follows from the later fit. The squares of its derivatives by the parameters over the noise, with
-start and encoder zeros eliminated, are the information H. S is the effect of the noise on them,
-which is H for white noise and more if rounding leaves lasting errors. Both add up over records, and
-the covariance is H⁻¹ S H⁻¹.
+It follows from the fit that will use the record. H is the information: squares of the derivatives
+by the parameters over the noise, with start and encoder zeros eliminated. S is the covariance that
+the noise causes in these derivatives' sums. It equals H for white noise and is larger if rounding
+leaves lasting errors. Both add up over records, and the covariance of the parameters is H⁻¹ S H⁻¹.
 
 References: E. Walter, L. Pronzato, Identification of Parametric Models from Experimental Data,
 1997, chapter 6; G. C. Goodwin, R. L. Payne, Dynamic System Identification: Experiment Design and
@@ -46,14 +46,17 @@ class Knowledge:
 
     Attributes
     ----------
-    chain : as identified.
-    told : (2, n_p, n_p) H and S of the relative changes of the parameters of `parametrisation`.
-    size : (n_p,) the reference of these changes, in physical units.
-    step, noise : (n,) the encoder step and the other noise of each cart, position units.
+    chain : the identified chain.
+    told : (2, n_p, n_p) H and S for relative changes of the parameters. See `parametrisation`.
+    size : (n_p,) the reference values of these changes, in physical units.
+    step, noise : (n,) encoder step and other noise of each cart. In position units.
     sample_time : s, of the bench.
-    beyond : the ratio of S to the encoders' part: friction, for example, adds to it.
-    dwells : so far; if there are any, the carts are identified from dwells alone.
-    misfit : the distance of a dwell from the carts beyond its error, as a share of its magnitude.
+    beyond : the ratio of the variances found to those that the encoders cause. Friction, for
+        example,
+        makes it larger.
+    dwells : the dwells so far. If there are any, the carts are identified from dwells alone.
+    misfit : distance of a dwell from the carts beyond its standard error. As a share of its
+        magnitude.
     """
 
     chain: Chain
@@ -73,7 +76,7 @@ class Knowledge:
 
         Raises
         ------
-        DataError : the carts are not identified, or from a table alone.
+        DataError : the carts are not identified, or only from a table.
         """
         chain = identified_chain(analysis)
         fit = analysis.fit
@@ -81,7 +84,7 @@ class Knowledge:
         everything = Parametrisation(bench=analysis.bench)
         gone = tuple(name for name in everything.names if name not in fit.names)
         P = everything.holding_at_zero(*gone)
-        # A fit held these at zero; here the logarithm needs a slope.
+        # The fit held these at zero, but their logarithm needs a finite value here.
         undamped = 1e-6 * critical_damping(chain)
         chain = Chain(m=chain.m, c=np.where(chain.c > 0, chain.c, undamped), k=chain.k)
         value = P.physical(chain)
@@ -116,9 +119,10 @@ class Knowledge:
         return replace(known, noise=np.array(shaken))._compared(windows, covariance)
 
     def _compared(self, windows: Sequence[FitWindow], covariance: Array) -> Self:
-        """Return the same with H of the windows, the S behind this covariance, and their ratio.
+        """Return this knowledge with H of the windows, and the S that gives the found covariance.
 
-        S is never below the effect of the encoders' noise on such records.
+        `beyond` becomes the ratio of the found variances to those from the encoders' noise, at
+        least 1.
         """
         H, S = np.sum([self._of_window(window) for window in windows], axis=0)
         J, inverse = self.by_parameters(), np.linalg.inv(H)
@@ -134,7 +138,7 @@ class Knowledge:
     # -------------------------------------------------------- the information in a record
 
     def of_recording(self, recording: Recording) -> Array:
-        """Return H and S (2, n_p, n_p) of a recording with all carts free, from rest."""
+        """Return H and S (2, n_p, n_p) of a recording with all carts free, starting from rest."""
         if recording.kind == "sine":
             return self._of_dwell(recording)
         t, u = self.input(recording)
@@ -166,7 +170,7 @@ class Knowledge:
         J = misfit.jacobian * (self.size / self.parametrisation.dp_dtheta(theta))[:, None, None]
         exact = window.y + misfit.residual * window.sigma[:, None]
         resting = window.n_resting
-        exact[:, :resting] = exact[:, [resting]]  # whose residual is not weighted down
+        exact[:, :resting] = exact[:, [resting]]  # the residual there is not weighted down
         flat = J.reshape(theta.size, -1)
         S = np.mean(
             [score_covariance(weighed(off, window), J) for off in self._errors(exact, rows)], axis=0
@@ -174,17 +178,17 @@ class Knowledge:
         return np.stack([flat @ flat.T, S])
 
     def _errors(self, exact: Array, rows: list[int]) -> Iterator[Array]:
-        """Yield random encoder errors on exact positions (p, n), several times."""
+        """Yield several samples of random encoder errors on exact positions (p, n)."""
         rng, step = np.random.default_rng(0), self.step[rows, None]
-        for _ in range(3):  # the effect of a single noise on the parameters is chance
-            # An encoder's start between two counts is random.
+        for _ in range(3):  # a single sample would be too random
+            # An encoder starts anywhere between two counts.
             from_count = exact + step * rng.uniform(-0.5, 0.5, size=step.shape)
             read = from_count + self.noise[rows, None] * rng.standard_normal(exact.shape)
             whole = step * np.round(read / np.where(step > 0, step, 1.0))
             yield np.where(step > 0, whole, read) - from_count
 
     def _of_dwell(self, recording: Recording) -> Array:
-        """Return the information of the steady state, as precise as that of the dwells so far."""
+        """Return H and S of a dwell; it is taken to be as precise as the dwells so far."""
         steady = recording.duration - settling_wait(self.chain, time_constants=SETTLED_DWELL)
         samples = max(steady / self.sample_time, 1.0)
         omega, responses = np.array([2 * np.pi * recording.frequency]), []
@@ -202,7 +206,7 @@ class Knowledge:
         return np.tile(J.T @ J, (2, 1, 1))
 
     def of_lines(self, omega: Array, *, amplitude: Array, seconds: float) -> Array:
-        """Return H and S (n, 2, n_p, n_p) of steady sines of omega (n,), rad/s, each alone.
+        """Return H and S (n, 2, n_p, n_p) of each steady sine of omega (n,), rad/s, by itself.
 
         The sines move the carts by many counts, so rounding errors are white.
         """
@@ -212,7 +216,7 @@ class Knowledge:
         sigma = np.hypot(self.step / np.sqrt(12), self.noise)
         dG = dG.reshape(self.chain.n, omega.size, -1) * self.size
         dG = dG * (amplitude[:, None] / sigma[:, None, None])
-        samples = seconds / self.sample_time / 2  # a sine's mean square is a half
+        samples = seconds / self.sample_time / 2  # the mean square of a sine is a half
         H = samples * np.einsum("cwp,cwq->wpq", np.conj(dG), dG).real
         return np.stack([H, self.beyond * H], axis=1)
 
@@ -236,7 +240,7 @@ class Knowledge:
         return sampled_input(recording, period=self.sample_time)
 
     def at_its_limits(self, recording: Recording, *, limits: PlanLimits, share: float) -> float:
-        """Return the input at which the largest cart motion is this `share` of the travel."""
+        """Return the amplitude at which the largest cart motion is this `share` of the travel."""
         t, u = self.input(recording)
         x = simulate_linear(self.chain, t, u, free=recording.carts)
         return min(share * limits.travel / float(np.max(np.abs(x))), limits.input)
@@ -253,7 +257,7 @@ def sampled_input(recording: Recording, *, period: float) -> tuple[Array, Array]
     return _sampled(start, recording.duration, period, recording.frequency_end, recording.sines)
 
 
-# All candidates are kept, as each is used twice or more.
+# Large enough for all candidates, as each one is used at least twice.
 @lru_cache(maxsize=64)
 def _sampled(
     start: Start, duration: float, period: float, end: float | None, tones: tuple[Tone, ...]
@@ -270,7 +274,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 
     Raises
     ------
-    DataError : the fit is to a table, without records.
+    DataError : the fit is to a table, so there are no records.
     """
     kinds = ("sine",) if fit.method == "bode_fit" else ("step", "sweep")
     out = {one.experiment for one in analysis.left_out}
@@ -290,7 +294,7 @@ def _fitted_records(analysis: Analysis, fit: ChainFit) -> list[Record]:
 def _median_by_cart(
     runs: Sequence[Record] | Sequence[FitWindow], values: Sequence[Array], *, n: int
 ) -> Array:
-    """Return the median (n,) over the runs of a value that each run has for its carts."""
+    """Return the median (n,) for each cart of a value that the runs have for their carts."""
     found = [
         [
             float(of_run[run.carts.index(cart)])

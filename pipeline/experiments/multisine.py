@@ -1,10 +1,10 @@
 """Many sines in one record, at the most informative frequencies and with a low peak.
 
-The input is bounded by the carts' travel, so the peak of their motion is reduced.
+The carts' travel limits the amplitude, so the phases are chosen for a low peak of the motion.
 
-References: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970), 85-89, for the phases to
-begin with; E. Van der Ouderaa, J. Schoukens, J. Renneboog, IEEE Trans. Instrumentation and
-Measurement 37 (1988), 145-147, for the clipping.
+References: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970), 85-89, for the initial
+phases; E. Van der Ouderaa, J. Schoukens, J. Renneboog, IEEE Trans. Instrumentation and Measurement
+37 (1988), 145-147, for the clipping.
 """
 
 import numpy as np
@@ -15,12 +15,12 @@ from pipeline.experiments.goal import Goal, choose
 from pipeline.experiments.information import Knowledge
 
 Tones = tuple[tuple[int, float, float], ...]
-Lines = NDArray[np.int64]  # harmonics
+Lines = NDArray[np.int64]  # numbers of harmonics
 
-_QUANTA = 16  # equal parts of the motion's power, placed where they are most informative
-_LOW, _HIGH = 0.3, 1.6  # times the first and the last resonance, as limits of the lines
-_CLIP_AT = 0.8  # of the peak
-_DIGITS = 4  # of shares and phases, as written in a file
+_QUANTA = 16  # equal parts of the motion's power. Each goes to the most informative line
+_LOW, _HIGH = 0.3, 1.6  # times the first and the last resonance. The lines lie between
+_CLIP_AT = 0.8  # share of the peak
+_DIGITS = 4  # of shares and phases in the file
 
 
 def optimal_tones(
@@ -30,8 +30,8 @@ def optimal_tones(
 
     Parameters
     ----------
-    base : Hz, of which the lines are harmonics.
-    seconds, travel : duration, and limit of the motion, position units.
+    base : the fundamental frequency, Hz.
+    seconds, travel : duration in s, and limit of the motion in position units.
     """
     resonances = np.sort(np.abs(known.chain.poles)) / (2 * np.pi)
     low, high = _LOW * resonances[0], _HIGH * resonances[-1]
@@ -39,7 +39,7 @@ def optimal_tones(
     omega = np.asarray(2 * np.pi * base * lines, dtype=np.float64)
     G = known.chain.frequency_response(omega)
     reach = np.max(np.abs(G), axis=0)
-    # The motion for each part of the power; the motion's peak is about 1.8 of its rms.
+    # Amplitude of the motion for one part of the power; the peak is about 1.8 times the rms.
     each = travel / 1.8 * np.sqrt(2 / _QUANTA)
     told = known.of_lines(omega, amplitude=each / reach, seconds=seconds)
     chosen = choose(told, known.told, n=_QUANTA, goal=goal)
@@ -52,15 +52,16 @@ def optimal_tones(
 
 
 def schroeder_phases(size: Array) -> Array:
-    """Return phases (n,) of lines of these sizes (n,) that keep their sum's peak low, rad."""
+    """Return phases (n,) in rad that keep the peak low for lines of sizes `size` (n,)."""
     power = size**2 / np.sum(size**2)
     return -2 * np.pi * np.cumsum(np.cumsum(power) - power)
 
 
 def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
-    """Return phases (n,) with a low largest swing of the carts: clip, keep the phases, repeat.
+    """Return phases (n,) for which the largest swing of the carts is small.
 
-    `G` (carts, n) is the response at the lines.
+    The motion is clipped and the new phases are kept, again and again. `G` (carts, n) is the
+    response at the lines.
     """
     motion = size * G
     phase = schroeder_phases(np.max(np.abs(motion), axis=0))
@@ -71,14 +72,14 @@ def low_peak_phases(lines: Lines, size: Array, G: ComplexArray) -> Array:
         if top < lowest:
             best, lowest = phase, top
         spectrum = np.fft.rfft(np.clip(x, -_CLIP_AT * top, _CLIP_AT * top))[:, lines]
-        # A sine here is -j times half the line there; each cart is weighted by its motion.
+        # Here a sine is -j times half its line. The carts are weighted by their motion.
         phase = np.angle(np.sum(1j * spectrum * np.conj(motion), axis=0))
     return best
 
 
 def _synthesise(lines: Lines, amplitude: ComplexArray) -> Array:
-    """Return sums (…, points) over one period of sines of complex amplitude (…, n)."""
-    points = 1 << int(np.ceil(np.log2(16 * lines[-1])))  # 16 a period of the highest line
+    """Return sums (…, points) of sines of complex amplitude (…, n), over one period."""
+    points = 1 << int(np.ceil(np.log2(16 * lines[-1])))  # 16 points in a period of the highest line
     spectrum = np.zeros((*amplitude.shape[:-1], points // 2 + 1), dtype=np.complex128)
     spectrum[..., lines] = -0.5j * points * amplitude
     return np.fft.irfft(spectrum, points)

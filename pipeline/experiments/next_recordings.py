@@ -1,4 +1,4 @@
-"""`cartlab plan --next`: the most useful experiments, and the benefit of each."""
+"""Implement `cartlab plan --next`: choose the most useful experiments and predict the benefit."""
 
 import json
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from pipeline.words.numbers import count, first_few
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-_ALONE = 4  # recordings of the plan whose single benefit is listed
+_ALONE = 4  # number of planned recordings whose own benefit is listed
 STATISTICAL = (
     f"that counts the noise alone: no bench is calibrated better than to {100 * CALIBRATION:g} %"
 )
@@ -41,12 +41,16 @@ class NextPlan:
 
     Attributes
     ----------
-    now : the present error described by `words`, relative.
-    errors : (n + 1,) the same with the open recordings of the plan, and after each more.
+    words : description of the error.
+    now : the present error, relative.
+    errors : (n + 1,) the error after the open recordings of the plan. Then the error after each
+        chosen
+        one.
     planned : the error after each single open recording of the plan, by id.
-    separation : for "gap", of the pair of explanations that is separated best, in noises.
+    separation : only for "gap". The separation of the best separated pair of explanations, in noise
+        standard deviations.
     wrote : the change of plan.toml, in words.
-    doubt : why the errors are not reliable, whatever is recorded; "": they are.
+    doubt : why the errors are not reliable, whatever is recorded. Empty if they are.
     """
 
     words: str
@@ -62,12 +66,12 @@ class NextPlan:
 
     @property
     def said(self) -> str:
-        """Their benefit, in one sentence."""
+        """The benefit of the experiments in one sentence."""
         return "; ".join(self.sentences)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Their benefit, with notes."""
+        """The benefit of the experiments, with notes."""
         if self.separation is not None:
             return (
                 f"{self.recordings[0].id} tells two explanations of the gap apart by "
@@ -142,7 +146,7 @@ def plan_next(
 
 
 def _doubt(analysis: Analysis, folder: Path) -> str:
-    """Return a note that the errors count noise, if more than noise is left."""
+    """Return a note if more than noise remains, because the errors count only noise."""
     fit = analysis.fit
     if fit is None or fit.explains_data:
         return ""
@@ -162,11 +166,11 @@ def choose_next(
     commands: frozenset[str],
     without: Sequence[Recording] = (),
 ) -> NextPlan:
-    """Choose the `n` next experiments, each with the error expected after it.
+    """Choose the `n` next experiments, and predict the error after each.
 
     Parameters
     ----------
-    without : nothing similar to these.
+    without : nothing similar to these is chosen.
 
     Raises
     ------
@@ -213,7 +217,7 @@ def choose_next(
 
 
 def tells_nothing(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
-    """Return why a recording would not improve the carts' parameters; "": it would."""
+    """Return why a recording would not improve the carts' parameters; "" if it would."""
     kinds = ("sine",) if known.dwells else ("step", "sweep")
     if recording.kind not in kinds:
         used = "dwells" if known.dwells else "steps and sweeps"
@@ -232,8 +236,8 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
 
     Raises
     ------
-    DataError : there is no gap.json, or it has no proposal.
-    ConfigError : it is broken, or belongs to other data or limits than these.
+    DataError : there is no gap.json, or it contains no proposal.
+    ConfigError : gap.json is broken, or belongs to other data or limits than these.
     """
     path = submission.folder / "gap" / "gap.json"
     command = f"`cartlab gap {submission.folder}`"
@@ -258,7 +262,7 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
     if of != here or found.provenance.files != read_data(submission).files:
         raise ConfigError(f"--for gap: gap/gap.json is of other data: run {command} again")
     kept = found.proposal.limits
-    # The numbers of gap.json have ten digits.
+    # gap.json has only ten digits.
     if not all(isclose(kept.get(name, 0.0), limit, rel_tol=1e-9) for name, limit in limits):
         raise ConfigError(
             f"--for gap: the limits in plan.toml are not those of gap/gap.json: run {command} again"
@@ -276,7 +280,7 @@ def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
 
 
 def _promise(words: str, before: float, after: float) -> str:
-    """Return the promise of one recording, as its note says it."""
+    """Return the predicted benefit of one recording in words, for its note."""
     doubt = f"; {STATISTICAL}" if after < CALIBRATION else ""
     return f"{words}: ± {_percent(before)} before, ± {_percent(after)} expected{doubt}"
 

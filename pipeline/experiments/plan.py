@@ -1,7 +1,7 @@
 """The plan of a session at the bench: what to record, and within which limits.
 
-It is `plan.toml` in the submission folder. `cartlab plan` proposes it, a person may change it,
-`cartlab acquire` carries it out.
+It is `plan.toml` in the submission folder. `cartlab plan` proposes it, a person may change it, and
+`cartlab acquire` makes the recordings.
 """
 
 from math import isclose
@@ -30,7 +30,7 @@ class PlanLimits(TomlTable):
 
 
 class PidLoop(TomlTable):
-    """The bench's own PID on one cart: duty counts, with e in encoder counts."""
+    """Gains of the bench's own PID on one cart: duty counts, with e in encoder counts."""
 
     type: Literal["pid"] = "pid"
     kp: Finite
@@ -40,7 +40,7 @@ class PidLoop(TomlTable):
 
 
 class StateLoop(TomlTable):
-    """State feedback, in the submission's units; () and None: those of the design."""
+    """State feedback in the submission's units; () and None mean the gains of the design."""
 
     type: Literal["state_feedback"] = "state_feedback"
     gains: tuple[Finite, ...] = ()
@@ -53,19 +53,21 @@ class Recording(TomlTable):
 
     Attributes
     ----------
-    id : of the experiment in submission.toml; its files have this name.
-    carts : free to move; the others are held.
-    wave : of the input, or in closed loop of the reference.
-    amplitude : input units, in closed loop position units; 0: a decay started by hand.
-    frequency : Hz, of the wave; a chirp starts there.
+    id : the id of the experiment in submission.toml. The data file has the same name.
+    carts : the carts free to move. The others are held.
+    wave : the waveform of the input. In closed loop, of the reference.
+    amplitude : input units. In closed loop, position units. Zero for a decay started by hand.
+    frequency : Hz, of the wave. A chirp starts there.
     frequency_end : Hz, end of a chirp.
-    tones : of a multisine, for each sine the harmonic of `frequency`, its share of the amplitude
+    tones : the sines of a multisine. Each has the harmonic of `frequency`, its share of the
+        amplitude
         and its phase in rad.
-    cycles : periods; the run takes cycles/frequency seconds.
-    release : the cart that is pulled out and released by hand; None: no hand.
-    controller : closes the loop.
+    cycles : number of periods. The run takes cycles/frequency seconds.
+    release : the cart that is pulled out and released by hand. None without a release.
+    controller : the controller that closes the loop.
     settle : s of rest beforehand.
-    aim : the parameter for which it was chosen, "zeta_2"; "": by default, or by a person.
+    aim : the parameter for which cartlab chose it, such as "zeta_2". Empty if it is a standard
+        recording or a person chose it.
     """
 
     id: str
@@ -85,7 +87,7 @@ class Recording(TomlTable):
 
     @property
     def duration(self) -> float:
-        """How long the run takes, s."""
+        """Duration of the run, s."""
         return self.cycles / self.frequency
 
     @property
@@ -100,7 +102,7 @@ class Recording(TomlTable):
             return False
         mine = (self.amplitude, self.frequency, self.frequency_end or 0.0)
         yours = (other.amplitude, other.frequency, other.frequency_end or 0.0)
-        # A proposal repeated after other records differs by this much.
+        # The same proposal, made again after other recordings, may differ by 10 %.
         return all(isclose(a, b, rel_tol=0.1) for a, b in zip(mine, yours, strict=True))
 
 
@@ -109,7 +111,7 @@ class Plan(TomlTable):
 
     Attributes
     ----------
-    baud : of the serial line.
+    baud : speed of the serial line.
     """
 
     version: Literal[1] = 1

@@ -1,4 +1,4 @@
-"""`plan.toml`: read it, write it, add to it; every fault is one line a person can act on."""
+"""Read, write and extend `plan.toml`; every mistake in it gives a message of one line."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -19,28 +19,29 @@ from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.submission.toml_section import toml_section
 
 NAME = "plan.toml"
-LONGEST_RUN = 600.0  # s; a limit for the time of a simulation and the size of a file
+LONGEST_RUN = 600.0  # s. Limits the time of a simulation and the size of a file
 
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # data files have its name
+_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,60}")  # a data file has the same name
 _HEAD = """\
-# What to record, in this order; `cartlab acquire` carries it out. Change what you like: `cartlab
-# plan` leaves what stands here alone and adds tables at the end as the data allow it, dwells after
-# the sweep, the closed loop after the dwells. Delete the file to begin anew.
+# What to record, in this order. `cartlab acquire` makes the recordings. Change what you like.
+# `cartlab plan` does not touch the entries below. It adds tables at the end as soon as the data
+# allow it: dwells after the sweep, the closed loop after the dwells. To start again, delete this
+# file.
 #
 # carts          free to move; the others are held
 # release        the cart that is pulled out and let go by hand
 # wave           "square" is off for half a period, then on; "chirp" sweeps from frequency to
-#                frequency_end; "multisine" is the sum of its tones; "sine", "triangle", "sawtooth";
-#                "delta" is a short pulse
-# amplitude      {input}; of a closed loop {position}; 0 where a hand starts a decay
-# frequency      Hz, of the wave; the run takes cycles/frequency seconds
+#                frequency_end; "multisine" is the sum of its tones. Further waves are "sine",
+#                "triangle", "sawtooth" and "delta", a short pulse.
+# amplitude      {input}; in closed loop {position}. Zero if a hand starts a decay.
+# frequency      Hz, of the wave. The run takes cycles/frequency seconds.
 # settle         s of rest beforehand
 """
 _CHECK = """\
-# CHECK these two before you switch the motor on. A run that passes one is stopped; then divide its
-# amplitude by four and record it again.
-#   input    {input}: the most the motor is given
-#   travel   {position}: the furthest a cart may be from where it was zeroed; runs aim at 40 % of it
+# CHECK these two limits before you switch the motor on. A run that passes one is stopped; then
+# divide its amplitude by four and record it again.
+#   input    {input}. The largest input of the motor.
+#   travel   {position}. The largest distance of a cart from where it was zeroed; runs aim at 40 %.
 """
 
 
@@ -54,7 +55,7 @@ def load_plan(submission: Submission) -> Plan:
 
     Raises
     ------
-    ConfigError : one line with the file, the key, what was expected, what was found.
+    ConfigError : the plan is wrong; one line gives the file, the key, what was expected and found.
     """
     path = plan_path(submission)
     where = f"{submission.folder.resolve().name}/{NAME}"
@@ -65,12 +66,13 @@ def load_plan(submission: Submission) -> Plan:
 
 
 def save_plan(plan: Plan, submission: Submission) -> Path:
-    """Write the plan, or add its new recordings to the file; same plan, same bytes.
+    """Write the plan, or add its new recordings to the file; the same plan gives the same bytes.
 
     Raises
     ------
-    ConfigError : the existing file is broken, or would be; nothing is written.
-    ValueError : it does not begin with the recordings of the file, which are never overwritten.
+    ConfigError : the existing file is broken, or would be afterwards; nothing is written.
+    ValueError : the plan does not begin with the recordings of the file, which are never
+        overwritten.
     """
     path = plan_path(submission)
     if path.exists() or path.is_symlink():
@@ -91,9 +93,10 @@ def save_plan(plan: Plan, submission: Submission) -> Path:
 
 
 def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Plan) -> Plan:
-    """Add recordings to the end of a submission's plan as it is now; return that plan.
+    """Append recordings to the current plan of a submission; return the new plan.
 
-    The proposal may have taken minutes, while others added theirs. An id that is taken is changed.
+    Computing the proposal may have taken minutes, and others may have added recordings meanwhile.
+    An id that is already taken is changed.
 
     Parameters
     ----------
@@ -101,7 +104,7 @@ def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Pl
 
     Raises
     ------
-    ConfigError : the plan is broken, or would be; nothing is written.
+    ConfigError : the plan is broken, or would be afterwards; nothing is written.
     """
     with turn_in(folder):
         submission = load_submission(folder)
@@ -114,7 +117,7 @@ def add_recordings(folder: Path, proposed: Sequence[Recording], *, otherwise: Pl
 
 
 def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Recording, ...]:
-    """Return the recordings, each with a unique id: "step-3" if there is a "step-2"."""
+    """Return the recordings with unique ids: "step-3" if there is already a "step-2"."""
     used, renamed = set(taken), []
     for recording in proposed:
         name = recording.id
@@ -129,7 +132,7 @@ def renamed(proposed: Sequence[Recording], *, taken: Sequence[str]) -> tuple[Rec
 
 
 def plan_text(plan: Plan, system: System) -> str:
-    """Return a whole `plan.toml`, with comments."""
+    """Return the text of a whole `plan.toml`, with comments."""
     units = {"input": system.input.unit, "position": system.position.unit}
     return "\n".join(
         [
@@ -175,7 +178,7 @@ def _tuples(value: Any) -> Any:
 
 
 def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
-    """Yield (location, problem) for problems that no single value shows."""
+    """Yield (location, problem) for problems that involve several values."""
     first: dict[str, int] = {}
     for i, recording in enumerate(plan.recordings):
         name = recording.id.lower()  # some file systems ignore case
@@ -189,7 +192,7 @@ def _problems(plan: Plan, system: System) -> Iterator[tuple[Location, str]]:
 def recording_problems(
     recording: Recording, limits: PlanLimits, system: System
 ) -> Iterator[tuple[str, str]]:
-    """Yield (key, problem) for problems that no single value of a recording shows."""
+    """Yield (key, problem) for problems that involve several values of a recording."""
     n, carts, wave = system.carts, recording.carts, recording.wave
     if not _ID.fullmatch(recording.id):
         wanted = "letters, digits, dots, dashes; its data files are named after it"
@@ -211,27 +214,27 @@ def recording_problems(
     if (wave == "multisine") != bool(recording.tones) or len(recording.tones) > MOST_TONES:
         found = len(recording.tones)
         yield "tones", f"expected 1 to {MOST_TONES} for a multisine, else none, found {found}"
-    elif recording.tones and _peak(recording) > 1.01:  # the peak may be between the points
+    elif recording.tones and _peak(recording) > 1.01:  # the true peak may lie between the points
         yield "tones", f"their sum reaches {_peak(recording):.3g} times `amplitude`, at most 1 does"
     yield from _loop_problems(recording, n)
 
 
 def _peak(recording: Recording) -> float:
-    """Return the peak of a multisine of amplitude one."""
+    """Return the peak of a multisine of amplitude 1."""
     h, share, phase = (column[:, None] for column in np.array(recording.tones).T)
-    # 16 points of a period of the highest.
+    # 16 points per period of the highest tone.
     turns = np.linspace(0.0, 1.0, 16 * int(h.max()), endpoint=False)
     return float(np.max(np.abs((share * np.sin(2 * np.pi * h * turns + phase)).sum(axis=0))))
 
 
 def _time_problems(recording: Recording) -> Iterator[tuple[str, str]]:
-    """Yield times that no bench accepts: it drops the command, and streams nothing."""
+    """Yield problems with times: a bench ignores such a command and sends no data."""
     low, high = FREQUENCIES
     for key in ("frequency", "frequency_end"):
         hertz = getattr(recording, key)
         if hertz is not None and not low <= hertz <= high:
             yield key, f"expected {low:g} to {high:g} Hz, found {hertz:g}"
-    # A rest is a run of one period.
+    # A rest is a run of one period, so the same limits apply.
     if recording.settle and not 1 / high <= recording.settle <= LONGEST_RUN:
         expected = f"0, or {1 / high:g} to {LONGEST_RUN:g} s"
         yield "settle", f"expected {expected}, found {recording.settle:g}"

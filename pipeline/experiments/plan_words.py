@@ -1,4 +1,4 @@
-"""A plan for people: what is recorded, what must be held, how long it takes."""
+"""Describe a plan for people: what is recorded, what must be held, how long it takes."""
 
 from collections.abc import Collection, Sequence
 from itertools import groupby
@@ -9,11 +9,11 @@ from pipeline.words.numbers import count
 
 
 def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ()) -> str:
-    """Return the recordings in order, under a line whenever carts must be held or freed.
+    """Return the recordings in order, with a line whenever carts must be held or freed.
 
     Parameters
     ----------
-    new : ids that were not in the plan before; each is marked with +.
+    new : ids that were not in the plan before. Each is marked with +.
     """
     n, done = submission.system.carts, recorded_ids(plan, submission)
     wide = max((len(recording.id) for recording in plan.recordings), default=0)
@@ -41,7 +41,7 @@ def plan_table(plan: Plan, submission: Submission, *, new: Collection[str] = ())
 def plan_data(
     plan: Plan, submission: Submission, *, new: Collection[str] = ()
 ) -> dict[str, object]:
-    """Return the plan for JSON, with derived values; `new` as for the table."""
+    """Return the plan with derived values for JSON; `new` as for `plan_table`."""
     done, everyone = recorded_ids(plan, submission), range(1, submission.system.carts + 1)
     recordings = [
         {
@@ -64,17 +64,17 @@ def plan_data(
 
 
 def recorded_ids(plan: Plan, submission: Submission) -> frozenset[str]:
-    """Return the ids of the recordings that the submission has."""
+    """Return the ids of the recordings that the submission already has."""
     return frozenset(r.id for r in plan.recordings) & {e.id for e in submission.experiments}
 
 
 def session_time(recordings: Collection[Recording]) -> float:
-    """Return the duration of recordings, rests included, s, without the time for hands."""
+    """Return the duration of recordings in s, with rests but without handling the carts."""
     return sum(recording.settle + recording.duration for recording in recordings)
 
 
 def hold_words(carts: Sequence[int], *, n: int) -> str:
-    """Return which carts to hold and which to free."""
+    """Return in words which carts to hold and which to free."""
     held = [cart for cart in range(1, n + 1) if cart not in carts]
     if not held:
         return "all carts free" if n > 1 else "cart 1 free"
@@ -86,7 +86,7 @@ def _carts(carts: Sequence[int]) -> str:
 
 
 def what_words(recording: Recording, submission: Submission) -> str:
-    """Return the content of one recording and its duration."""
+    """Return the content of one recording and its duration, in words."""
     if recording.amplitude == 0:
         what = f"{recording.kind}: pull cart {recording.release} out, let it go"
     else:

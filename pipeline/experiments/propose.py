@@ -1,8 +1,8 @@
-"""Propose recordings: cautious runs first, then those chosen with a quick model of the carts.
+"""Propose recordings: cautious runs first, then runs chosen with the identified carts.
 
-Nothing is known at first, so inputs are a few percent of the motor's range, and a hand releases the
-carts. Once a sweep is recorded, the identified carts determine the dwell frequencies and inputs.
-Once the dwells are recorded, the designed controller is run.
+At first nothing is known, so inputs are a few percent of the motor's range, and carts are released
+by hand. After a sweep, the identified carts determine the dwell frequencies and inputs. After the
+dwells, the designed controller is run.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,33 +33,33 @@ from pipeline.words.numbers import count
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-AIM = 0.4  # of the travel limit: the intended motion of the carts
-FURTHEST = 0.8  # of the travel limit: allowed for a transient, as the quick model may err
+AIM = 0.4  # of the travel limit. The intended motion of the carts
+FURTHEST = 0.8  # of the travel limit. Allowed for a transient, as the first model may be wrong
 
 # About 1 cm in common units; an ECP 210 has 440 counts per centimetre.
 _ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0, "counts": 440.0}
 
 # Shares of the input limit while nothing is known. A bench's motor moves its carts some 5 to 15 cm
-# at full scale, and at a resonance several times that.
+# at full scale, and at a resonance several times as far.
 _FIRST_STEP = 0.04
-_REPEATS = "ab"  # of a decay
+_REPEATS = "ab"  # one decay for each letter
 EDGES = 4  # half periods of a step: off, on, off, on
 _SWEEP_TIME = 20.0  # s
 _FIRST_SETTLE = 5.0  # s
 FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
 
 _DWELLS = 24
-_STEP = 0.9  # of the aim: the level of a step; it overshoots up to twice as far
+_STEP = 0.9  # of the aim. The final level of a step; it overshoots up to twice as far
 
 
 @dataclass(frozen=True, kw_only=True)
 class MadePlan:
-    """A plan with a message about what was written.
+    """A plan, with a message about what was written.
 
     Attributes
     ----------
-    said : what was written, in one sentence.
-    trouble : why the data could not be used; "": they were used, or no data exist.
+    said : the message, in one sentence.
+    trouble : why the data could not be used. Empty if they were used, or if there are no data.
     """
 
     plan: Plan
@@ -75,11 +75,11 @@ def current_plan(submission: Submission, *, bench: Description | None = None) ->
 
 
 def make_plan(submission: Submission, *, stock: bool = False, progress: Progress) -> MadePlan:
-    """Write plan.toml, or add the recordings that the data allow.
+    """Write plan.toml, or add the recordings that the data make possible.
 
     Parameters
     ----------
-    stock : the bench knows the stock commands only.
+    stock : whether the bench knows only the stock commands.
     """
     carts = submission.system.carts
     bench = Description(name="stock", encoders=2, carts=carts) if stock else None
@@ -87,7 +87,7 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
     progress("choosing further recordings")
     try:
         new, trouble = extend_plan(old, submission, bench=bench), ""
-    except DataError as error:  # if the data cannot help, a plan stays as it is
+    except DataError as error:  # if the data cannot be used, the plan stays as it is
         new, trouble = old, str(error)
     added = new.recordings[len(old.recordings) :]
     new, path = add_recordings(submission.folder, added, otherwise=old), plan_path(submission)
@@ -97,13 +97,13 @@ def make_plan(submission: Submission, *, stock: bool = False, progress: Progress
 
 
 def propose_plan(submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Propose the first runs from the submission's statements about the bench, without data.
+    """Propose the first recordings from the submission's statements about the bench, without data.
 
     Existing recordings are not proposed again. `extend_plan` continues from there.
 
     Parameters
     ----------
-    bench : its own description; None: a bench that knows every command.
+    bench : the bench's own description. None for a bench that knows every command.
     """
     system, recorded = submission.system, submission.experiments
     limits = _limits(system, submission.design, bench)
@@ -122,7 +122,7 @@ def propose_plan(submission: Submission, *, bench: Description | None = None) ->
 
 
 def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None = None) -> Plan:
-    """Add what the recorded data allow: dwells after a sweep, the closed loop after dwells.
+    """Add what the recorded data make possible: dwells after a sweep, the loop after dwells.
 
     Existing entries stay unchanged and in place. Recordings that were added once are not added
     again. A bench without state feedback gets a PID on cart 1.
@@ -147,10 +147,13 @@ def extend_plan(plan: Plan, submission: Submission, *, bench: Description | None
 
 
 def _wants_dwells(plan: Plan, submission: Submission) -> bool:
-    """Whether there are no dwells yet, and a sweep (or everything planned) is recorded."""
+    """Whether dwells should be added: no dwell exists, and a sweep is recorded.
+
+    If no sweep is planned, a recorded step is enough.
+    """
     n, recorded = submission.system.carts, submission.experiments
     kinds = {e.kind for e in recorded if len(e.carts) == n}
-    if any(r.aim for r in plan.recordings):  # the person planned dwells; these replace the proposal
+    if any(r.aim for r in plan.recordings):  # these replace the standard dwells
         return False
     if kinds & {"sine", "bode"} or any(r.kind == "sine" for r in plan.recordings):
         return False
@@ -160,7 +163,7 @@ def _wants_dwells(plan: Plan, submission: Submission) -> bool:
 
 
 def _wants_loop(plan: Plan, submission: Submission) -> bool:
-    """Whether there is no loop yet, and the dwells are recorded."""
+    """Whether a loop should be added: no loop exists, and all planned dwells are recorded."""
     ids = {e.id for e in submission.experiments}
     kinds = {e.kind for e in submission.experiments}
     kinds_planned = {r.kind for r in plan.recordings}
@@ -176,12 +179,12 @@ def _wants_loop(plan: Plan, submission: Submission) -> bool:
 
 
 def _limits(system: System, design: Design | None, bench: Description | None) -> PlanLimits:
-    """Return the stated limits, or usual ones for a person to check."""
+    """Return the stated limits, or usual ones that a person must check."""
     per_count = system.input.per_count or (bench.input_per_count if bench else None)
     if per_count is None and system.input.unit == "V":
         per_count = DUTY_COUNT
     stated = design.input_limit if design else None
-    # In an unknown unit, nobody can say what input the motor takes: a usual one is proposed.
+    # In an unknown unit, nobody knows which input the motor takes, so a usual value is proposed.
     most = FULL_SCALE * per_count if per_count else stated or 5.0
     asked = abs(design.reference) if design else 1.0
     travel = _ABOUT_1_CM.get(system.position.unit, asked or 1.0) / AIM
@@ -191,7 +194,7 @@ def _limits(system: System, design: Design | None, bench: Description | None) ->
 
 
 def _decays(cart: int, system: System) -> list[Recording]:
-    """Release one cart by hand, with the others held; a cart without a spring cannot swing."""
+    """Return releases of one cart by hand, with the others held; empty if it has no spring."""
     if not (system.springs[cart - 1] or system.springs[cart]):
         return []
     return [let_go(cart, name=f"decay-{cart}{repeat}", seconds=10.0) for repeat in _REPEATS]
@@ -239,8 +242,8 @@ def _steps(
 
 
 def _sweep(system: System, limits: PlanLimits, *, chirps: bool) -> Recording:
-    """Sweep once over the usual frequencies, or switch on and off many times."""
-    # A chirp ends 20 times higher; of a square wave, edges are 2.5 s apart.
+    """Return one chirp over the usual frequencies, or without chirps a long square wave."""
+    # A chirp ends at 20 times this frequency. The edges of the square wave are 2.5 s apart.
     frequency = 0.5 if chirps else 0.5 / 2.5
     return Recording(
         id="sweep",
@@ -255,7 +258,7 @@ def _sweep(system: System, limits: PlanLimits, *, chirps: bool) -> Recording:
     )
 
 
-# ------------------------------------------------------------ from the quick model
+# ------------------------------------------------------- from the identified carts
 
 
 def identified_chain(analysis: Analysis) -> Chain:
@@ -263,13 +266,13 @@ def identified_chain(analysis: Analysis) -> Chain:
 
     Raises
     ------
-    DataError : they are not identified, with the reason.
+    DataError : the carts are not identified; the message gives the reason.
     """
     fit = analysis.fit
     if fit is None or not fit.converged:
         why = fit.message if fit else _reason(analysis, Stage.FINAL_ESTIMATES, Stage.BODE_FIT)
         raise DataError(
-            f"the next recordings need identified carts, and none are identified: {why}"
+            f"the next recordings need identified carts, but the carts are not identified: {why}"
         )
     if not fit.chain.is_tied:
         raise DataError(
@@ -320,11 +323,13 @@ def _driven(chain: Chain, limits: PlanLimits) -> list[Recording]:
 def _loop(
     analysis: Analysis, submission: Submission, limits: PlanLimits, bench: Description | None
 ) -> Recording:
-    """Step the set point of the designed loop on and off, or that of a PID on a stock bench.
+    """Return a recording in which the set point of a loop steps on and off.
+
+    The loop is the designed one, or a PID on a stock bench.
 
     Raises
     ------
-    DataError : there is no design or no PID, with the reason.
+    DataError : there is no design or no PID; the message gives the reason.
     """
     feedback = analysis.feedback
     if feedback is None:
@@ -332,10 +337,10 @@ def _loop(
             f"no closed loop can be proposed: {_reason(analysis, Stage.STATE_FEEDBACK)}"
         )
     task = submission.design or Design(cart=feedback.cart)
-    # Carts before the controlled one may go further than it does.
+    # Carts before the controlled one may move further than it does.
     furthest = float(np.max(np.abs(feedback.y)) / abs(feedback.reference))
     size = min(abs(task.reference), FURTHEST * limits.travel / furthest)
-    edge = max(3.0 * task.settling_time, 2.0)  # s between edges of the set point
+    edge = max(3.0 * task.settling_time, 2.0)  # s between steps of the set point
     recording = Recording(
         id="control",
         kind="closed_loop",
@@ -356,11 +361,11 @@ def _loop(
 
 
 def rounded(value: float) -> float:
-    """Return the number with two digits, as people type it."""
+    """Return the number with two significant digits."""
     return float(f"{value:.2g}")
 
 
 def rounded_down(value: float) -> float:
-    """Return the number with two digits, rounded towards zero."""
+    """Return the number with two significant digits, rounded towards zero."""
     size = 10.0 ** (floor(log10(abs(value))) - 1)
     return float(f"{floor(abs(value) / size * (1 + 1e-12)) * size:.2g}") * (1 if value > 0 else -1)

@@ -1,4 +1,4 @@
-"""The benefit of a proposed experiment, beside the program's own choice."""
+"""The benefit of a proposed experiment, compared with cartlab's own choice."""
 
 from dataclasses import dataclass
 
@@ -8,8 +8,8 @@ from pipeline.experiments.next_recordings import choose_next, tells_nothing
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.results import Analysis
 
-# The fit treats the error of each sample as independent; the rounding error of a cart that hardly
-# moves is the same in many samples.
+# The fit treats the error of each sample as independent, but for a cart that hardly moves the
+# rounding error is the same in many samples.
 _WHY_WORSE = (
     "the fit would be worse: while carts rest, or move by few counts, the rounding errors of their "
     "encoders do not average out; try a larger motion, or a shorter run"
@@ -18,12 +18,12 @@ _WHY_WORSE = (
 
 @dataclass(frozen=True, kw_only=True)
 class Weighed:
-    """Relative errors: now, after the proposed one alone, after the chosen one alone.
+    """Relative errors: now, after the proposed recording alone, and after the best one alone.
 
     Attributes
     ----------
-    words : the parameter, "zeta_2".
-    why : why the proposed one does not help, or harms; "": it helps.
+    words : the parameter, such as "zeta_2".
+    why : why the proposed recording does not help, or harms. Empty if it helps.
     """
 
     words: str
@@ -49,7 +49,7 @@ def weigh(
     error = find_goal(goal, known, feedback=analysis.feedback).of
     why = tells_nothing(proposed, known, limits=plan.limits)
     after = found.now if why else float(error(known.told + known.of_recording(proposed)))
-    if after > 1.01 * found.now:  # times the present error: a visible difference in two digits
+    if after > 1.01 * found.now:  # 1 % is visible in two digits
         why = _WHY_WORSE
     return Weighed(
         words=found.words,

@@ -1,1 +1,1 @@
-"""Pages served to a browser on this computer: who may ask, and who may stay connected."""
+"""Serve pages to a browser on this computer: admit requests and limit connections."""

@@ -1,4 +1,4 @@
-"""Who may ask: what every answer to a browser carries, and which requests another page made."""
+"""Decide which requests to answer, and add the security headers to every answer."""
 
 from collections.abc import Collection, Mapping
 from typing import Any, Protocol
@@ -21,31 +21,34 @@ HEADERS: Mapping[str, str] = {
 
 
 class Door(Protocol):
-    """Knows who may come in."""
+    """The rules for who may send requests."""
 
     def site(self, headers: Headers) -> str:
-        """Return scheme, name and port by which a request asks; "" if they do not lead here."""
+        """Return the address (scheme, name and port) that a request uses; "" if it is not ours."""
         ...
 
     @property
     def arrivals(self) -> bool:
-        """Whether people may come from another page, by a link or led on by a login.
+        """Whether a person may come from another page, by a link or a login.
 
-        A whole page may then be asked for, which writes nothing and no other page can read.
+        Such a request may only load a whole page. It changes nothing, and the other page cannot
+        read the answer.
         """
         ...
 
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
-        """Return what the application is to know of who asks, or the answer to who may not."""
+        """Return information about the sender for the application, or the response that refuses."""
         ...
 
 
 class Guard:
-    """Lets in who the door knows and no other page.
+    """Passes on requests that the door admits, and refuses those made by other pages.
 
     Parameters
     ----------
-    headers : of every answer; those that a page sets itself stand.
+    app : the application.
+    door : the rules.
+    headers : added to every answer, unless the page itself sets them.
     """
 
     def __init__(self, app: ASGIApp, door: Door, *, headers: Mapping[str, str] = HEADERS) -> None:
@@ -72,26 +75,26 @@ class Guard:
 
 
 def refuse(why: str, *, status: int = 403) -> Response:
-    """Return the answer to who may not ask, after which the connection ends."""
+    """Return the answer that refuses a request and closes the connection."""
     return PlainTextResponse(why, status_code=status, headers={"Connection": "close"})
 
 
 def list_own_names(port: int) -> frozenset[str]:
-    """Return what this computer is called by a page that is served at a port of it."""
+    """Return the addresses of this computer for a page served at one of its ports."""
     return frozenset(f"http://{host}:{port}" for host in ("127.0.0.1", "localhost"))
 
 
 def find_site(sites: Collection[str], headers: Headers) -> str:
-    """Return which of the addresses a request asks for, or "" if it matches none."""
+    """Return the one of these addresses that a request uses, or "" if it uses none."""
     host = headers.get("host", "")
     return next((site for site in sites if site.partition("://")[2] == host), "")
 
 
 def _find_refusal(headers: Headers, method: str, door: Door) -> str:
-    """Return why a request is not one of our own pages' or of a person; "" where it is.
+    """Return why a request must be refused, or "" if a person or our own page sent it.
 
-    Names that lead here from elsewhere have another Host; other pages have another Origin, and
-    browsers say Sec-Fetch-Site of what they were made to ask.
+    A foreign name that leads to this computer has a different Host. Another page has a different
+    Origin, and browsers state in Sec-Fetch-Site which page caused a request.
     """
     origin, site = headers.get("origin"), door.site(headers)
     if not site:

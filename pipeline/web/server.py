@@ -1,8 +1,8 @@
 """A server in its own thread, without an access log.
 
-Anybody on this computer can connect. Connections that are not admitted yet share a fixed number of
-places, so that the server never runs out of descriptors. uvicorn's own limits do not do this: it
-keeps every idle connection, and its `limit_concurrency` refuses all later ones.
+Anybody on this computer can connect. Connections that are not yet admitted share a fixed number of
+places, so the server never runs out of file descriptors. The limits of uvicorn do not ensure this.
+It keeps every idle connection, and its `limit_concurrency` refuses all later ones.
 """
 
 import asyncio
@@ -14,15 +14,15 @@ from starlette.types import ASGIApp, Scope
 from uvicorn import Config, Server
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-_BACKLOG = 32  # connections accepted in one turn of the loop, before any can be driven out
-# Connections not let in; the newest drives out the oldest. A request that is there when its
-# connection is accepted reaches the application three turns later, so it is never driven out first.
+_BACKLOG = 32  # connections accepted in one turn of the loop, before any can be closed
+# Most connections that are not admitted; a new one closes the oldest. A request that arrives with
+# its connection reaches the application three turns later, so it is never closed before that.
 _MOST_STRANGERS = 4 * _BACKLOG
 _STRANGER_STAYS = 5.0  # s
 
 
 class Served:
-    """An application that is served at a port that is open already."""
+    """An application served at a port that is already open."""
 
     def __init__(self, app: ASGIApp, listener: socket.socket) -> None:
         self._listener = listener
@@ -30,9 +30,9 @@ class Served:
             app,
             http=_limit_strangers(),
             backlog=_BACKLOG,
-            proxy_headers=False,  # a peer is who it is, whatever it says of itself
+            proxy_headers=False,  # take the sender's address from the connection, not from headers
             log_config=None,
-            log_level="critical",  # nothing that holds the address is written anywhere
+            log_level="critical",  # do not log addresses
             access_log=False,
             lifespan="off",
             ws="none",
@@ -46,11 +46,11 @@ class Served:
 
     @property
     def runs(self) -> bool:
-        """Whether it serves."""
+        """Whether the server is running."""
         return self._thread.is_alive()
 
     def start(self) -> bool:
-        """Serve; tell whether it does."""
+        """Start the server; return whether it runs."""
         self._thread.start()
         while not self._server.started:
             if not self._thread.is_alive():
@@ -59,7 +59,7 @@ class Served:
         return True
 
     def stop(self) -> None:
-        """Serve no more, and free the port."""
+        """Stop the server and free the port."""
         self._server.should_exit = True
         self._thread.join()
         self._listener.close()
@@ -71,8 +71,8 @@ def let_in(scope: Scope) -> None:
 
 
 def _limit_strangers() -> type[asyncio.Protocol]:
-    """Return HTTP over connections that end soon unless `let_in` is called for a request."""
-    strangers: dict[asyncio.Transport, asyncio.TimerHandle] = {}  # the oldest first
+    """Return an HTTP protocol that closes connections soon unless `let_in` admits a request."""
+    strangers: dict[asyncio.Transport, asyncio.TimerHandle] = {}  # oldest first
 
     def forget(transport: asyncio.Transport) -> None:
         if timer := strangers.pop(transport, None):

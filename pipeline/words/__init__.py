@@ -1,1 +1,1 @@
-"""How numbers, lists, names and sentences are written: the same words in every room."""
+"""Write numbers, lists, names and sentences in the same way everywhere."""

@@ -1,7 +1,7 @@
 """Mathematics as a small tree, rendered as MathML, as plain text, or by the PDF template.
 
-A leaf is a string: a number ("24.3"), an operator ("+"), or an identifier ("ω", "s"); anything
-longer that is not a number is set upright. A node is `Math(kind, parts)`.
+A leaf is a string: a number ("24.3"), an operator ("+"), or an identifier ("ω", "s"). A longer
+identifier is set upright. A node is `Math(kind, parts)`.
 """
 
 import re
@@ -21,7 +21,7 @@ Kind = Literal["row", "fraction", "sub", "sup", "dot", "ddot", "matrix", "parens
 
 @dataclass(frozen=True)
 class Math:
-    """A node; `columns` is the width of a matrix, whose parts go row by row."""
+    """A node; a matrix has its parts row by row, and `columns` is its width."""
 
     kind: Kind
     parts: tuple["Term", ...]
@@ -32,7 +32,7 @@ Term = Math | str
 
 
 def row(*parts: Term) -> Math:
-    """Return terms side by side."""
+    """Return terms in a row."""
     return Math("row", parts)
 
 
@@ -68,7 +68,7 @@ def matrix(rows: Iterable[Sequence[Term]]) -> Math:
 
 
 def lines(equations: Iterable[Term]) -> Math:
-    """Return equations one below the other."""
+    """Return equations below each other."""
     return Math("lines", tuple(equations))
 
 
@@ -76,12 +76,12 @@ THIN_SPACE, WIDE_SPACE, NO_BREAK = "\u2009", "\u2003", "\u00a0"
 
 
 def upright(words: str) -> str:
-    """Return words inside a formula as one leaf; its spaces stay."""
+    """Return words inside a formula as one leaf, with their spaces."""
     return words.replace(" ", NO_BREAK)
 
 
 def function(name: str, *argument: Term) -> tuple[Term, ...]:
-    """Return the name of a function before its argument; one without brackets stands apart."""
+    """Return a function's name and its argument, with a space between unless it has brackets."""
     return (THIN_SPACE, name, *(argument or (THIN_SPACE,)))
 
 
@@ -96,12 +96,12 @@ def total(terms: Sequence[Term]) -> Term:
 
 
 def negative(term: Term) -> Math:
-    """Return the term with a minus sign before it."""
+    """Return the term with a minus sign in front."""
     return row("−", term)
 
 
 def symbol(name: str) -> Term:
-    """Return a parameter name such as `omega_a`, `K_1` or `mass` as it is written by hand."""
+    """Return a parameter name such as `omega_a`, `K_1` or `mass` as a mathematical symbol."""
     read = read_name(name)
     base = GREEK.get(read.symbol, read.symbol)
     return sub(base, read.suffix) if read.suffix else base
@@ -111,7 +111,7 @@ GREEK = {"omega": "ω", "zeta": "ζ", "delta": "δ", "mass": "m", "damping": "c"
 
 
 def number(text: str) -> Term:
-    """Return a formatted number ("−1.2 × 10⁻³") as a term that reads as one."""
+    """Return a formatted number ("−1.2 × 10⁻³") as one term."""
     unsigned = text.removeprefix("−")
     mantissa, times, exponent = unsigned.partition(" × 10")
     term: Term = mantissa
@@ -141,7 +141,7 @@ def _mathml(term: Term) -> str:
         case "row":
             return f"<mrow>{inside}</mrow>"
         case "parens":
-            # A bracket free to grow takes room even where it need not.
+            # A stretchable bracket takes more room, so it is used only for tall terms.
             grow = "true" if any(map(_is_tall, term.parts)) else "false"
             left, right = (f'<mo stretchy="{grow}">{bracket}</mo>' for bracket in "()")
             return f"<mrow>{left}<mrow>{inside}</mrow>{right}</mrow>"
@@ -175,9 +175,9 @@ def _is_tall(term: Term) -> bool:
 
 
 def _aligned(line: Term) -> str:
-    """Return a line in three cells, so that all lines meet at their equals sign.
+    """Return a line in three cells, so that the equals signs of all lines are aligned.
 
-    A line that begins with a plus sign goes on with the one above.
+    A line that begins with a plus sign continues the line above it.
     """
     if isinstance(line, Math) and line.parts[:1] == ("+",):
         return f"<mtd></mtd><mtd></mtd><mtd>{_mathml(line)}</mtd>"
@@ -198,7 +198,7 @@ def _mathml_leaf(leaf: str) -> str:
 
 
 def to_text(term: Term) -> str:
-    """Return the mathematics in one line of text, for readers that cannot see it."""
+    """Return the mathematics in one line of text, for screen readers."""
     if isinstance(term, str):
         return f" {term} " if term in _RELATIONS or term in "+" else term
     parts = [to_text(part) for part in term.parts]
@@ -228,12 +228,12 @@ def to_text(term: Term) -> str:
 _IN_TEX = {
     "−": "-", "→": r"\to", "≤": r"\le", "≠": r"\ne", "·": r"\cdot", "π": r"\pi", "μ": r"\mu",
     "τ": r"\tau", "λ": r"\lambda", "φ": r"\phi", "δ": r"\delta", WIDE_SPACE: r"\quad",
-    NO_BREAK: "\\",  # with the space that follows it
+    NO_BREAK: "\\",  # "\\" includes the space that follows it
 }  # fmt: skip
 
 
 def to_tex(term: Term) -> str:
-    """Return a formula without matrices and derivations as TeX."""
+    """Return a formula as TeX; matrices and derivations are not supported."""
     if isinstance(term, str):
         return _tex_leaf(term)
     first, *others = term.parts
@@ -268,8 +268,8 @@ def _tex_leaf(leaf: str) -> str:
 
 
 def _tex_row(parts: Sequence[Term]) -> str:
-    """Return terms with a space between them, but where a bar, a sign or a slash joins them."""
-    text, joined, bars = "", True, 0  # joined: nothing parts what comes from what was
+    """Return terms with spaces between them, except next to a bar, a sign or a slash."""
+    text, joined, bars = "", True, 0  # `joined`: no space before the next part
     for before, part in zip((None, *parts), parts, strict=False):
         if part == THIN_SPACE:
             continue
@@ -283,5 +283,8 @@ def _tex_row(parts: Sequence[Term]) -> str:
 
 
 def _is_called(name: Term | None, brackets: Math) -> bool:
-    """Whether brackets hold what a function is of: its name is a word, or they begin with time."""
+    """Whether these brackets hold a function's argument, rather than a product.
+
+    They do if the name before them is a word, or if they begin with time.
+    """
     return brackets.parts[0] == "t" or (isinstance(name, str) and len(name) > 1)

@@ -1,4 +1,4 @@
-"""How numbers and lists are written: once, here, so that every page says the same."""
+"""Write numbers and lists in the same way on every page."""
 
 import math
 import re
@@ -8,13 +8,13 @@ _SUPERSCRIPT = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _SUBSCRIPT = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _PLAIN_RANGE = (1e-3, 1e5)  # sizes written without a power of ten
 _MOST_DIGITS = 8
-_FINEST = 1e-8  # an error this far below the value is that of exact data: its digits say nothing
+_FINEST = 1e-8  # a smaller relative error belongs to exact data and does not limit the digits
 NOTHING = "–"
 _TIMES = " × 10"
 _WHOLE = re.compile(r"[^\w]*\d+(?=\D|$)")
 _EXPONENT = re.compile(r"(?<![\w.])(-?\d+(?:\.\d+)?)e([+-]\d+)\b")
 _HYPHEN = re.compile(r"(?<![\w.)\]])-(?=\d)")
-# A space beside a sign of errors or powers, or between a number and its unit.
+# A space next to a sign of errors or powers, or between a number and its unit.
 _JOINT = re.compile(
     r"(?<=[\d⁰¹²³⁴-⁹)]) (?=[±×%°σ]|(?:(?:[kmµ]?(?:Hz|V|A|N|g|m|s)|cm|rad|dB|min|h|counts?)\b))"
     r"|(?<=[±×]) (?=[\d(])"
@@ -35,7 +35,7 @@ def significant(value: float | None, *, digits: int = 4, power: bool = False) ->
 
 
 def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
-    """Return "value ± std" for each of a column: all with a power of ten where one needs it."""
+    """Return "value ± std" for each in a column; if one needs a power of ten, all get one."""
     texts = [with_error(value, std) for value, std in column]
     if not any(_TIMES in text for text in texts):
         return texts
@@ -43,9 +43,9 @@ def with_errors(column: Sequence[tuple[float, float | None]]) -> list[str]:
 
 
 def with_error(value: float, std: float | None, *, digits: int = 2, power: bool = False) -> str:
-    """Return "value ± std", to the decimal place of the last of so many digits of the error.
+    """Return "value ± std", rounded to so many digits of the standard error.
 
-    With a power of ten where the size, or `power`, asks for it.
+    It has a power of ten if the size of the number, or `power`, requires it.
     """
     if std is None or not math.isfinite(std) or std <= 0 or not math.isfinite(value):
         return significant(value, power=power)
@@ -62,7 +62,7 @@ def with_error(value: float, std: float | None, *, digits: int = 2, power: bool 
 
 
 def complex_text(value: complex, *, digits: int) -> str:
-    """Return "−1.2 + 3.4 j"; a real number as one."""
+    """Return "−1.2 + 3.4 j", or only the real part if the number is real."""
     real = significant(value.real, digits=digits)
     if value.imag == 0:
         return real
@@ -71,7 +71,7 @@ def complex_text(value: complex, *, digits: int) -> str:
 
 
 def percent(value: float | None, *, signed: bool = False) -> str:
-    """Return a percentage: one decimal below 100 %, none above."""
+    """Return a percentage, with one decimal below 100 % and no decimals above."""
     if value is None or not math.isfinite(value):
         return NOTHING
     text = _fixed(value, 1 if abs(value) < 99.95 else 0)
@@ -79,25 +79,25 @@ def percent(value: float | None, *, signed: bool = False) -> str:
 
 
 def at_decimal(text: str) -> tuple[str, str]:
-    """Return a number as written, cut before its decimal mark: "−1", ".4 % (1.6 σ)"."""
+    """Return a written number in two parts, cut before its decimal mark: "−1", ".4 % (1.6 σ)"."""
     match = _WHOLE.match(text)
     return (match[0], text[match.end() :]) if match else (text, "")
 
 
 def typeset(text: str) -> str:
-    """Return a sentence with true minus signs and powers of ten, and no signed zero."""
+    """Return a sentence with real minus signs and powers of ten, and without signed zeros."""
     text = _EXPONENT.sub(lambda m: f"{m[1]} × 10{_superscript(int(m[2]))}", text)
     text = _HYPHEN.sub("−", text)
     return _SIGNED_ZERO.sub("0.0 %", text)
 
 
 def count(n: int, noun: str) -> str:
-    """Return "1 decay", "3 decays"."""
+    """Return a number with its noun: "1 decay", "3 decays"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def listing(items: Sequence[str], *, most: int | None = None) -> str:
-    """Return "a", "a and b", "a, b and c"; those beyond `most` as a number, "a, b and 3 more"."""
+    """Return "a", "a and b", "a, b and c"; with `most` the rest is counted, "a, b and 3 more"."""
     if most is not None and len(items) > most:
         items = [*items[:most], f"{len(items) - most} more"]
     if len(items) < 2:
@@ -106,20 +106,20 @@ def listing(items: Sequence[str], *, most: int | None = None) -> str:
 
 
 def first_few(names: Sequence[str], most: int) -> str:
-    """Return "a, b, c", those beyond `most` as a number, "a, b and 3 more"."""
+    """Return "a, b, c"; after `most` names the rest is counted, "a, b and 3 more"."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
 
 def abridge(ids: Sequence[str], *, most: int = 4) -> str:
-    """Return names, the middle of more than `most` left out: "a, b … z (9 in all)"."""
+    """Return names; if there are more than `most`, leave out the middle: "a, b … z (9 in all)"."""
     if len(ids) <= most:
         return ", ".join(ids)
     return f"{ids[0]}, {ids[1]} … {ids[-1]} ({len(ids)} in all)"
 
 
 def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Return one sentence a note, headed by the names of all it is about."""
+    """Return one sentence per note, beginning with the names of all items that have the note."""
     about: dict[str, list[str]] = {}
     for name, note in notes:
         if note:
@@ -128,17 +128,17 @@ def by_note(notes: Iterable[tuple[str, str]]) -> list[str]:
 
 
 def subscript(n: int) -> str:
-    """Return "₁" for 1, for texts that have no other way to set an index."""
+    """Return "₁" for 1, for texts without other means to write an index."""
     return str(n).translate(_SUBSCRIPT)
 
 
 def unit_text(unit: str) -> str:
-    """Return a unit with its powers raised and unbroken: "V s^2/cm" as "V s²/cm"."""
+    """Return a unit with raised powers and no-break spaces: "V s^2/cm" as "V s²/cm"."""
     return unit.replace("^2", "²").replace("^3", "³").replace(" ", "\u00a0")
 
 
 def unbroken(text: str) -> str:
-    """Return a text whose numbers stay in one line with their errors, powers and units."""
+    """Return a text in which numbers stay on one line with their errors, powers and units."""
     return _JOINT.sub("\u00a0", text)
 
 
@@ -153,7 +153,7 @@ def _is_plain(exponent: int) -> bool:
 
 
 def _fixed(value: float, decimals: int) -> str:
-    rounded = round(value, decimals) + 0.0  # no minus zero
+    rounded = round(value, decimals) + 0.0  # + 0.0 turns -0.0 into 0.0
     return f"{rounded:.{max(decimals, 0)}f}".replace("-", "−")
 
 

@@ -2,7 +2,7 @@
 
 A sentence has its values in braces and marks **strong** words, `code` and [links](#here). Code
 chooses the sentence and passes the values as text, which is never read as markup. A file is read
-when its first sentence is needed; only then are mistakes in it reported.
+when its first sentence is needed. Only then are mistakes in it reported.
 """
 
 import re
@@ -23,13 +23,13 @@ _LARGEST = 1_000_000  # bytes of a file
 
 @dataclass(frozen=True)
 class Phrases:
-    """The sentences of one file; each raises a `ConfigError` where the file does not serve it."""
+    """The sentences of one file; a `ConfigError` reports a mistake in the file."""
 
     path: Path
 
     @cached_property
     def by_key(self) -> Mapping[str, str]:
-        """The sentences of the file."""
+        """The sentences of the file, by key."""
         where = self._where()
         text = read_text(self.path, where=where, limit=_LARGEST, error=ConfigError)
         found = parse_toml(text, where=where, error=ConfigError)
@@ -39,20 +39,20 @@ class Phrases:
         return found
 
     def text(self, key: str, **values: object) -> str:
-        """Return a sentence without marks, its values put in."""
+        """Return a sentence without marks, with its values filled in."""
         return _filled_in(self._template(key, values), values)
 
     def cells(self, key: str, **values: object) -> list[str]:
-        """Return the headings of a table, which stand between bars."""
+        """Return the headings of a table, which the file separates by bars."""
         template = self._template(key, values)
         return [_filled_in(part, values) for part in template.split(" | ")]
 
     def spans(self, key: str, **values: str | Spans) -> Spans:
-        """Return a sentence with its marks; values may be marked as well."""
+        """Return a sentence with its marks; values may have marks as well."""
         return tuple(span for span in _spans(self._template(key, values), values) if span.text)
 
     def _template(self, key: str, values: Mapping[str, object]) -> str:
-        """Return a sentence that uses only these values."""
+        """Return a sentence, after checking that it uses only these values."""
         known = f"it may name {', '.join(f'{{{v}}}' for v in sorted(values)) or 'no values'}"
         if key not in self.by_key:
             raise ConfigError(f"{self._where()}: the sentence {key} is missing; {known}")
@@ -90,7 +90,7 @@ def _spans(template: str, values: Mapping[str, str | Spans]) -> Iterator[Span]:
 
 
 def _filled(text: str, like: Span, values: Mapping[str, str | Spans]) -> Iterator[Span]:
-    """Yield the text in the style of a span; text values join it, marked ones stand alone."""
+    """Yield a text with its values, in the style of `like`; values with marks keep their own."""
     said = ""
     for i, part in enumerate(_VALUE.split(text)):
         value = values[part] if i % 2 else part

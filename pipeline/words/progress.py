@@ -1,4 +1,4 @@
-"""How a long job says what it is doing."""
+"""How a long job reports its progress."""
 
 from collections.abc import Callable
 
@@ -6,4 +6,4 @@ Progress = Callable[[str], None]
 
 
 def silent(text: str) -> None:
-    """Say nothing: the default of a job that nobody watches."""
+    """Do nothing: the default for a job whose progress nobody watches."""

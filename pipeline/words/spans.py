@@ -1,4 +1,4 @@
-"""Text with marks: strong words, links and mathematics in a line."""
+"""Text with marks: strong words, links and inline mathematics."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -8,9 +8,10 @@ from pipeline.words.math import Term
 
 @dataclass(frozen=True)
 class Span:
-    """A run of text in one style, a link, or inline mathematics.
+    """A piece of text in one style, a link, or inline mathematics.
 
-    Links of students are http, https or mailto; our own also lead into the page or beside it.
+    Links from students are http, https or mailto. cartlab's own may also lead to a place on the
+    page or to a file next to it.
     """
 
     text: str
@@ -36,5 +37,5 @@ def spans(*parts: str | Span | Spans) -> Spans:
 
 
 def plain(text: Spans) -> str:
-    """Return the text alone, for titles, alt texts and attributes."""
+    """Return only the text, for titles, alt texts and attributes."""
     return "".join(span.text for span in text)

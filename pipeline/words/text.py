@@ -1,4 +1,4 @@
-"""Plain words: parameter names inside sentences, and text that any page can show."""
+"""Parameter names inside sentences, and text that any page can show."""
 
 import re
 import unicodedata
@@ -12,7 +12,7 @@ _NAME = re.compile(r"\b(?:omega|zeta|K|X|m|c|k)_(?:\d|[a-h]|[nxy])\b|\b(?:omega|
 
 
 def rich(text: str) -> Spans:
-    """Return our own sentence, well set, with names such as `omega_a` as mathematics."""
+    """Return one of cartlab's sentences with names such as `omega_a` as mathematics."""
     text = typeset(text)
     parts: list[Span] = []
     end = 0
@@ -30,13 +30,13 @@ def name_span(name: str) -> Span:
 
 
 def symbol_text(name: str) -> str:
-    """Return a parameter's symbol where only text can stand: "ζ₁"; few letters can stand low."""
+    """Return a parameter's symbol as plain text, "ζ₁", as far as Unicode has the index."""
     read, text = read_name(name), name_span(name).text
     return text if read.cart is None else text.removesuffix(f"_{read.cart}") + subscript(read.cart)
 
 
 def with_symbols(text: str) -> str:
-    """Return a sentence with its parameters' symbols, as plain text."""
+    """Return a sentence with parameter names replaced by symbols, as plain text."""
     return _NAME.sub(lambda match: symbol_text(match[0]), text)
 
 
@@ -54,5 +54,5 @@ def clean(text: str) -> str:
 
 
 def capital(text: str) -> str:
-    """Return a phrase as a sentence begins."""
+    """Return a phrase with a capital first letter."""
     return text[:1].upper() + text[1:]

@@ -1,1 +1,1 @@
-"""The chain with its effects as a model for other programs: C, an FMU, MATLAB and Octave."""
+"""Export the chain with its effects as a model for other programs: C, FMU, MATLAB and Octave."""

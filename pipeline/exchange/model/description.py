@@ -1,8 +1,8 @@
-"""The content of a model, the same for every language: its parameters, bodies and laws.
+"""The content of an exported model, for all languages: its parameters, bodies and laws.
 
 Laws are expressions for `syntax`, with the names of the model: `p.m1`, `x.cart_1`, `v.motor`,
-`z.z1`. `u` is the force that arrives from the drive, and `on` is 1 while the drive is powered. In a
-spring, `d` is the stretch and `rate` its velocity.
+`z.z1`. `u` is the force of the drive on its body, and `on` is 1 while the drive is powered. In a
+spring's law, `d` is the stretch and `rate` its velocity.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -27,14 +27,14 @@ from pipeline.plant.nonlinear.effects.law import (
 from pipeline.plant.nonlinear.simulator.laws import settling
 from pipeline.set_up import Units
 
-_PHASE = 0.05  # rad of the fastest oscillation in a step: its period is right to 1e-4
+_PHASE = 0.05  # rad of the fastest oscillation per step. Its period is then right to 1e-4
 _LONGEST = 2e-4  # s
 _DIGITS = 10  # as in gap.json
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that may be changed."""
+    """A number that the user of the model may change."""
 
     name: str
     value: float
@@ -43,24 +43,24 @@ class Parameter:
 
     @property
     def text(self) -> str:
-        """The value as a number of any language."""
+        """The value as a number that all languages read."""
         return f"{self.value:.{_DIGITS}g}"
 
     @property
     def label(self) -> str:
-        """Its unit, and what it is."""
+        """The unit and the meaning."""
         return f"{self.unit}: {self.meaning}" if self.unit else self.meaning
 
 
 @dataclass(frozen=True)
 class Body:
-    """A cart, the motor behind a play, or a hidden mass.
+    """A cart, the motor in front of its play, or a hidden mass.
 
     Attributes
     ----------
     mass : an expression.
-    suffix : of its states, `x1` say.
-    start : the cart, from 0, that it starts with.
+    suffix : distinguishes its states, such as `1` in `x1`.
+    start : index (from 0) of the cart whose initial state it takes.
     """
 
     name: str
@@ -76,8 +76,9 @@ class Force:
 
     Attributes
     ----------
-    side, depth, rate : of a contact, which acts while `depth` has the sign of `side`. `rate` is the
-        velocity of `depth`.
+    side, depth, rate : expressions of a contact. It acts while `depth` has the sign of `side`.
+        `rate` is
+        the velocity of `depth`.
     pulls : whether a contact may pull too.
     """
 
@@ -92,7 +93,10 @@ class Force:
 
 @dataclass(frozen=True)
 class SpringTension:
-    """A spring with its stretch and its tension; `left` and `right` are its bodies, "" a wall."""
+    """A spring with its stretch and its tension.
+
+    `left` and `right` are the bodies at its ends; "" means a wall.
+    """
 
     meaning: str
     stretch: str
@@ -103,13 +107,13 @@ class SpringTension:
 
     @property
     def needs_rate(self) -> bool:
-        """Whether any part of its tension is a damper."""
+        """Whether a part of the tension is a damper."""
         return any(part.rate or "rate" in names_in(part.force) for part in self.tension)
 
 
 @dataclass(frozen=True)
 class Bristle:
-    """A state of dry friction; `force` and `rate` are linear in its bend `z`."""
+    """A state of dry friction, the bristle's bend `z`; `force` and `rate` are linear in it."""
 
     name: str
     title: str
@@ -119,12 +123,12 @@ class Bristle:
 
     @property
     def now(self) -> str:
-        """The force as it is."""
+        """The force in terms of the current bend."""
         return substitute(self.force, {"z": f"z.{self.name}"})
 
     @property
     def rate_at_zero(self) -> str:
-        """The rate while the bristle is straight."""
+        """The rate of the bend while the bristle is straight."""
         return substitute(self.rate, {"z": "0"})
 
     @property
@@ -142,14 +146,14 @@ class Bristle:
 
 @dataclass(frozen=True, kw_only=True)
 class Description:
-    """A model for the templates.
+    """The data of a model for the templates.
 
     Attributes
     ----------
     links : each hidden mass, with the force on its cart. The opposite force acts on the mass.
-    inputs : title and law of each step to `u`.
-    rest : (n_carts,) positions without dry friction.
-    turned : the recordings count the input the other way.
+    inputs : title and law of each step from the input to the force `u`.
+    rest : (n_carts,) rest positions. Dry friction is left out.
+    turned : whether the recordings have the opposite sign of the input.
     """
 
     units: Units
@@ -159,11 +163,11 @@ class Description:
     springs: tuple[SpringTension, ...]
     forces: tuple[Force, ...]
     links: tuple[tuple[str, Force], ...]
-    play: tuple[str, str, str] | None  # gap, stiffness, damping
+    play: tuple[str, str, str] | None  # gap, stiffness, damping; None without play
     frictions: tuple[Force, ...]
     bristles: tuple[Bristle, ...]
     inputs: tuple[tuple[str, str], ...]
-    delay: str  # a parameter, or ""
+    delay: str  # an expression, or ""
     lag: str
     readings: tuple[str, ...]
     rest: tuple[str, ...]
@@ -172,12 +176,12 @@ class Description:
 
     @property
     def driven(self) -> str:
-        """The body that the drive pushes."""
+        """The body on which the drive acts."""
         return "motor" if self.play else "cart_1"
 
     @property
     def contacts(self) -> list[Force]:
-        """The forces that act on one side of a position only."""
+        """The forces that act only on one side of a position."""
         parts = [*self.forces, *(part for s in self.springs for part in s.tension)]
         return [part for part in parts if part.side]
 
@@ -202,16 +206,16 @@ def describe(
     free: Collection[int] | None = None,
     turned: bool = False,
 ) -> Description:
-    """Return the content of a model.
+    """Return the content of a model for export.
 
     Parameters
     ----------
-    free : the carts that may move, default all. Nothing is known of the others.
-    turned : whether the recordings count the input the other way.
+    free : the carts that may move, by default all. Nothing is known of the others.
+    turned : whether the recordings have the opposite sign of the input.
 
     Raises
     ------
-    DataError : the drive leads its log, so the model would need future inputs.
+    DataError : the motor acts before its logged input, so the model would need future inputs.
     """
     chain, terms = model.chain, model.terms
     _refuse_lead(terms)
@@ -270,11 +274,11 @@ def describe(
 
 
 def _refuse_lead(terms: Sequence[EffectTerm]) -> None:
-    """Check that the drive does not lead its log.
+    """Refuse a model whose motor acts before its logged input.
 
     Raises
     ------
-    DataError : it does.
+    DataError : the delay is negative.
     """
     for term in terms:
         if term.effect.is_built("delay") and term.values[0] < 0.0:
@@ -300,7 +304,7 @@ def _name(term: EffectTerm, parameter: str) -> str:
 
 
 def _law(term: EffectTerm, text: str, **quantities: str) -> str:
-    """Return an expression of a law at its place."""
+    """Return the expression of an effect's law, with the names of its place in the model."""
     place = f"cart_{term.place or 1}"
     known = {"x": f"x.{place}", "v": f"v.{place}", **quantities}
     if term.effect.place == "spring":
@@ -333,7 +337,7 @@ def _parameters(
 
 
 def _acting_springs(chain: Chain, terms: Sequence[EffectTerm], free: Sequence[int]) -> list[int]:
-    """Return the springs at a free cart."""
+    """Return the springs that touch a free cart."""
     changed = {term.place for term in terms if term.effect.place == "spring"}
     there = (j for j, k in enumerate(chain.k, start=1) if k != 0.0 or j in changed)
     return [j for j in there if {j - 1, j} & {*free}]
@@ -357,7 +361,7 @@ def _bodies(
     others = []
     for term in built["play"]:
         mass = _names(term)[1]
-        # As in our own simulator, cart 1 keeps some mass of its own.
+        # As in cartlab's own simulator, cart 1 keeps at least 2 % of its mass.
         carts[0] = replace(carts[0], mass=f"max(p.m1 - {mass}, 0.02 * p.m1)")
         others.append(Body("motor", "motor, in play with cart 1", "_motor", mass, 0))
     for term in built["hidden mass"]:
@@ -389,7 +393,7 @@ def _springs(
 
 
 def _difference(letter: str, left: str, right: str) -> str:
-    """Return right minus left; a wall is at zero."""
+    """Return the expression right minus left; "" is a wall, at zero."""
     if not (left and right):
         return f"{letter}.{right}" if right else f"-{letter}.{left}"
     return f"{letter}.{right} - {letter}.{left}"
@@ -414,7 +418,7 @@ def _forces(terms: Sequence[EffectTerm], *, driven: str, free: Sequence[int]) ->
 
 
 def _link(term: EffectTerm) -> tuple[str, Force]:
-    """Return the hidden mass of an effect, and the force on the cart that it hangs on."""
+    """Return the hidden mass of an effect, and the force on the cart to which it is attached."""
     cart, hidden = f"cart_{term.place}", f"hidden_{term.place}"
     _, k, c = _names(term)
     force = f"{k} * (x.{hidden} - x.{cart}) + {c} * (v.{hidden} - v.{cart})"
@@ -422,9 +426,10 @@ def _link(term: EffectTerm) -> tuple[str, Force]:
 
 
 def _longest_step(model: AugmentedChain, free: Sequence[int]) -> float:
-    """Return the longest step in s: a twentieth of a radian of the fastest oscillation.
+    """Return the longest time step in s: a twentieth of a radian of the fastest oscillation.
 
-    In a contact it is a tenth. Our own simulator, of higher order, takes steps four times as long.
+    In a contact it is a tenth of a radian. cartlab's own simulator has a higher order and takes
+    steps four times as long.
     """
     step = 0.25 * SteppedBench(model, free=free).shortest_step
     cart = model.tables().cart

@@ -1,4 +1,6 @@
-"""The model as an FMU: FMI 2.0, co-simulation, with sources and, if there is a compiler, a binary.
+"""Export the model as an FMU: FMI 2.0 for co-simulation.
+
+It contains sources and, if there is a compiler, a binary.
 
 Reference: Functional Mock-up Interface for Model Exchange and Co-Simulation, version 2.0.4.
 """
@@ -19,15 +21,15 @@ from pipeline.exchange.model.description import Description
 from pipeline.exchange.model.sources import c_sources, render
 
 _COMPILERS = ("cc", "gcc", "clang")
-_PATIENCE = 120.0  # s; compiling takes 0.3 s
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # the first date of a zip: the same model gives the same bytes
+_PATIENCE = 120.0  # s. Compiling takes 0.3 s
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # a zip's first date, so that the same model gives the same bytes
 _LIBRARY = {"linux": "so", "darwin": "dylib", "win32": "dll"}
 _SYSTEM = {"linux": "linux", "darwin": "darwin", "win32": "win"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Variable:
-    """A variable in modelDescription.xml; `member` is its place in the C structure."""
+    """A variable in modelDescription.xml; `member` is its name in the C structure."""
 
     index: int
     name: str
@@ -44,7 +46,7 @@ def fmu(description: Description) -> tuple[bytes, bool]:
     sources = c_sources(description)
     variables = _variables(description)
     settable = sum(v.causality in ("input", "parameter") for v in variables)
-    # A tool checks that binary and description have the same GUID.
+    # The GUID in binary and description must be the same, as tools compare them.
     known = "".join([*sources.values(), *map(repr, variables), __version__])
     guid = f"{{{hashlib.sha256(known.encode()).hexdigest()[:32]}}}"
     said = {"guid": guid, "variables": variables, "settable": settable, "version": __version__}
@@ -98,7 +100,7 @@ def _variables(description: Description) -> list[Variable]:
 
 
 def compile_library(sources: Mapping[str, str]) -> bytes | None:
-    """Return the sources as a library for this computer; None without a working compiler."""
+    """Return the sources compiled to a library for this computer; None without a compiler."""
     compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
     if compiler is None or sys.platform not in _LIBRARY:
         return None

@@ -1,4 +1,4 @@
-"""A model saved for other programs: `model.fmu`, `model.c` with its header, and `model.m`."""
+"""Save a model for other programs: `model.fmu`, `model.c` with its header, and `model.m`."""
 
 from collections.abc import Collection
 from pathlib import Path
@@ -19,7 +19,7 @@ def save_model(
 ) -> str:
     """Write a model with its free carts into the folder `out`; return a sentence about it.
 
-    A model that needs future inputs is not written; the sentence says why.
+    A model that would need future inputs is not written; the sentence then says why.
     """
     driven = [record.input_scale for record in analysis.records if record.u is not None]
     turned = sum(scale > 0 for scale in driven) < sum(scale < 0 for scale in driven)
@@ -37,6 +37,6 @@ def save_model(
 
 
 def clear_model(out: Path) -> None:
-    """Remove an earlier model, which does not belong to the new gap analysis."""
+    """Remove an earlier model, because it does not belong to the new gap analysis."""
     for name in FILES:
         (out / name).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""A model as source code: `model.c` with its header, `model.m`, and the sources of the FMU."""
+"""Write a model as source code: `model.c` with its header, `model.m`, and the FMU's sources."""
 
 from collections.abc import Callable
 from functools import partial
@@ -15,12 +15,12 @@ _LETTERS = str.maketrans({"µ": "u", "μ": "u", "°": "deg", "²": "^2", "³": "
 
 
 def c_sources(description: Description) -> dict[str, str]:
-    """Return `model.h` and `model.c`."""
+    """Return the texts of `model.h` and `model.c`."""
     return {name: render(name, description, code=in_c) for name in ("model.h", "model.c")}
 
 
 def matlab_source(description: Description) -> str:
-    """Return `model.m`."""
+    """Return the text of `model.m`."""
     bodies = [body.name for body in description.bodies]
     bristles = [bristle.name for bristle in description.bristles]
     code = partial(in_matlab, bodies=bodies, bristles=bristles)
@@ -30,8 +30,8 @@ def matlab_source(description: Description) -> str:
 def render(
     name: str, description: Description, *, code: Callable[[str], str] = in_c, **more: Any
 ) -> str:
-    """Fill in a file of `templates/model`; `code` writes an expression in the file's language."""
-    import jinja2  # costs 50 ms
+    """Fill in a template of `templates/model`; `code` translates expressions."""
+    import jinja2  # takes 50 ms
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(TEMPLATES / "model"),
@@ -50,6 +50,6 @@ def render(
 
 
 def comment(text: str) -> str:
-    """Return a text that is safe in a comment: ASCII, and nothing that ends or opens a comment."""
+    """Return a text that is safe in a comment: only ASCII, and nothing that ends the comment."""
     plain = text.translate(_LETTERS).encode("ascii", "replace").decode().replace("\\", "/")
     return plain.replace("/*", "/ *").replace("*/", "* /").replace("??", "? ?")

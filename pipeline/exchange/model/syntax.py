@@ -2,7 +2,7 @@
 
 The laws of the effects are such expressions (`plant.nonlinear.effects.law`). Here their symbols are
 names of the model: `p.NAME` is a parameter, `x.BODY` a position, `v.BODY` a velocity and `z.NAME` a
-bristle. All other names are local variables.
+bristle of dry friction. All other names are local variables.
 """
 
 import ast
@@ -13,7 +13,7 @@ _FORMS = (
     ast.Expression, ast.BinOp, ast.UnaryOp, ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub,
 )  # fmt: skip
 
-# The functions of a law, and `pow` for powers that have no operator.
+# Functions allowed in a law. `pow` stands for powers, which have no operator in C.
 _MATH = {name: name for name in ("abs", "min", "max", "exp", "sin", "cos", "sign", "pow")}
 
 _IN_C = {"π": "PI", "inf": "INFINITY"}
@@ -21,7 +21,7 @@ _IN_MATLAB = {"π": "pi", "inf": "Inf"}
 
 
 def substitute(text: str, symbols: Symbols) -> str:
-    """Replace symbols of an expression by names or expressions."""
+    """Replace symbols of an expression by other names or expressions."""
     return ast.unparse(_Substitution(symbols).visit(ast.parse(text, mode="eval")))
 
 
@@ -47,7 +47,7 @@ class _Substitution(ast.NodeTransformer):
         return ast.Call(node.func, [self.visit(one) for one in node.args], [])
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-        """Simplify products and sums with 0 and 1, which may have replaced a symbol."""
+        """Simplify products and sums with 0 and 1; substituted symbols may leave these."""
         left, right = self.visit(node.left), self.visit(node.right)
         match node.op, _value(left), _value(right):
             case (ast.Mult(), 0, _) | (ast.Mult(), _, 0):
@@ -72,7 +72,7 @@ def _not_known(node: ast.AST) -> ValueError:
 
 
 class _Printer(ast.NodeTransformer):
-    """The part common to both languages; refuses every form that laws do not have."""
+    """The part common to both languages; it refuses anything that laws do not contain."""
 
     def __init__(self, functions: Mapping[str, str], constants: Mapping[str, str]) -> None:
         self._functions, self._constants = functions, constants
@@ -139,7 +139,7 @@ class _Matlab(_Printer):
         return ast.Name(f"{of}({self._order[of].index(node.attr) + 1})")
 
     def visit_BinOp(self, node: ast.BinOp) -> ast.AST:
-        # a^b^c is (a^b)^c here, but a**(b**c) in Python.
+        # In MATLAB a^b^c means (a^b)^c, in Python a**b**c means a**(b**c).
         nested = isinstance(node.right, ast.BinOp) and isinstance(node.right.op, ast.Pow)
         if isinstance(node.op, ast.Pow) and nested:
             return self._call("pow", self.visit(node.left), self.visit(node.right))

@@ -1,1 +1,1 @@
-"""Exploring a bench: record, identify, look for gaps, choose the next recording, again."""
+"""Explore a bench: record, identify, look for gaps, choose the next recording, and repeat."""

@@ -1,4 +1,4 @@
-"""An exploration of a bench on a line, which people watch and steer."""
+"""Explore a bench over a serial line, while people watch and intervene."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,8 +30,9 @@ def explore_bench(
 
     Parameters
     ----------
-    observers, buttons : see `acquire`; "skip" vetoes a chosen recording, before or during it, and
-        "stop" ends the exploration, also while it computes.
+    observers, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
+        "stop"
+        ends the exploration, even during a computation.
     goal, seconds, vetoes : see `Exploration`.
 
     Raises

@@ -1,4 +1,4 @@
-"""The next recording of an exploration, and its reason."""
+"""Choose the next recording of an exploration, with its reason."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -15,11 +15,11 @@ from pipeline.gap.types import Gap
 from pipeline.results import Analysis
 
 SETTLED = ("named", "none")
-# Noises squared, times seconds: explanations that no recording separates further stay in dispute.
-# At 200 readings a second, every tenth of which is independent, the criterion would differ by 20.
+# Separation squared times seconds: a recording below this limit cannot decide between explanations.
+# With 200 readings a second, of which every tenth is independent, the criterion would differ by 20.
 _APART = 1.0
-_HARD = 0.8  # of the amplitude that moves the carts as far as allowed: equivalent
-_FAR_OUT = "far"  # the aim of a recording that shows effects far out
+_HARD = 0.8  # of the amplitude that moves the carts as far as allowed; from here on it is as good
+_FAR_OUT = "far"  # the aim of a recording that shows effects at large motion
 
 
 def choose_recording(
@@ -31,19 +31,19 @@ def choose_recording(
     refused: Sequence[Recording],
     commands: frozenset[str],
 ) -> tuple[Recording | None, str]:
-    """Return the next recording and its reason; None if all is known, or nothing would help.
+    """Return the next recording and its reason; None if everything is known or nothing helps.
 
-    First a recording that distinguishes explanations, then one that improves the worst parameter,
-    then one that shows effects far out.
+    A recording that distinguishes explanations comes first, then one that improves the worst
+    parameter, then one that shows effects at large motion.
 
     Parameters
     ----------
     missing : the parameters that are not known well enough, with their relative errors.
-    refused : nothing similar to these.
+    refused : recordings refused before. Nothing similar is chosen.
     commands : the extensions of the protocol that the bench knows.
     """
     named = gap is None or gap.verdict in SETTLED
-    # A named model whose error exceeds the noise is still one of several contenders.
+    # A named model whose error exceeds the noise still counts as only one of several contenders.
     settled = gap is None or (named and not gap.contenders)
     end = "" if named else WORDS.text("undecided")
     decides = gap and gap.proposal
@@ -55,15 +55,15 @@ def choose_recording(
         return recording, WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
     if missing and named:
         worst = max(missing, key=lambda name: missing[name])
-        # An open recording was refused, or is chosen next: it contains no information yet.
+        # Recordings of the plan without data give no information yet, so leave them out.
         made = plan.model_copy(update={"recordings": ()})
         try:
             found = choose_next(analysis, made, n=1, goal=worst, commands=commands, without=refused)
-        except DataError as error:  # the large step is left
+        except DataError as error:  # a large step is still possible
             end = str(error)
         else:
             return found.recordings[0], found.said
-    # Each once: carts that are held back go no further the second time.
+    # Record each only once: carts that were held back go no further the second time.
     recorded = {record.id for record in analysis.records}
     tried = [*refused, *(r for r in plan.recordings if r.id in recorded)]
     for recording, unseen in _reach_far_out(analysis, plan.limits):
@@ -78,9 +78,9 @@ def choose_recording(
 
 
 def _reach_far_out(analysis: Analysis, limits: PlanLimits) -> Iterator[tuple[Recording, str]]:
-    """Yield recordings that show effects far out, with the part not seen so far; "": all is seen.
+    """Yield recordings that show effects at large motion, with the range they add; "" if none.
 
-    A step as large as the carts may rest, and a sweep that swings them to both sides.
+    They are a step as far as the carts may rest, and a sweep that swings them to both sides.
     """
     chain = identified_chain(analysis)
     driven = [record for record in analysis.records if record.kind in ("step", "sweep")]

@@ -1,4 +1,4 @@
-"""The goal of an exploration: which errors to reach, and how long it may take."""
+"""The goal of an exploration: which errors to reach, and within what time."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ from pipeline.submission.complaints import nearest
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorGoal:
-    """The error to reach for every parameter whose name begins so; "": all of them."""
+    """The relative error to reach for all parameters with this name prefix; "" means all."""
 
     prefix: str = ""
     error: float = 0.01
@@ -21,7 +21,7 @@ class ErrorGoal:
 
         Raises
         ------
-        ConfigError : no parameter's name begins so.
+        ConfigError : no parameter's name has the prefix.
         """
         meant = {name: errors[name] for name in names_beginning(errors, self.prefix)}
         if not meant:
@@ -35,11 +35,11 @@ class ErrorGoal:
 
 
 def read_error_goal(text: str) -> ErrorGoal:
-    """Read "zeta 1%", "1 %" or "omega_1 0.05 %".
+    """Read a goal such as "zeta 1%", "1 %" or "omega_1 0.05 %".
 
     Raises
     ------
-    ConfigError : it has another form.
+    ConfigError : the text has another form.
     """
     before, _, after = text.partition("%")
     *name, share = before.split() or [""]
@@ -53,11 +53,11 @@ def read_error_goal(text: str) -> ErrorGoal:
 
 
 def read_time(text: str) -> float:
-    """Read "20min", "90 s" or "1.5h"; return seconds.
+    """Read a time such as "20min", "90 s" or "1.5h"; return seconds.
 
     Raises
     ------
-    ConfigError : it has another form.
+    ConfigError : the text has another form.
     """
     number = text.strip().rstrip("minsech ")
     unit = text.strip()[len(number) :].strip()

@@ -1,4 +1,4 @@
-"""Record, identify, look for the gap, choose, record, until all is known or time is up."""
+"""Record, identify, look for the gap and choose, until everything is known or time is up."""
 
 import gc
 from collections.abc import Callable, Sequence
@@ -39,9 +39,9 @@ from pipeline.submission.models import MOST_CARTS
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
 
-_FIRST = "sweep"  # of the plan proposed when nothing is known: it needs no hands
-_SEARCH = 300.0  # s for one search for the gap; most take ten
-_OFTEN = 2  # recordings made to distinguish explanations before another kind's turn
+_FIRST = "sweep"  # the first recording that the plan proposes; nobody has to hold a cart for it
+_SEARCH = 300.0  # s for one search for the gap. Most take ten
+_OFTEN = 2  # recordings in a row that distinguish explanations, before another purpose has its turn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,10 +50,10 @@ class Recorded:
 
     Attributes
     ----------
-    ids : of the recordings made.
-    seconds : total time of all tries.
-    vetoed : a person at the bench refused the missing ones.
-    why : otherwise, why they are missing, as far as known.
+    ids : the recordings made.
+    seconds : total time of all attempts.
+    vetoed : whether a person at the bench refused the missing recordings.
+    why : otherwise the reason why they are missing, if known.
     """
 
     ids: tuple[str, ...]
@@ -64,28 +64,33 @@ class Recorded:
 
 @dataclass(kw_only=True)
 class Exploration:
-    """A bench that is explored into a submission, turn by turn.
+    """An exploration of a bench, turn by turn, into a submission.
 
-    The submission, gap/gap.json and the diary are in its folder after each turn, whatever ends it.
-    A recording that a person adds to plan.toml comes before the program's own choice.
+    After each turn the folder holds the submission, gap/gap.json and the diary, however the
+    exploration ends. A recording that a person adds to plan.toml comes before cartlab's own choice.
 
     Attributes
     ----------
-    record : carries out recordings of the plan by their ids; the first call makes submission and
+    folder : the submission's folder.
+    record : makes recordings of the plan, given by their ids. The first call also makes submission
+        and
         plan if they are missing.
     goal : the errors to reach.
-    seconds : time at the bench, rests included; no recording begins that would exceed it. An
-        interrupted one counts each time it is tried.
+    seconds : time at the bench, with rests. No recording begins that would exceed it. An
+        interrupted
+        recording counts each time.
     tell : called with a sentence in each turn.
-    progress : called often, with a few words, during computations; an exception it raises ends the
+    progress : called often with a few words during computations. An exception that it raises ends
+        the
         exploration.
-    vetoes : returns whether a person refuses the chosen recording; then another is chosen.
-    turns : what was known in each turn.
-    made, spent : recordings since the last turn, and the time at the bench, s.
-    ours : ids of the plan that the program added; other open ones were added by a person.
+    vetoes : returns whether a person refuses the chosen recording. If so, another one is chosen.
+    turns : the knowledge after each turn.
+    made : recordings since the last turn.
+    spent : time at the bench, s.
+    ours : ids in the plan that cartlab added. A person added the other open ones.
     refused : recordings that were vetoed or failed.
     asked : recordings made to decide between explanations.
-    lost : why the last chosen recording is missing, if it is.
+    lost : the reason why the last chosen recording is missing. Empty if it is there.
     failures : number of failures in a row.
     """
 
@@ -111,18 +116,19 @@ class Exploration:
         Raises
         ------
         DataError : the first recordings do not identify the carts.
-        ConfigError : such carts do not have the goal's parameter, or the first sweep alone takes
-            too long.
+        ConfigError : these carts do not have the goal's parameter, or the first sweep alone takes
+            too
+            long.
         """
         self._begin()
         self._look()
         while (recording := self._take_turn()) is not None:
-            gc.collect()  # a turn leaves figures and searches, which are cycles with large arrays
+            gc.collect()  # figures and searches are reference cycles with large arrays
             self._try_out(recording)
         return tuple(self.turns)
 
     def _begin(self) -> None:
-        """Make the first runs if nothing is recorded, and if the goal can be met at all."""
+        """Make the first recordings of an empty submission, after checking the goal."""
         submission = load_submission(self.folder) if (self.folder / NAME).exists() else None
         self._check_goal(submission and submission.system)
         known = submission is not None and bool(submission.experiments)
@@ -152,7 +158,7 @@ class Exploration:
                 self._record([step.id for step in steps])
 
     def _check_goal(self, system: System | None) -> None:
-        """Refuse a goal that such carts cannot meet; None: their number is not known yet."""
+        """Refuse a goal that these carts cannot meet; None if their number is not known yet."""
         if system:
             names = parameter_names(system.carts, rigid=not system.bench.tied)
         else:
@@ -170,7 +176,7 @@ class Exploration:
         return self.spent + session_time(recordings) <= self.seconds
 
     def _look(self) -> None:
-        """Identify the carts and look for the gap with the present data."""
+        """Identify the carts and look for the gap with all data so far."""
         analysis = analyse(load_submission(self.folder), progress=self.progress)
         self.gap: Gap | None = None
         try:
@@ -181,7 +187,7 @@ class Exploration:
         self.analysis = _identify_beside(analysis, self.gap)
 
     def _propose(self, analysis: Analysis) -> None:
-        """Find the recording that decides between the explanations, and keep it in gap.json."""
+        """Find the recording that decides between the explanations, and save it in gap.json."""
         if self.gap is None:
             return
         often = [r for r in self.asked if sum(map(r.resembles, self.asked)) >= _OFTEN]
@@ -192,7 +198,7 @@ class Exploration:
         write_file(place / "gap.json", json_text(self.gap))
 
     def _take_turn(self) -> Recording | None:
-        """Report what is known; return the next recording, which is in the plan."""
+        """Report what is known; add the next recording to the plan and return it."""
         self.progress("what to record next")
         gap, errors = self.gap, relative_errors(self.analysis)
         missing = self.goal.missing(errors)
@@ -204,11 +210,11 @@ class Exploration:
         said, but = "; ".join(filter(None, parts)), ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)
-        elif recording and self.failures >= 3:  # in a row: the choice of recording is not the cause
+        elif recording and self.failures >= 3:  # in a row; choosing better does not help
             but = WORDS.text("none_came", count=self.failures)
         if but:
             said, recording = f"{said}, but {but}", None
-        wanting = bool(but or (self.failures and not recording))  # the last wish
+        wanting = bool(but or (self.failures and not recording))  # something useful was left undone
         turn = Turn(
             seconds=self.spent,
             recorded=self.made,
@@ -243,7 +249,7 @@ class Exploration:
             )
         except DataError as error:
             why = str(error)
-        # The computation took time: a person may have chosen meanwhile.
+        # A person may have added a recording during the computation.
         submission = load_submission(self.folder)
         done = {experiment.id for experiment in submission.experiments}
         still = [one for one in load_plan(submission).recordings if one.id not in done]
@@ -258,7 +264,7 @@ class Exploration:
         return recording, WORDS.text("therefore", name=recording.id, why=why)
 
     def _try_out(self, recording: Recording) -> None:
-        """Record what was chosen and look again, or remember that it failed."""
+        """Make the chosen recording and look again, or remember that it failed."""
         self.ours.add(recording.id)
         if self.vetoes(recording):
             came = Recorded(ids=(), seconds=0.0, vetoed=True)
@@ -275,11 +281,11 @@ class Exploration:
         key = "vetoed" if came.vetoed else "lost_why" if came.why else "lost"
         values = {"name": recording.id} | ({"why": came.why} if key == "lost_why" else {})
         self.lost = WORDS.text(key, **values) + "; "
-        self._propose(self.analysis)  # the question which recording decides is open again
+        self._propose(self.analysis)  # which recording decides must be found again
 
 
 def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
-    """Return the analysis with the carts as identified together with their effects.
+    """Return the analysis with the carts identified together with their effects.
 
     Raises
     ------
@@ -297,7 +303,8 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
     if covariance is None or not model.chain.is_tied:
         return analysis
     names = tuple(gap.chain_std)
-    # The residual of the linear chain is not noise; the encoders' own noise is used.
+    # With effects, the residual of the linear chain is not noise, so only the encoders' noise is
+    # used.
     noise = {name: np.ones_like(left) for name, left in fit.standardised.items()}
     parameters = named_estimates(model.chain, names=names, covariance=covariance, source="gap")
     fit = replace(
@@ -313,5 +320,5 @@ def _identify_beside(analysis: Analysis, gap: Gap | None) -> Analysis:
 
 
 def _shape(recording: Recording) -> str:
-    """Return the content of a recording, without its name."""
+    """Return the content of a recording without its name, for comparison."""
     return recording.model_copy(update={"id": "", "note": "", "aim": ""}).model_dump_json()

@@ -1,4 +1,4 @@
-"""A turn of an exploration in words: what is known, and what is in doubt."""
+"""Describe a turn of an exploration: what is known and what is in doubt."""
 
 import numpy as np
 
@@ -35,7 +35,7 @@ def tell_known(missing: dict[str, float], errors: dict[str, float | None]) -> st
 
 
 def tell_doubt(gap: Gap) -> str:
-    """Name the effects beside the linear carts, or the explanations in dispute."""
+    """Describe the effects found, or the explanations that are still in dispute."""
     named = abridge([effect_name(found.effect, found.where) for found in gap.effects])
     times = "a gap"
     if gap.noise_floor:
@@ -56,7 +56,7 @@ def tell_doubt(gap: Gap) -> str:
 
 
 def list_explanations(gap: Gap) -> tuple[WeighedExplanation, ...]:
-    """Return the models that may be true, the chosen one first; for a named gap, only that."""
+    """Return the models that may be true, the chosen one first; for a named gap only that one."""
     contenders = [(one, one.weight) for one in gap.contenders]
     if gap.verdict == "named":
         contenders = [(gap.model, 1.0)]
@@ -66,6 +66,6 @@ def list_explanations(gap: Gap) -> tuple[WeighedExplanation, ...]:
 
 
 def name_model(model: AugmentedChain) -> str:
-    """Return the effects of a model by name and place."""
+    """Return the effects of a model in words, by name and place."""
     names = [effect_name(term.effect, term.where) for term in model.terms]
     return " and ".join(names) or "the linear chain"
