@@ -1,1 +1,1 @@
-"""The residual of the linear model, and the physical effect that explains it on held-out runs."""
+"""Find the physical effects that the linear model lacks, and test them on held-out runs."""

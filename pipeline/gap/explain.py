@@ -1,4 +1,4 @@
-"""The gap workflow: split, fit the chain, search, judge, describe the rest."""
+"""The gap workflow: split the runs, fit the chain, search for effects, judge, describe the rest."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -43,12 +43,12 @@ from pipeline.words.progress import Progress, silent
 def investigate(analysis: Analysis, *, progress: Progress, budget: float | None = None) -> Gap:
     """Explain the gap of a submission's time records, starting from the identified chain.
 
-    Recordings that the identification left out are not used here. After `budget` s, compilation
-    excluded, the best answer so far is returned.
+    Recordings that the identification left out are not used here. `budget` is a time limit in s,
+    without compilation; if it is reached, the result is the best answer so far.
 
     Raises
     ------
-    DataError : no usable record.
+    DataError : no record can be used.
     """
     records, notes = drop_left_out(analysis.records, left_out=analysis.left_out)
     progress("preparing the simulator")
@@ -75,28 +75,29 @@ def explain_gap(
     budget: float | None = None,
     progress: Progress = silent,
 ) -> Gap:
-    """Find where the linear chain and the records disagree, name the cause, and shrink the gap.
+    """Find where the linear chain and the records disagree, name the cause, and reduce the gap.
 
     Parameters
     ----------
-    records : any kind but tables; all dwells beyond a few, and feedback runs if there are open-loop
-        runs, are left out.
-    chain : the estimate of the stages, used as one start of the fit.
+    records : any kind except tables. Dwells beyond a few are left out. So are feedback runs, if
+        there
+        are open-loop runs.
+    chain : the identified chain, as one start of the fit.
     catalogue : the effects that may be named.
-    budget : s; after that the best answer so far. By default the search ends by itself, and the
-        answer does not depend on the machine.
+    budget : time limit in s. If it is reached, the result is the best answer so far. By default
+        the search ends by itself, and the answer does not depend on the machine.
 
     Raises
     ------
-    DataError : no usable record.
+    DataError : no record can be used.
     """
     notes: list[str] = []
     interventions = find_interventions(records)
     runs = prepare(records, springs=bench.springs, interventions=interventions, notes=notes)
     training, held_out = take_sides(runs, notes=notes)
-    # One run more than before: the longest was cut in time.
+    # There is one run more than before if the longest one was cut in time.
     whole = runs if len(training) + len(held_out) > len(runs) and not any(bench.springs) else []
-    # The matrices are small: threads inside BLAS would only slow the workers down.
+    # The matrices are small, so threads inside BLAS would only slow the workers down.
     with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(max_workers=2) as pool:
         deadline = Deadline(pool.map, seconds=budget)
         progress("fitting the linear chain")
@@ -129,11 +130,11 @@ def explain_gap(
 
 
 def _describe(search: Search, bench: Bench) -> Gap:
-    """Return the result of a search."""
+    """Return the result of a search as a `Gap`."""
     study, path, chosen, final = search.study, search.path, search.chosen, search.final
     verdict, found, close = search.verdict, search.found, search.close
     driven = any(np.any(run.command) for run in study.training)
-    # Without an input the first mass is set to one.
+    # Without an input, the first mass is set to 1, which gives forces this unit.
     units = bench.units if driven else replace(bench.units, input=f"{bench.units.position}/s^2")
     effects = list_effects(path, final, found, units)
     traces = make_traces(path[0], chosen, study)
@@ -173,7 +174,7 @@ def _describe(search: Search, bench: Bench) -> Gap:
 
 
 def _notes(search: Search, budget: float | None) -> list[str]:
-    """Return notes on a search and its end for the reader."""
+    """Return the notes for the reader: on the search and on how it ended."""
     words, study, chosen, notes = phrases("gap"), search.study, search.chosen, search.notes.copy()
     times = f"{chosen.error / study.floor:.1f}"
     if search.verdict not in ("none", "unexplained") and not study.explains(chosen):
@@ -188,7 +189,7 @@ def _notes(search: Search, budget: float | None) -> list[str]:
 
 
 def _learnt_spread(fit: GapFit) -> dict[int, float]:
-    """Return the run-to-run spread of each cart's dry friction, if the runs needed one."""
+    """Return how much each cart's dry friction varies from run to run, if it varies."""
     moved = np.any([nuisance.scatter != 1.0 for nuisance in fit.nuisance], axis=0)
     dry = fit.structure.dry
     return {i + 1: float(fit.spread[i]) for i in range(len(dry)) if dry[i] and moved[i]}

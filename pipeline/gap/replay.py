@@ -1,4 +1,4 @@
-"""One run simulated with effects: from rest, or from its first readings."""
+"""Simulate one run with effects, from rest or from its first readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from pipeline.results import HardwareCheck, Record
 class Replay:
     """One cart under the measured input: the linear model, and the model with effects, (n,).
 
-    `rest` is its rest position, about which its motion counts.
+    `rest` is the cart's rest position, from which its motion is measured.
     """
 
     check: HardwareCheck
@@ -30,13 +30,13 @@ class Replay:
 def replay_driven(
     record: Record, checks: Sequence[HardwareCheck], model: AugmentedChain
 ) -> list[Replay]:
-    """Simulate a run with the measured input; [] if the carts diverge or nothing drives them.
+    """Simulate a run with the measured input; return [] if it diverges or has no input.
 
     Parameters
     ----------
-    checks : the linear model under the same input, cart by cart.
+    checks : the linear model under the same input, one for each cart.
     """
-    # Compiled code, which the linear report never needs.
+    # The linear report never needs this compiled code.
     from pipeline.plant.nonlinear.augmented import rest_positions, simulate_augmented
 
     if record.u is None:
@@ -51,14 +51,14 @@ def replay_driven(
         found = [
             run.rest[:, None] + (y - rest[:, None])[rows]
             for factor in sorted(factors, key=lambda factor: factor != 1.0)
-            if factor == 1.0 or not 1 / 1.5 <= factor <= 1.5  # no other scale: the model's error
+            if factor == 1.0 or not 1 / 1.5 <= factor <= 1.5  # else the model is wrong
             for y in [simulate_augmented(model, record.t, factor * record.u, free=run.free, x0=x0)]
         ]
     except DataError:
         return []
     as_logged, *others = found
     best = min(others, key=run.misfit, default=as_logged)
-    # A factor on the logged input is believed if it removes 0.6 of the error.
+    # A factor on the logged input is accepted if it reduces the error to 0.6 or less.
     chosen = best if run.misfit(best) < 0.6 * run.misfit(as_logged) else as_logged
     replays = []
     for check in checks:
@@ -71,7 +71,7 @@ def replay_driven(
 
 
 def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
-    """Return one record as the gap's fits see it; a decay starts when the hand has let go.
+    """Return one record as the fits of the gap use it; a decay starts after the hand has let go.
 
     Raises
     ------
@@ -81,11 +81,11 @@ def prepare_run(record: Record, *, springs: tuple[bool, ...]) -> GapRun:
 
 
 def replay_fitted(run: GapRun, model: AugmentedChain, *, springs: tuple[bool, ...]) -> Array:
-    """Return the readings (rows, samples) of a run, its start and zeros fitted as in the gap.
+    """Return the simulated readings (rows, samples) of a run, with start and zeros fitted.
 
     Raises
     ------
-    DataError : the carts diverge.
+    DataError : the simulation diverges.
     """
     from pipeline.gap.fit.baseline import fit_nuisance
     from pipeline.gap.fit.levenberg_marquardt import evaluate

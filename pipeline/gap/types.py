@@ -30,7 +30,7 @@ class NamedValue:
 
 @result()
 class Rival:
-    """Another effect in the same role, fitted as fully."""
+    """Another effect that could take the place of this one, fitted in the same way."""
 
     effect: Effect = written("its name in the catalogue")
     where: dict[str, int] = written(_WHERE)
@@ -88,7 +88,7 @@ class FreeRun:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trace:
-    """One cart in one run, for figures: measured, the linear model, the final model (n,).
+    """One cart in one run, for figures: measured, linear model and final model (n,).
 
     `zero` is the encoder's zero in that run, according to the final model.
     """
@@ -110,9 +110,10 @@ class LeftForce:
 
     Attributes
     ----------
-    t, x, v, u (windows, samples) : times, position, velocity, input (0 for carts other than 1).
-    weight (windows, samples) : of each sample in the mean; the weights of a window add up to one.
-    acceleration, force (windows,) : means.
+    t, x, v, u : (windows, samples) times, position, velocity, input. The input is 0 for carts other
+        than 1.
+    weight : (windows, samples) of each sample in the mean. The weights of a window add up to 1.
+    acceleration, force : (windows,) means.
     """
 
     experiment: str
@@ -126,7 +127,7 @@ class LeftForce:
     force: Array
 
     def mean(self, values: Array) -> Array:
-        """Return the mean of (windows, samples) values over each window, (windows,)."""
+        """Return the mean over each window (windows,) of values (windows, samples)."""
         return (self.weight * values).sum(axis=1)
 
 
@@ -147,7 +148,7 @@ class ForceFormula:
     @property
     @computed()
     def text(self) -> str:
-        """The sum of the terms, for people: "-0.0021 sqrt|v| sign v"."""
+        """The sum of the terms as text: "-0.0021 sqrt|v| sign v"."""
         signed = " ".join(
             f"{'-' if one.coefficient < 0 else '+'} {abs(one.coefficient):.3g} {one.term}"
             for one in self.terms
@@ -177,7 +178,7 @@ class ForceAgainst:
 
 @result()
 class Residual:
-    """The residual of one cart."""
+    """The unexplained force on one cart."""
 
     cart: int = written()
     unit: str = written("of the force")
@@ -198,8 +199,10 @@ class Prediction:
 
     Attributes
     ----------
-    pair : the two, from 0, that decide: by their weights the recording separates them best.
-    t, u : (n,) s and the input; `positions` (contenders, n) of `cart`.
+    pair : indices (from 0) of the two contenders that the recording separates best. The separation
+        counts by their weights.
+    t, u : (n,) time in s and input.
+    positions : (contenders, n) of `cart`.
     """
 
     pair: tuple[int, int]
@@ -217,9 +220,10 @@ class Proposal:
     ----------
     recording : a table of plan.toml.
     limits : the plan's limits for which it was chosen, by name.
-    separation : root mean square of the difference between the deciding two that no refit of the
-        other absorbs, in units of the noise.
-    prediction : None if it was read from a file.
+    separation : root mean square difference between the deciding two, in units of the noise. Only
+        the
+        part counts that no refit of the other model absorbs.
+    prediction : None if the proposal was read from a file.
     """
 
     recording: dict[str, Any]
@@ -252,10 +256,10 @@ class Gap:
     Attributes
     ----------
     bench : the set-up that the numbers refer to.
-    traces, left_forces : for the figures; missing in a gap that was read from a file.
-    chain_covariance : (n_p, n_p) covariance of the parameters in `chain_std`; None if it could not
-        be computed or was read from a file.
-    proposal : the next recording, as in a plan; None if no candidate was evaluated.
+    traces, left_forces : for the figures. Missing in a gap that was read from a file.
+    chain_covariance : (n_p, n_p) covariance of the parameters in `chain_std`. None if it could not
+        be computed or the gap was read from a file.
+    proposal : the next recording, as in a plan. None if no candidate was evaluated.
     """
 
     schema: Literal["cartlab-gap/1"] = written(default="cartlab-gap/1")
@@ -306,13 +310,13 @@ class Gap:
     @property
     @computed(older=None)
     def next_limits(self) -> dict[str, float] | None:
-        """The limits of plan.toml that it respects."""
+        """The limits of plan.toml for which it was chosen."""
         return self.proposal and self.proposal.limits
 
     @property
     @computed(older=None)
     def separation(self) -> float | None:
-        """The separation of the deciding two, in noises, after refits."""
+        """Root mean square difference of the deciding two after refits, in units of the noise."""
         return self.proposal and self.proposal.separation
 
     training: tuple[str, ...] = written("ids of the runs")
@@ -361,13 +365,13 @@ class Gap:
     @property
     @computed()
     def springs(self) -> tuple[bool, ...]:
-        """Wall-1, 1-2, …, n-wall."""
+        """Which springs exist: wall-1, 1-2, …, n-wall."""
         return self.bench.springs
 
     @property
     @computed()
     def chain(self) -> ChainWithUnits:
-        """The chain of the model."""
+        """The chain of the final model."""
         return ChainWithUnits.of(self.model.chain, self.bench.units)
 
     chain_std: dict[str, Number] = written(
@@ -392,14 +396,14 @@ class Gap:
         linear_chain: Chain,
         **own: Any,
     ) -> "Gap":
-        """Return the gap that a file holds."""
+        """Return the gap from the content of a file."""
         recording, limits, separation = (
             own.pop(name) for name in ("next_recording", "next_limits", "separation")
         )
         proposal = None
         if recording is not None and separation is not None:
             proposal = Proposal(recording=recording, limits=limits or {}, separation=separation)
-        del own["chain"]  # that of the model again
+        del own["chain"]  # the model has it too
         bench = Bench(springs=springs, units=units)
         return cls(
             bench=bench,
@@ -415,15 +419,15 @@ class Gap:
 
 
 def read_gap(text: str) -> Gap:
-    """Return the gap that a `gap.json` holds, without its traces.
+    """Return the gap of a `gap.json`, without its traces.
 
     Raises
     ------
-    ConfigError : the text is no `gap.json`, or its model is not of this catalogue.
+    ConfigError : the text is not a `gap.json`, or its model has effects unknown to this catalogue.
     """
     try:
         return read_json(Gap, text, readers={Effect: find_effect})
     except ValidationError as error:
         raise ConfigError(f"not what cartlab gap writes: {first_refusal(error)}") from None
-    except (ValueError, KeyError, TypeError) as error:  # null in place of a number, say
+    except (ValueError, KeyError, TypeError) as error:  # such as null in place of a number
         raise ConfigError(f"not what cartlab gap writes: {quote(str(error))}") from None

@@ -1,1 +1,1 @@
-"""Records prepared for fitting: which are used, training or held out, where a run begins."""
+"""Prepare records for fitting: which are used, which are held out, where a run begins."""

@@ -1,4 +1,4 @@
-"""How many readings of a residual count as independent."""
+"""Count the independent readings of a residual."""
 
 import numpy as np
 
@@ -8,9 +8,10 @@ from pipeline.arrays import Array
 def independent(residual: Array) -> float:
     """Return the number of independent readings in a residual (samples,).
 
-    Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543: a mean
-    square of n correlated points is as certain as one of n / (1 + 2 Σ ρ²). This holds for
-    oscillations, not for a drift.
+    A mean square of n correlated points is as certain as one of n / (1 + 2 Σ ρ²) independent
+    points. This holds for oscillations, not for a drift.
+
+    Reference: M. S. Bartlett, Journal of the Royal Statistical Society 98 (1935), 536-543.
     """
     power = np.abs(np.fft.rfft(residual - residual.mean(), 2 * residual.size)) ** 2
     covariance = np.fft.irfft(power)[: residual.size]

@@ -1,4 +1,4 @@
-"""Records prepared for fitting: free motion only, rest and start found, noise estimated."""
+"""Prepare one record for fitting: cut it to free motion; find rest, start and noise."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -13,12 +13,12 @@ from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
 from pipeline.results import Record
 
-_STILL = 2.6  # encoder steps, peak to peak, that count as rest
-_SMOOTHING = 0.03  # s, half width of a local cubic, at the usual pace
-_HELD_SAMPLES = 4  # fewer samples at the top are no hold …
-_HELD_TIME = 2.0  # … nor is a stay there within this many times that of free motion
-_RESTING = 1.5  # encoder steps within which a cart at rest reads …
-_ONE_READING = 0.07  # … and the time (s, at the usual pace) that counts as one independent reading
+_STILL = 2.6  # encoder steps, peak to peak. A smaller range counts as rest
+_SMOOTHING = 0.03  # s, half width of a local cubic. For a bench of carts
+_HELD_SAMPLES = 4  # Fewer samples at the top of the motion are not a hold
+_HELD_TIME = 2.0  # Nor is a stay there shorter than this many times that of free motion
+_RESTING = 1.5  # encoder steps. The range of the readings of a cart at rest
+_ONE_READING = 0.07  # s. At rest, this time counts as one independent reading
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,23 +27,26 @@ class GapRun:
 
     Attributes
     ----------
-    t (samples,), y (rows, samples) : times from the first sample used, and readings.
-    rows : (rows,) cart index (from 0) of each row; held carts are left out.
+    t : (samples,) times from the first sample used, s.
+    y : (rows, samples) readings.
+    rows : (rows,) cart index (from 0) of each row. Held carts are left out.
     free : (n,) which carts move.
-    guided : (n, samples) motion of held carts that are not held firmly; 0 for all others.
+    guided : (n, samples) motion of held carts that are not held firmly. Zero for all others.
     knots, command : the input, held from knot to knot.
-    at_rest : the carts do not move at the first sample.
-    start_known : the first readings determine the start; else it is fitted, since springs forget
-        it.
+    at_rest : whether the carts are at rest at the first sample.
+    start_known : whether the first readings determine the start. Otherwise it is fitted, since
+        springs
+        make the carts forget it.
     start, slope : (n,) first reading and velocity of each cart.
-    rest : (n,) rest positions, as read.
-    zero, zero_std : (n,) expected encoder zero, and its uncertainty.
+    rest : (n,) rest positions. These are readings.
+    zero, zero_std : (n,) expected encoder zero, and its uncertainty. See `with_zeros`.
     sigma : (rows,) noise of one sample.
-    weight : (rows, samples) square root of the weight of each sample, at most 1.
+    weight : (rows, samples) square root of the weight of each sample. At most 1.
     block : number of samples averaged to one residual, in `thin`.
-    pace : 1 for a bench of carts, smaller in proportion for faster systems.
-    shots : (shots + 1,) bounds of pieces with a start of their own; (0, samples) is the whole run.
-    shot_x, shot_v : (shots, n) smoothed states at the start of each shot, encoder zeros included.
+    pace : 1 for a bench of carts. Smaller in proportion for faster systems.
+    shots : (shots + 1,) bounds of pieces that have their own start. (0, samples) is the whole run.
+    shot_x, shot_v : (shots, n) smoothed states at the start of each shot. Encoder zeros are
+        included.
     """
 
     id: str
@@ -72,9 +75,9 @@ class GapRun:
 
     @property
     def start_std(self) -> tuple[Array, Array]:
-        """(n,) Uncertainty of `start` and `slope` from the first readings.
+        """(n,) each: standard errors of `start` and `slope` from the first readings.
 
-        Infinite where fitted.
+        They are infinite for a start that is fitted.
         """
         known = np.full(self.zero.size, np.inf)
         if self.start_known:
@@ -83,47 +86,48 @@ class GapRun:
 
     @property
     def swing(self) -> Array:
-        """(rows,) Root-mean-square of the reading about its rest."""
+        """(rows,) root-mean-square of the readings about their rest."""
         return np.sqrt(np.mean((self.y - self.rest[list(self.rows)][:, None]) ** 2, axis=1))
 
     @property
     def input(self) -> Array:
-        """(samples,) The input at each sample."""
+        """(samples,) the input at each sample."""
         if self.knots.size == self.t.size:
             return self.command
         return np.interp(self.t, self.knots, self.command)
 
     def by_cart(self, rows: Array, zero: Array) -> Array:
-        """Return (n, samples) positions about `zero` (n,) of readings (rows, samples).
+        """Return the positions (n, samples) for readings (rows, samples) and encoder zeros (n,).
 
-        0 for other carts.
+        Carts without readings get 0.
         """
         x = np.zeros((zero.size, self.t.size))
         x[list(self.rows)] = rows - zero[list(self.rows)][:, None]
         return x
 
     def with_noise(self, sigma: Mapping[int, float]) -> "GapRun":
-        """Return the run with the noise of some rows, by cart index."""
+        """Return the run with another noise for some carts, given by cart index."""
         own = [sigma.get(row, old) for row, old in zip(self.rows, self.sigma, strict=True)]
         return replace(self, sigma=np.array(own))
 
     def with_zeros(self, *, width: float) -> "GapRun":
-        """Return the run with the encoder zeros of the file, within `width` times the noise."""
+        """Return the run with the file's own encoder zeros, known to `width` times the noise."""
         std = np.full(self.zero.size, 1.0)
         std[list(self.rows)] = width * self.sigma
         return replace(self, zero=np.zeros(self.zero.size), zero_std=std)
 
     @cached_property
     def thin(self) -> "GapRun":
-        """Return the run as the fits use it: fast samples averaged in blocks, pieces unchanged."""
+        """The run as the fits use it: fast samples are averaged in blocks, pieces stay the same."""
         return _thin(self) if self.block > 1 else self
 
 
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
-    """Prepare one record of a bench with n carts; `in_motion`: it is cut from a longer one.
+    """Prepare one record of a bench with n carts.
 
-    A decay starts after the hand has let go; a slow or held beginning is cut. A decay that begins
-    in motion starts at its first turning point, where no hand can still act.
+    `in_motion` is true for a part of a longer record, which may begin in motion. A decay starts
+    after the hand has let go, so its beginning by hand is cut. A part that begins in motion starts
+    at its first turning point, where no hand can still act.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)
     y = np.array([record.position(row + 1) for row in rows])
@@ -131,11 +135,11 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     guided = _guided(record, n=n)
     t, u = record.t, record.u if record.u is not None else np.zeros(record.t.size)
     still = np.maximum(_STILL * resolution, 4.0 * difference_noise(y, order=4))
-    # The rest point is known only if the last eighth is at rest.
+    # The rest point is known only if the carts are at rest in the last 12 %.
     tail = y[:, -max(3, int(0.12 * t.size)) :]
     settled = np.ptp(tail, axis=1) <= still
     frequency = _dominant_frequency(t, y)
-    # Carts on a bench swing no faster than at 8 Hz.
+    # The carts of a bench swing at 8 Hz at most; a faster system gets a smaller pace.
     pace = min(1.0, 8.0 / frequency)
     if record.kind == "decay":
         offset = y - np.where(settled, tail.mean(axis=1), np.median(y, axis=1))[:, None]
@@ -173,7 +177,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
         zero_std=zero_std,
         sigma=np.maximum(resolution / np.sqrt(12.0), 1e-9 * span),
         weight=np.array([_weight(*row, length) for row in zip(y, resolution, strict=True)]),
-        block=max(1, int(rate * pace / 250.0)),  # Hz; faster samples are averaged for the fits
+        block=max(1, int(rate * pace / 250.0)),  # Hz. Faster samples are averaged for fits
         pace=pace,
         shots=(0, t.size),
         shot_x=start[None],
@@ -182,29 +186,29 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
 
 
 def _begins_at_rest(y: Array, u: Array, still: Array, sample_time: float) -> tuple[bool, bool]:
-    """Return whether a run starts at rest, and whether in equilibrium without an input."""
-    # The input may already act between the samples; the first two come before its effect.
+    """Return whether a run starts at rest, and whether it is in equilibrium without an input."""
+    # Samples before the input changes. The first two count too, as the input has no effect yet.
     quiet = max(2, int(np.argmax(u != u[0])) + 1)
-    # 20 ms without motion: the run starts at rest.
+    # A run without motion in its first 20 ms starts at rest.
     look = max(2, min(quiet, round(0.02 / sample_time)))
     at_rest = bool(np.all(np.ptp(y[:, :look], axis=1) <= still))
-    # A cart that moves before the input does was held, not in equilibrium.
+    # A cart that moves before the input changes was held, so it was not in equilibrium.
     in_place = bool(np.all(np.ptp(y[:, :quiet], axis=1) <= still))
     return at_rest, at_rest and in_place and bool(u[0] == 0.0)
 
 
 def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
-    """Return knots and an input held between them, with the mean of the smooth input."""
+    """Return knots, and a held input with the same mean between knots as the smooth input."""
     knots, smooth = interpolate_band_limited(t, u)
     return knots, np.append(0.5 * (smooth[1:] + smooth[:-1]), smooth[-1])
 
 
 def _guided(record: Record, *, n: int) -> Array:
-    """Return (n, samples) the smoothed motion of held carts, if it exceeds that of a reading."""
-    from scipy.signal import savgol_filter  # half a second: imported where it is used
+    """Return the motion (n, samples) of held carts, smoothed; zero if it is within a reading."""
+    from scipy.signal import savgol_filter  # takes half a second, so it is imported on use
 
     guided = np.zeros((n, record.t.size))
-    # A local cubic over 20 ms to either side: a hand holds no faster motion.
+    # A local cubic over 20 ms to either side; a hand allows no faster motion.
     half = max(2, round(0.02 / record.sample_time))
     for cart in record.carts:
         y = record.position(cart)
@@ -214,11 +218,11 @@ def _guided(record: Record, *, n: int) -> Array:
 
 
 def _thin(run: GapRun) -> GapRun:
-    """Return one reading for each block of samples, at the middle of its times.
+    """Return the run with one reading for each block of samples, at the middle of its times.
 
     The mean of a smooth motion exceeds its value in the middle by half the curvature times the
-    spread of the times. This is subtracted, so the model need not be simulated sample by sample.
-    The first sample of each piece, which defines its state, has no weight.
+    variance of the times. This is subtracted, so the model need not be simulated sample by sample.
+    The first sample of each piece defines its state and has no weight.
     """
     q = run.block
     t, y, weight, shots = [], [], [], [0]
@@ -227,7 +231,7 @@ def _thin(run: GapRun) -> GapRun:
         times = run.t[first:last].reshape(-1, q)
         middle = times.mean(axis=1)
         mean = run.y[:, first:last].reshape(len(run.y), -1, q).mean(axis=2)
-        if middle.size >= 3:  # enough for a curvature
+        if middle.size >= 3:  # the fewest blocks for a curvature
             slope = np.diff(mean, axis=1) / np.diff(middle)
             curvature = np.diff(slope, axis=1) / (0.5 * (middle[2:] - middle[:-2]))
             mean = mean - 0.5 * times.var(axis=1) * np.pad(curvature, ((0, 0), (1, 1)), mode="edge")
@@ -236,7 +240,7 @@ def _thin(run: GapRun) -> GapRun:
         y += [run.y[:, first : first + 1], mean]
         weight += [np.zeros((len(run.y), 1)), np.sqrt(share)]
         shots.append(shots[-1] + 1 + middle.size)
-    side = (1.0 - q**-2) / 24.0  # of each neighbour's mean in a corrected one
+    side = (1.0 - q**-2) / 24.0  # of each neighbour's mean, in the corrected mean
     return replace(
         run,
         t=np.concatenate(t),
@@ -252,8 +256,8 @@ def _thin(run: GapRun) -> GapRun:
 def _weight(readings: Array, step: float, length: int) -> Array:
     """Return the weight of each reading of one encoder.
 
-    A cart at rest repeats one rounding error: however long it rests, that counts as `length`
-    readings.
+    A cart at rest repeats the same rounding error. So however long it rests, its readings count as
+    `length` readings.
     """
     weight = np.ones(readings.size)
     if step <= 0.0:
@@ -269,9 +273,9 @@ def _weight(readings: Array, step: float, length: int) -> Array:
 
 
 def cut_shots(run: GapRun, *, length: float) -> GapRun:
-    """Cut a run into pieces, each with a start state of its own.
+    """Cut a run into pieces, each with its own start state.
 
-    `length` is in s at the usual pace.
+    `length` is in s for a bench of carts; it is scaled by the pace.
     """
     count = max(1, round(float(run.t[-1] - run.t[0]) / (length * run.pace)))
     bounds = np.linspace(0, run.t.size, count + 1).astype(int)
@@ -287,7 +291,7 @@ def cut_shots(run: GapRun, *, length: float) -> GapRun:
 
 
 def _dominant_frequency(t: Array, y: Array) -> float:
-    """Return the frequency (Hz) at which the velocity is strongest."""
+    """Return the frequency (Hz) with the strongest velocity."""
     uniform = np.linspace(t[0], t[-1], t.size)
     best, peak = 1.0, 0.0
     for row in y:
@@ -300,9 +304,10 @@ def _dominant_frequency(t: Array, y: Array) -> float:
 
 
 def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
-    """Return the first sample of a decay's free motion, which turns by `radians` a sample.
+    """Return the first sample of a decay's free motion.
 
-    None: it begins in motion. Then the largest motion's first turning point is used.
+    `radians` is the phase of the motion per sample. If it is None, the run begins in motion, and
+    the result is the first turning point of the cart that moves most.
     """
     leader = int(np.argmax(np.ptp(offset, axis=1) / np.maximum(still, 1e-12)))
     if radians is None:
@@ -317,15 +322,16 @@ def _free_from(offset: Array, still: Array, *, radians: float | None) -> int:
     last = top + int(held[gaps[0]] if gaps.size else held[-1])
     passing = _HELD_TIME * np.sqrt(2.0 * slack / peak) / radians
     if last - top < max(_HELD_SAMPLES, passing):
-        # Shaken, or released as the file begins: the largest swing is free of the hand.
+        # The carts were shaken, or released before the file begins: no hand acts after the largest
+        # swing.
         return last if top > 0 else 0
-    # The first turning point after the release, where no hand can still act.
+    # The first turning point after the release; no hand can still act there.
     side = np.sign(offset[leader, top])
     return last + int(np.argmin(side * offset[leader, last:]))
 
 
 def _smooth_state(t: Array, y: Array, at: int, *, window: float) -> tuple[float, float]:
-    """Return position and velocity at one sample from a local cubic."""
+    """Return position and velocity at one sample, from a local cubic."""
     half = max(3, round(window / float(t[1] - t[0])))
     low, high = max(0, at - half), min(t.size, at + half + 1)
     if high - low < 2 * half + 1:

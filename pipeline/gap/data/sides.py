@@ -1,4 +1,4 @@
-"""Which records are used, cut to the fits' needs, and which of them are held out."""
+"""Choose the records to use, cut them to runs, and hold some of the runs out."""
 
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from pipeline.results import Intervention, LeftOut, Record
 from pipeline.words.numbers import by_note
 from pipeline.words.phrases import phrases
 
-_MOST_DWELLS = 4  # sine dwells used; further ones add little beyond their frequency
-_LEAST_MOTION = 8.0  # encoder steps
+_MOST_DWELLS = 4  # sine dwells to use. Further ones add little beyond their frequency
+_LEAST_MOTION = 8.0  # encoder steps, a smaller motion is not used
 _FEWEST, _SHORTEST = 50, 0.5  # samples, s
 
 
 def drop_left_out(
     records: Sequence[Record], *, left_out: Sequence[LeftOut]
 ) -> tuple[list[Record], list[str]]:
-    """Return the records that the identification used, and a note for each other reason.
+    """Return the records that the identification used, and notes on those that it left out.
 
     Raises
     ------
@@ -43,13 +43,13 @@ def prepare(
     interventions: Sequence[Intervention] = (),
     notes: list[str],
 ) -> list[GapRun]:
-    """Return the runs worth fitting, with notes on those left out.
+    """Return the runs worth fitting; append a note on each that is left out.
 
-    The part of a record after an intervention is a run of its own.
+    The part of a record after an intervention is a separate run.
 
     Raises
     ------
-    DataError : no record with a free cart that moves.
+    DataError : there is no record in which a free cart moves.
     """
     n, words = len(springs) - 1, phrases("gap")
     timed = [r for r in records if r.kind != "bode"]
@@ -97,27 +97,28 @@ def _free_runs(record: Record, interventions: Sequence[Intervention], *, n: int)
                 let_go = piece.u is None or not np.any(piece.u)
                 piece = replace(piece, kind="decay" if let_go else "sweep")
             run = make_run(piece, n=n, in_motion=later)
-            # A cart that waits for a hand at rest shows nothing.
+            # A cart that waits at rest for a hand shows nothing.
             if piece.kind != "decay" or _last_away(run):
                 runs.append(run)
     return runs
 
 
 def _on_no_spring(run: GapRun) -> GapRun:
-    """Return a run whose readings are absolute positions, as no rest defines a zero, and its start.
+    """Return a run without springs: readings are absolute positions, and the start is known.
 
-    Without springs a start is never forgotten: a free start would absorb missing effects.
+    Without springs there is no rest to define a zero, and a start has a lasting effect. If it were
+    free, it would absorb missing effects.
     """
-    # A known zero may be off by a thousandth of the noise.
+    # The zero counts as known to a thousandth of the noise.
     known = np.full(run.zero.size, 1e-3 * float(run.sigma.min()))
     return replace(run, start_known=True, zero=np.zeros(run.zero.size), zero_std=known)
 
 
 def _is_usable(record: Record) -> bool:
-    """Return whether a free cart moves, for a known reason, for long enough."""
+    """Return whether a free cart moves for long enough, and by forces that are known."""
     if not record.free or record.t.size < _FEWEST or record.t[-1] - record.t[0] < _SHORTEST:
         return False
-    # Without its input only a release or a run with cart 1 held is usable.
+    # Without a recorded input, only a release or a run with cart 1 held is usable.
     known = record.u is not None or record.kind == "decay" or 1 not in record.free
     return known and _moves(record)
 
@@ -132,9 +133,9 @@ def _span(record: Record, cart: int) -> float:
 
 
 def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[Record]:
-    """Return the records; carts that move in none of them are marked as held."""
+    """Return the records, with carts that move in none of them marked as held."""
     seen = [(r, cart) for r in records for cart in r.free if cart in r.carts]
-    # A cart that stays within three encoder steps is at rest.
+    # A cart whose readings stay within three encoder steps is at rest.
     moving = {cart for r, cart in seen if _span(r, cart) > 3.0 * r.encoder_step(cart)}
     still = {cart for _, cart in seen} - moving
     if not still:
@@ -145,19 +146,19 @@ def _with_still_carts_held(records: list[Record], *, notes: list[str]) -> list[R
 
 
 def take_sides(runs: list[GapRun], *, notes: list[str]) -> tuple[list[GapRun], list[GapRun]]:
-    """Return training and held-out runs; if no run can be spared, the longest is cut in time."""
+    """Return training and held-out runs; if no run can be spared, cut the longest one in time."""
     teach, judge_by = split(runs)
     if judge_by:
         return [runs[i] for i in teach], [runs[i] for i in judge_by]
     notes.append(phrases("gap").text("note_cut"))
     longest = max(range(len(runs)), key=lambda i: runs[i].t[-1] - runs[i].t[0])
     run = runs[longest]
-    cut = int((1.0 - 0.4) * _last_motion(run))  # the share that is held out
+    cut = int((1.0 - 0.4) * _last_motion(run))  # 40 % of the motion is held out
     pieces = []
     for piece in (slice(0, cut), slice(cut, None)):
         record = replace(
             run.record,
-            # A later piece of a decay is free of hands.
+            # No hand acts in the later piece of a decay.
             kind=run.record.kind if piece.start == 0 and run.record.kind != "decay" else "sweep",
             t=run.t[piece],
             u=None if run.record.u is None else run.record.u[-run.t.size :][piece],
@@ -186,14 +187,14 @@ def _last_motion(run: GapRun) -> int:
 
 
 def _last_away(run: GapRun) -> int:
-    """Return the number of samples until all carts stay where they end; 0 if they never move."""
+    """Return the number of samples until all carts reach their final position; 0 without motion."""
     step = run.sigma * np.sqrt(12.0)
     away = np.abs(run.y - run.y[:, -1:]) > _LEAST_MOTION * step[:, None]
     return int(np.flatnonzero(away.any(axis=0))[-1]) + 1 if away.any() else 0
 
 
 def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:
-    """Return the runs without exact copies of earlier ones."""
+    """Return the runs without exact copies of earlier runs."""
     kept: list[GapRun] = []
     for run in runs:
         if not any(k.y.shape == run.y.shape and np.array_equal(k.y, run.y) for k in kept):
@@ -204,21 +205,24 @@ def without_twins(runs: Sequence[GapRun]) -> list[GapRun]:
 def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
     """Return the indices of training and held-out runs.
 
-    Whole runs are held out. Of repeats, one goes to each side. Of three sizes of a kind the middle
-    one is held out, so that both extremes are trained on. Of two free decays one is held out. Every
-    kind keeps one run in training. Nothing is held out of a single run, or of two sweeps, which
-    must be cut in time instead.
+    Whole runs are held out, by these rules:
+
+    - Every second one of repeats.
+    - The middle one of three or more sizes of a kind. So both extremes are trained on.
+    - The smaller one of two free decays.
+    - Never the last run of a kind.
+    - Nothing from a single run, or from only two sweeps. The caller then cuts a run in time.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, run in enumerate(runs):
         groups[run.record.kind, run.free].append(index)
     held: list[int] = []
-    pairs: list[list[int]] = []  # groups of two different runs, a last resort
+    pairs: list[list[int]] = []  # groups of two different runs, held out only as a last resort
     for (kind, _), members in groups.items():
         sizes = {i: _size(runs[i]) for i in members}
         clusters: list[list[int]] = []
         for i in sorted(members, key=lambda i: sizes[i]):
-            # Sizes within 6 % are repeats.
+            # Runs whose sizes differ by at most 6 % are repeats.
             if clusters and abs(sizes[i] - sizes[clusters[-1][0]]) <= 0.06 * abs(sizes[i]):
                 clusters[-1].append(i)
             else:
@@ -227,13 +231,13 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
             held += cluster[1::2]
         sizes_apart = [cluster[0] for cluster in clusters]
         if len(sizes_apart) >= 3:
-            # In order of signed size: the extremes of both signs are trained on.
+            # The order is by signed size, so the extremes of both signs are trained on.
             held.append(sizes_apart[len(sizes_apart) // 2])
         elif len(sizes_apart) == 2 and kind == "decay" and len(members) == 2:
             held.append(min(sizes_apart, key=lambda i: abs(sizes[i])))
         elif len(sizes_apart) == 2:
             pairs.append(sizes_apart)
-    # Of two sweeps alone, each may cover what the other does not, so both are trained on.
+    # Each of two sweeps may cover what the other lacks, so both are trained on.
     if not held and any(runs[i].record.kind != "sweep" for pair in pairs for i in pair):
         held = [min(pair, key=lambda i: abs(_size(runs[i]))) for pair in pairs[:1]]
     return [i for i in range(len(runs)) if i not in held], sorted(held)
@@ -242,7 +246,7 @@ def split(runs: Sequence[GapRun]) -> tuple[list[int], list[int]]:
 def _size(run: GapRun) -> float:
     """Return how hard a run was driven: its extreme input, or the start of a free decay.
 
-    Under feedback it is the reference, as the input is only the controller's response.
+    Under feedback it is the extreme reference, because the controller only responds with the input.
     """
     if run.record.reference is not None and np.ptp(run.record.reference) > 0.0:
         return float(np.ptp(run.record.reference))

@@ -1,1 +1,1 @@
-"""A model fitted to all runs at once: its vector, derivatives, steps and first estimate."""
+"""Fit a model to all runs at once: parameter vector, derivatives, steps and first estimate."""

@@ -1,4 +1,4 @@
-"""The linear chain fitted to all runs at once, so that only missing structure is left."""
+"""Fit the linear chain to all runs at once, so that only missing effects are left."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ from pipeline.plant.linear.chain import Chain
 def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     """Estimate masses, dampings and springs by modulating functions.
 
-    Without any input the first mass is one.
+    Without any input the first mass is 1.
     """
     n = len(springs) - 1
     rows = [j for j, there in enumerate(springs) if there]
@@ -29,29 +29,26 @@ def first_chain(runs: Sequence[GapRun], *, springs: Sequence[bool]) -> Chain:
     found = [one for run in runs for one in _equations(run, rows)]
     A, b = np.array([equation for equation, _ in found]), np.array([right for _, right in found])
     if not np.any(b):
-        # Free decays alone: forces are per unit of the first mass.
+        # With free decays alone, forces are relative to the first mass.
         A, b = np.vstack([A, np.zeros(columns)]), np.append(b, 0.0)
         first = int(np.argmax(np.abs(A[:, :n]).max(axis=0) > 0.0))  # the first cart that moves
-        # The equation m_1 = 1 has a large weight: nothing else sets a scale.
+        # The equation m_1 = 1 gets a large weight, because nothing else sets a scale.
         A[-1, first] = b[-1] = 1e3 * float(np.abs(A[:, first]).max())
     scale = np.linalg.norm(A, axis=0)
-    scale[scale == 0.0] = 1.0  # a cart that moves in no run keeps the smallest values
+    scale[scale == 0.0] = 1.0  # a cart that never moves keeps the smallest values
     p = np.linalg.lstsq(A / scale, b, rcond=None)[0] / scale
     m = np.maximum(p[:n], 0.02 * max(1e-12, np.abs(p[:n]).max()))
     k = np.zeros(n + 1)
     k[rows] = np.maximum(p[2 * n :], 1e-3 * max(1e-12, np.abs(p[2 * n :]).max(initial=0.0)))
     diagonal = k[:-1] + k[1:]
-    # No damping ratio below 0.002.
+    # Every damping ratio is at least 0.002.
     floor = 2 * 0.002 * np.sqrt(m * np.maximum(diagonal, 1e-12))
     return Chain(m=m, c=np.maximum(p[n : 2 * n], floor), k=k)
 
 
 def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]]:
-    """Yield the equations of each moving cart from each window of a run.
-
-    Equation and right side.
-    """
-    # Windows of 0.3 s, every 50 ms, at the usual pace.
+    """Yield one equation (coefficients and right side) per moving cart and window of a run."""
+    # Windows of 0.3 s, every 50 ms, for a bench of carts.
     step = max(1, round(0.05 * run.pace / run.record.sample_time))
     width = max(8, round(0.3 * run.pace / run.record.sample_time))
     x, u, n = run.by_cart(run.y, run.zero), run.input, run.zero.size
@@ -73,7 +70,7 @@ def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]
                 if j in (i, i + 1):
                     pull = np.trapezoid(stretch[j] * w, t)
                     equation[at] += pull if j == i else -pull
-            # A held input acts over the sample that follows.
+            # A held input acts during the interval after its sample.
             force = 0.5 * (u[piece] + np.append(u[first], u[piece][:-1])) if i == 0 else 0 * t
             yield equation / size, float(np.trapezoid(force * w, t)) / size
 
@@ -81,13 +78,13 @@ def _equations(run: GapRun, rows: Sequence[int]) -> Iterator[tuple[Array, float]
 def fit_baseline(
     runs: Sequence[GapRun], *, springs: Sequence[bool], start: Chain | None, mapper: Mapper = map
 ) -> tuple[GapFit, list[GapRun]]:
-    """Fit the linear chain; return it with the runs, whose noise is now measured.
+    """Fit the linear chain; return the fit and the runs with their measured noise.
 
-    First short pieces with states of their own, then whole runs. It starts from the stages' chain
-    and from an estimate of its own; the better result is kept.
+    The fit uses short pieces with their own start states first, then whole runs. It is done twice:
+    from the identified chain and from an independent estimate. The better result is kept.
     """
     structure = Structure(springs=tuple(springs))
-    # Over 0.6 s a wrong structure does little harm.
+    # In pieces of 0.6 s, a missing effect does little harm.
     shots = [cut_shots(run, length=0.6) for run in runs]
     starts = [chain for chain in (start,) if chain is not None]
     starts.append(first_chain(runs, springs=springs))
@@ -106,7 +103,7 @@ def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) 
         model = simulate_run(fit, shot, nuisance)
         for j, row in enumerate(shot.rows):
             for part in (slice(a, b) for a, b in pairwise(shot.shots)):
-                # An encoder at rest repeats itself: only a moving one shows its noise.
+                # Only a moving encoder shows its noise, as one at rest repeats the same reading.
                 moving = np.mean(shot.weight[j, part] ** 2) > 0.9
                 side = found if moving else resting
                 side.setdefault(row, []).append(high_frequency_noise((shot.y - model)[j, part]))
@@ -120,7 +117,7 @@ def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) 
 
 
 def fit_nuisance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
-    """Fit only the nuisance parameters of runs that the model was not fitted to."""
+    """Fit only the nuisance parameters, for runs that the model was not fitted to."""
     how = Fitting(mapper=mapper, shared=False, iterations=10)
     fresh = tuple(fresh_nuisance(run) for run in runs)
     found = fit_model(replace(fit, nuisance=fresh), runs, how)

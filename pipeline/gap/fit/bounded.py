@@ -1,4 +1,4 @@
-"""One step of a fit, inside bounds."""
+"""One step of a fit, within bounds."""
 
 from collections.abc import Callable
 
@@ -18,8 +18,8 @@ def bounded_step(
     """Return a step of the parameters `at` (size,) within their bounds and step limits.
 
     `bounds` are the lower bounds, the upper bounds, and the largest step of each parameter. `solve`
-    returns the step of the parameters that are `active`, by index. A parameter at a bound whose
-    step points outward is fixed, and the others are solved again, at most `rounds` times.
+    returns the step of the `active` parameters, given by index. If a parameter at a bound would
+    step outward, it is fixed and the others are solved again, at most `rounds` times.
     """
     low, high, reach = bounds
     delta = np.zeros(at.size)
@@ -34,5 +34,5 @@ def bounded_step(
             delta[active] = step
             break
         active = active[~out]
-    # One long step must not shorten the others: each is clipped separately.
+    # Each step is clipped separately, so that a long step does not shorten the others.
     return np.clip(at + np.clip(delta, -reach, reach), low, high) - at

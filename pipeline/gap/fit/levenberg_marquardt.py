@@ -35,11 +35,15 @@ class GapFit(GapModel):
 
     Attributes
     ----------
-    covariance : (size, size) of the vector, or None before the end.
-    nuisance : one for each run, in their order.
-    cost : sum of squared residuals over their noise, prior terms included.
-    chi_square : the same without prior terms; n_points is the number of residuals.
-    run_chi : (runs,) chi-square per residual of each run; run_prior: its prior terms.
+    covariance : (size, size) of the parameter vector. None before the search ends.
+    nuisance : the nuisance parameters of each run, in the order of the runs.
+    cost : sum of squared residuals over their noise. Prior terms are included.
+    chi_square : the cost without prior terms.
+    n_points : the number of residuals.
+    run_chi : (runs,) chi-square per residual. One for each run.
+    run_prior : (runs,) prior terms of each run.
+    run_points : (runs,) number of residuals of each run.
+    spread : (n,) run-to-run standard deviation of each cart's dry friction. It is relative.
     """
 
     nuisance: tuple[Nuisance, ...]
@@ -59,17 +63,17 @@ class GapFit(GapModel):
 
     @property
     def inflation(self) -> float:
-        """Factor by which the misfit of a model that is still wrong widens the noise."""
+        """Factor on the noise, at least 1, that makes it as large as the misfit."""
         return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
 
     @property
     def scattered(self) -> bool:
-        """Whether dry friction may differ between runs."""
+        """Whether dry friction differs between the runs."""
         return any(bool(np.any(nuisance.scatter != 1.0)) for nuisance in self.nuisance)
 
     @property
     def anew(self) -> GapModel:
-        """The model alone: a fit of it starts each run at its expected values."""
+        """The model without nuisance parameters; a fit then starts runs at expected values."""
         return GapModel(structure=self.structure, theta=self.theta)
 
 
@@ -79,12 +83,12 @@ class Fitting:
 
     Attributes
     ----------
-    mapper : maps work over runs.
-    iterations : the largest number of them.
-    tolerance : relative fall of the cost below which it has converged.
-    shared : whether the shared parameters move, or only those of the runs.
-    scatter_free : whether dry friction may differ between runs; with `learn_spread` its spread is
-        fitted too.
+    mapper : maps a function over the runs.
+    iterations : largest number of iterations.
+    tolerance : relative decrease of the cost below which the fit has converged.
+    shared : whether the shared parameters move. If not, only those of the runs do.
+    scatter_free : whether dry friction may differ between runs.
+    learn_spread : whether the size of these differences is estimated too.
     """
 
     mapper: Mapper = map
@@ -104,7 +108,7 @@ def evaluate(
     inflate: float = 1.0,
     mapper: Mapper = map,
 ) -> GapFit:
-    """Return the fit at given shared and nuisance parameters, without moving them."""
+    """Return the fit at given shared and nuisance parameters, without changing them."""
 
     def cost(pair: tuple[GapRun, Nuisance]) -> tuple[float, float]:
         return run_cost(model, *pair, spread=spread)
@@ -140,13 +144,14 @@ def _fit_at(
 def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
     """Fit the shared parameters and every run's nuisance parameters.
 
-    `start` is the initial point; a fit continues from its state in the same runs.
+    `start` is the initial point. If it is a fit of the same runs, its nuisance parameters are used
+    too.
     """
     structure = start.structure
     low, high = structure.bounds()
     bounds = low, high, structure.reach()
     goes_on = start if isinstance(start, GapFit) else None
-    # The initial guess: friction differs by 5 % between runs.
+    # The initial guess is that friction differs by 5 % between runs.
     best = evaluate(
         GapModel(structure=structure, theta=np.clip(start.theta, low, high)),
         runs,
@@ -164,7 +169,8 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
         # If the simulation diverges, the square of its slope is not a number.
         if not np.all(np.abs(stacked) < 1e100):
             break
-        # Shorter steps, each six times as damped. If none helps, the fit has converged.
+        # Each attempt has six times the damping and so a shorter step. If none helps, the fit has
+        # converged.
         for _attempt in range(5):
             delta = _step(stacked, best.theta, bounds, damp=damp)
             trial = _follow(best, runs, linear, delta, how)
@@ -184,7 +190,7 @@ def fit_model(start: GapModel, runs: Sequence[GapRun], how: Fitting) -> GapFit:
 
 
 def _linearise_all(fit: GapFit, runs: Sequence[GapRun], how: Fitting) -> list[Linear]:
-    """Return the contribution of every run to a step from a fit."""
+    """Return the contribution of every run to a step."""
 
     def share(job: tuple[GapRun, Nuisance]) -> Linear:
         run, nuisance = job
@@ -200,36 +206,36 @@ def _step(
 ) -> Array:
     """Return the damped step of the shared parameters, within their bounds and step limits.
 
-    `stacked` (rows, moving + 1) has the Jacobian and the residual; with nothing moving the step is
-    0.
+    `stacked` (rows, moving + 1) holds the Jacobian and the residual. If no parameter moves, the
+    step is 0.
     """
     J, r = stacked[:, :-1], stacked[:, -1]
 
     def solve(active: np.ndarray) -> Array:
         scale = np.linalg.norm(J[:, active], axis=0)
-        # A column below this share of the strongest is rounding error.
+        # A column below this share of the strongest one is rounding error.
         scale = np.maximum(scale, 1e-9 * max(1e-30, scale.max()))
         A = np.concatenate([J[:, active], np.diag(np.sqrt(damp) * scale)])
         right = np.concatenate([r, np.zeros(active.size)])
         return np.asarray(np.linalg.lstsq(A, right, rcond=None)[0], dtype=np.float64)
 
-    # Rarely more than one parameter is at its bound.
+    # Three rounds are enough: rarely is more than one parameter at its bound.
     return bounded_step(theta, bounds, np.arange(J.shape[1]), solve=solve, rounds=3)
 
 
 def _follow(
     fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear], delta: Array, how: Fitting
 ) -> GapFit:
-    """Return the fit after a step, with the nuisance parameters moved accordingly.
+    """Return the fit after a step, with the nuisance parameters moved along.
 
-    In a run whose cost would rise, they move less far.
+    If the cost of a run would rise, its nuisance parameters move less far.
     """
     model, inflate = GapModel(structure=fit.structure, theta=fit.theta + delta), fit.inflation
 
     def move(job: tuple[Linear, GapRun, Nuisance, float]) -> tuple[Nuisance, tuple[float, float]]:
         part, run, nuisance, before = job
         tried = []
-        # The share of the run's own step, if the full one raises its cost.
+        # Shares of the run's own step to try until its cost does not rise.
         for scale in (1.0, 0.3, 0.05):
             moved = move_nuisance(part, nuisance, delta[: part.reduced.shape[1] - 1], scale)
             cost = run_cost(model, run, moved, spread=fit.spread)
@@ -252,19 +258,19 @@ def _follow(
 
 
 def anchor(runs: Sequence[GapRun], size: int) -> Array:
-    """Return a row that fixes the first free mass if no input sets the scale of forces."""
+    """Return an equation that fixes the first free mass if no input sets the scale of forces."""
     if any(np.any(run.command) for run in runs):
         return np.zeros((0, size + 1))
     if not size:
         return np.zeros((0, 1))
     row = np.zeros((1, size + 1))
-    # In standard errors per unit of log mass.
+    # The weight: a million standard errors per unit of log mass.
     row[0, int(np.argmax(np.any([run.free for run in runs], axis=0)))] = 1e6
     return row
 
 
 def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear]) -> GapFit:
-    """Estimate the run-to-run spread of each cart's friction."""
+    """Estimate how much each cart's friction differs from run to run."""
     spread = fit.spread.copy()
     factors = np.array([nuisance.scatter for nuisance in fit.nuisance])
     noise = max(1.0, fit.chi)
@@ -278,7 +284,7 @@ def _learn_spread(fit: GapFit, runs: Sequence[GapRun], linear: Sequence[Linear])
         ]
         if not there:
             continue
-        weight, prior = 3.0, 0.04  # of the prior on that spread: its weight in runs, and its size
+        weight, prior = 3.0, 0.04  # the prior on the spread counts as three runs with 4 %
         total = weight * prior**2
         for r, j in there:
             column = linear[r].run_wide[j, j]

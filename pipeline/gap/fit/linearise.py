@@ -1,9 +1,14 @@
-"""One run: its nuisance parameters, its readings under a model, and its contribution to a step.
+"""One run: its nuisance parameters, its simulation, and its contribution to a step of the fit.
 
-The nuisance parameters of a run are the start (and restart) states of the carts, those of hidden
-masses if the carts already move, the encoder zeros, and a factor on the dry friction of each cart,
-which varies between runs. They enter the residual almost linearly, so a QR factorisation of each
-run leaves a small problem in the shared parameters (variable projection).
+The nuisance parameters of a run are:
+
+- The states of the carts at its start, and at the start of each further piece.
+- The states of hidden masses. Only if the carts already move.
+- The encoder zeros.
+- A factor on the dry friction of each cart. It varies between runs.
+
+They enter the residual almost linearly. So a QR factorisation of each run eliminates them and
+leaves a small problem in the shared parameters (variable projection).
 
 Reference: G. H. Golub, V. Pereyra, Inverse Problems 19 (2003), R1 (separable least squares).
 """
@@ -19,18 +24,19 @@ from pipeline.gap.fit.structure import GapModel, Structure
 from pipeline.plant.nonlinear.simulator import sensitivity
 from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
 
-_START_STEP = 1e-3  # for differences, of the swing or of the friction
-_HOME = 0.1  # how firmly the priors hold starts that the data do not determine …
-_HELD = 1e6  # … and a velocity that is known to be zero
-_FACTOR_STEP = 0.3  # largest step of a friction factor: further away, the friction is another one …
-_FACTORS = (0.3, 3.0)  # … and without a study the factors stay within some 20 % of one
+_START_STEP = 1e-3  # step for numerical derivatives, relative to swing or friction
+_HOME = 0.1  # weight of the priors on starts. The data need not determine these
+_HELD = 1e6  # weight of a velocity that is known to be zero
+_FACTOR_STEP = 0.3  # largest step of a friction factor
+_FACTORS = (0.3, 3.0)  # limits of a friction factor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Nuisance:
-    """The parameters of one run: start states (shots, 2 n), zeros (n,), friction factors (n,).
+    """The parameters of one run: start states, encoder zeros (n,), friction factors `scatter` (n,).
 
-    The start states are those of the carts, then those of their hidden masses relative to them.
+    The start states `x0` and `v0` (shots, 2 n) are those of the carts, then those of their hidden
+    masses relative to the carts.
     """
 
     x0: Array
@@ -40,7 +46,7 @@ class Nuisance:
 
     @property
     def start(self) -> StartState:
-        """The part that the simulator starts from."""
+        """The part that the simulator needs."""
         return StartState(self.x0, self.v0, self.scatter)
 
 
@@ -58,7 +64,7 @@ def fresh_nuisance(run: GapRun) -> Nuisance:
 
 
 def simulate_run(model: GapModel, run: GapRun, nuisance: Nuisance) -> Array:
-    """Return the readings (rows, samples) of one run, zeros included."""
+    """Return the simulated readings (rows, samples) of one run, with encoder zeros."""
     y, _ = _simulate_variants(model.structure, model.theta[None], run, [nuisance.start])
     return y[0] + nuisance.zero[list(run.rows)][:, None]
 
@@ -71,10 +77,10 @@ def _simulate_variants(
     *,
     lanes: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array]:
-    """Return (b, rows, samples) readings of one run for many vectors and starts, without zeros.
+    """Return readings (b, rows, samples) of one run for many vectors and starts, without zeros.
 
-    Also return the derivatives (lanes, rows, samples) of the first. `lanes` says by what: a kind of
-    `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
+    Also return the derivatives (lanes, rows, samples) of the first. Each of the `lanes` names a
+    quantity in `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
     """
     y, by = simulate(
         [(structure.model(theta).tables(), start)
@@ -101,20 +107,21 @@ def _simulate_variants(
 class Linear:
     """One run's contribution to a step.
 
-    The reduced system of the shared parameters, and the way back.
+    It holds the reduced equations of the shared parameters, and the factors that give the nuisance
+    parameters afterwards.
     """
 
-    reduced: Array  # (rows, size + 1) of R: shared parameters and residual
-    run_wide: Array  # R of friction factors and zeros: [they | shared | residual]
-    shots: Array  # (shots, ., .) R of each shot: [starts | run-wide | shared | residual]
+    reduced: Array  # (rows, size + 1) of R. Columns: shared parameters and residual
+    run_wide: Array  # R of friction factors and zeros. Columns: these, shared, residual
+    shots: Array  # (shots, ., .) R of each shot. Columns: starts, run-wide, shared, residual
     layout: "Layout"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """The parameters that move in a step: a run's own, and possibly the shared ones.
+    """Which parameters move in a step: those of a run, and possibly the shared ones.
 
-    Cart indices of each kind, plus n for a hidden mass.
+    Each field lists cart indices. A hidden mass has the index of its cart plus n.
     """
 
     x0: tuple[int, ...]
@@ -144,9 +151,9 @@ def layout_of(
 
 
 def _by_shot(residual: Array, run: GapRun) -> Array:
-    """Weight (…, rows, samples) and cut it into shots, padded with zeros to one length.
+    """Return weighted residuals (…, rows, samples), cut into shots (…, shots, rows * longest).
 
-    Returns (…, shots, rows * longest).
+    Shorter shots are padded with zeros.
     """
     residual = residual * run.weight
     counts = np.diff(run.shots)
@@ -163,14 +170,15 @@ def residual_points(run: GapRun) -> float:
 
 
 def triangle(matrix: Array) -> Array:
-    """Return R of the QR factorisation of one matrix or a stack of them.
+    """Return R of the QR factorisation of one matrix or of a stack of matrices.
 
-    Tall matrices are factorised in parts that fit the processor's cache, then their results.
+    A tall matrix is factorised in parts that fit the processor's cache. Then the results are
+    factorised together.
 
     Reference: J. Demmel, L. Grigori, M. Hoemmen, J. Langou, SIAM J. Sci. Comput. 34 (2012), A206.
     """
     *stack, rows, columns = matrix.shape
-    # This many rows are factorised at once.
+    # A part has about 400 rows.
     parts = rows // 400
     if parts > 1:
         even = rows // parts * parts
@@ -211,9 +219,9 @@ def linearise(
 
 
 def columns_of(model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout) -> Array:
-    """Return (., rows, samples): the Jacobian by starts, friction factors, zeros and shared …
+    """Return the Jacobian (., rows, samples) of a run, with the residual as last column.
 
-    … parameters, and the residual last.
+    The columns are starts, friction factors, zeros and shared parameters.
     """
     derive = _differences if model.structure.has_contact else _derivatives
     y, by_nuisance, by_shared = derive(model, run, nuisance, layout)
@@ -233,7 +241,7 @@ def _eliminate_starts(points: Array, prior: Array) -> Array:
 def run_prior(
     layout: Layout, run: GapRun, nuisance: Nuisance, columns: int, *, spread: Array, inflate: float
 ) -> Array:
-    """Return (run-wide parameters, columns) of the priors on friction factors and zeros."""
+    """Return the priors on friction factors and zeros, (run-wide parameters, columns)."""
     expected = np.zeros((len(layout.scatter) + len(layout.zero), columns))
     for j, i in enumerate(layout.scatter):
         expected[j, j] = inflate / spread[i]
@@ -247,10 +255,11 @@ def run_prior(
 def _derivatives(
     model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
-    """Return the readings (rows, samples) and their derivatives (., rows, samples).
+    """Return the readings (rows, samples), and two sets of derivatives (., rows, samples).
 
-    The derivatives are by the run's starts and friction factors, and by the shared parameters.
-    Those of the chain are integrated with the state, those of the effects are differences.
+    The first set is by the run's starts and friction factors, the second by the shared parameters.
+    Derivatives by the chain's parameters are integrated with the state, those by the effects'
+    parameters are finite differences.
     """
     structure, theta = model.structure, model.theta
     lanes = [(sensitivity.BY_POSITION, i) for i in layout.x0] + [
@@ -269,7 +278,7 @@ def _derivatives(
     thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
     thetas[1:, theta.size - steps.size :] += np.diag(steps)
     y, by = _simulate_variants(structure, thetas, run, [nuisance.start] * len(thetas), lanes=lanes)
-    # The derivative by a logarithm is the derivative by the number, times the number.
+    # The derivative by the logarithm of p is p times the derivative by p.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
     return y[0], by[:local], np.concatenate([by[local:], by_effects])
@@ -278,9 +287,9 @@ def _derivatives(
 def _differences(
     model: GapModel, run: GapRun, nuisance: Nuisance, layout: Layout
 ) -> tuple[Array, Array, Array]:
-    """Return the same as `_derivatives`, by differences alone.
+    """Return the same as `_derivatives`, but only by finite differences.
 
-    With contacts the misfit is full of narrow valleys: a finite difference looks across them.
+    With contacts the misfit has many narrow valleys, and a finite difference averages over them.
     """
     structure, theta = model.structure, model.theta
     position, velocity = usual_sizes(model, run)
@@ -310,7 +319,7 @@ def _differences(
 
 
 def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
-    """Return the usual positions and velocities (2 n,) of the carts and their hidden masses."""
+    """Return typical positions and velocities (2 n,) of the carts and their hidden masses."""
     size = np.maximum(run.swing, 1e-9)
     chain = model.structure.chain(model.theta)
     position = np.full(chain.n, size.max())
@@ -322,14 +331,14 @@ def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
 def start_prior(
     layout: Layout, run: GapRun, sizes: tuple[Array, Array], *, inflate: float
 ) -> Array:
-    """Return (shots, starts, starts) weak priors on starts that the data do not determine.
+    """Return weak priors (shots, starts, starts) on starts that the data do not determine.
 
-    In units of the swing; if a run starts at rest, its first velocity stays zero.
+    They are in units of the swing. If a run starts at rest, its first velocity is held at zero.
     """
     position, velocity = sizes
     weight = 1.0 / np.concatenate([position[list(layout.x0)], velocity[list(layout.v0)]])
     prior = np.tile(np.diag(_HOME * inflate * weight), (len(run.shots) - 1, 1, 1))
-    # No reading shows the hidden mass on a cart.
+    # The readings say nothing about the hidden mass on a cart.
     known = [np.append(1.0 / std, np.zeros(std.size)) for std in run.start_std]
     known_start = np.concatenate([known[0][list(layout.x0)], known[1][list(layout.v0)]])
     prior[0] += np.diag(inflate * known_start)
@@ -340,7 +349,7 @@ def start_prior(
 
 
 def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float = 1.0) -> Nuisance:
-    """Return the nuisance parameters after a step of the shared ones."""
+    """Return the nuisance parameters after a step of the shared parameters."""
     layout = linear.layout
     n_wide, n_starts = linear.run_wide.shape[0], linear.shots.shape[1]
     tail = np.concatenate([-delta, [1.0]])
@@ -366,7 +375,7 @@ def move_nuisance(linear: Linear, nuisance: Nuisance, delta: Array, scale: float
 def run_cost(
     model: GapModel, run: GapRun, nuisance: Nuisance, *, spread: Array
 ) -> tuple[float, float]:
-    """Return chi-square of a run, and its prior terms."""
+    """Return the chi-square of a run, and its prior terms."""
     structure = model.structure
     if not structure.visible(model.theta):
         return np.inf, 0.0

@@ -1,4 +1,4 @@
-"""Restart the worst runs' nuisance parameters elsewhere in the friction band."""
+"""Restart the worst runs with other rest positions in the friction band."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,15 +12,16 @@ from pipeline.gap.fit.linearise import Nuisance, residual_points
 from pipeline.plant.nonlinear.simulator.laws import dropping, settling, sliding
 from pipeline.plant.nonlinear.tables import Drive, Tables
 
-_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # chi-square, or share of the median run's, for a restart
+_BAD_RUN, _BAD_SHARE = 1.5, 2.0  # limits of a run's chi-square: absolute, and over the median
 _RESTARTS = ((0.8, 1.0), (-0.8, 1.0), (1.6, 1.0), (-1.6, 1.0), (0.0, 0.94), (0.0, 1.06))
 
 
 def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
-    """Restart the worst runs' nuisance parameters elsewhere in the rest band of the carts.
+    """Restart the worst runs' nuisance parameters at other rest positions of the carts.
 
-    A cart may rest anywhere inside the band of friction or cogging, and is zeroed there. So a run's
-    misfit has several valleys in zero and friction. Shared parameters do not move.
+    A cart may rest anywhere inside the band of friction or cogging, and its encoder is zeroed
+    there. So the misfit of a run has several valleys in encoder zero and friction. Shared
+    parameters stay the same.
     """
     if not fit.structure.many_rests:
         return fit
@@ -57,7 +58,7 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
 
 
 def _rest_band(fit: GapFit) -> Array:
-    """Return (n,) how far from its springs' equilibrium each cart may rest, about one sigma."""
+    """Return how far (n,) from its springs' equilibrium each cart may rest, about one sigma."""
     chain = fit.structure.chain(fit.theta)
     force = holding_force(fit.structure.model(fit.theta).tables())
     if not np.any(chain.k > 0):
@@ -67,7 +68,7 @@ def _rest_band(fit: GapFit) -> Array:
 
 
 def holding_force(tables: Tables) -> Array:
-    """Return (n,) the largest force that friction or cogging can hold on each cart."""
+    """Return the largest force (n,) that friction or cogging can hold on each cart."""
     cart, _, drive = tables
     dry = [sliding(cart, i, 0.0) + dropping(cart, i, 0.0, 0.0) for i in range(len(cart))]
     force = np.array(dry) + [settling(cart, i, 0.0)[0] for i in range(len(cart))]

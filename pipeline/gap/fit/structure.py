@@ -18,7 +18,7 @@ from pipeline.plant.nonlinear.effects.base import (
 )
 from pipeline.plant.nonlinear.tables import Cart
 
-_SMALLEST = 1e-7  # of a parameter's scale; below this an effect is absent
+_SMALLEST = 1e-7  # of a parameter's scale; an effect this small is absent
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,11 +32,11 @@ class Candidate:
 
     @property
     def key(self) -> tuple[str, int]:
-        """Effect and place."""
+        """The effect and its place."""
         return self.effect.key, self.place
 
     def values(self, coordinates: Array) -> list[float]:
-        """Return the parameter values at a piece of the vector."""
+        """Return the parameter values for the effect's part of the vector."""
         return [
             float(x) * scale if p.signed else sign * float(np.exp(x))
             for p, x, sign, scale in zip(
@@ -45,7 +45,7 @@ class Candidate:
         ]
 
     def coordinates(self, values: Sequence[float]) -> Array:
-        """Return the piece of the vector that holds parameter values."""
+        """Return the effect's part of the vector for these parameter values."""
         return np.array(
             [
                 v / scale if p.signed else np.log(max(abs(v), _SMALLEST * scale))
@@ -56,10 +56,10 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Structure:
-    """The springs present and the effects acting: the shape of the parameter vector.
+    """The springs and effects of a model, which define the parameter vector.
 
-    The vector holds log m, log c, log k (of the springs present; their sum for one cart), then each
-    effect's parameters: log |p| if the sign is known, p over its scale if not.
+    The vector holds log m, log c and log k of the existing springs (for one cart, of their sum).
+    Each effect's parameters follow: log |p| if the sign is known, otherwise p over its scale.
     """
 
     springs: tuple[bool, ...]
@@ -67,23 +67,23 @@ class Structure:
 
     @cached_property
     def n(self) -> int:
-        """Number of carts."""
+        """The number of carts."""
         return len(self.springs) - 1
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
-        """Rows of the spring table that are free parameters."""
+        """The springs whose stiffness is a free parameter, as rows of the spring table."""
         present = tuple(j for j, there in enumerate(self.springs) if there)
         return present[:1] if self.n == 1 else present
 
     @cached_property
     def base_size(self) -> int:
-        """Parameters of the linear chain."""
+        """The number of parameters of the linear chain."""
         return 2 * self.n + len(self.rows)
 
     @cached_property
     def dry(self) -> tuple[bool, ...]:
-        """(n,) on which carts dry friction acts."""
+        """(n,) whether dry friction acts on each cart."""
         places = {c.place for c in self.effects if c.effect.dry}
         return tuple(i + 1 in places for i in range(self.n))
 
@@ -94,16 +94,16 @@ class Structure:
 
     @cached_property
     def has_contact(self) -> bool:
-        """Whether bodies meet."""
+        """Whether an effect has a contact, in which bodies meet."""
         return any(c.effect.contact for c in self.effects)
 
     @cached_property
     def hidden(self) -> tuple[int, ...]:
-        """Indices of the carts that carry a hidden mass."""
+        """The indices of the carts with a hidden mass."""
         return tuple(sorted(c.place - 1 for c in self.effects if c.effect.hides_mass))
 
     def span(self, index: int) -> slice:
-        """Return the place of an effect's parameters in the vector."""
+        """Return the slice of the vector with an effect's parameters."""
         start = self.base_size + sum(len(c.effect.parameters) for c in self.effects[:index])
         return slice(start, start + len(self.effects[index].effect.parameters))
 
@@ -112,21 +112,21 @@ class Structure:
         return Structure(springs=self.springs, effects=(*self.effects, candidate))
 
     def without(self, *indices: int) -> "Structure":
-        """Return the structure without some of its effects."""
+        """Return the structure without some of its effects, given by index."""
         kept = tuple(c for i, c in enumerate(self.effects) if i not in indices)
         return Structure(springs=self.springs, effects=kept)
 
     # ------------------------------------------------------------ the vector
 
     def chain(self, theta: Array) -> Chain:
-        """Return the linear chain in a vector."""
+        """Return the linear chain of a vector."""
         n = self.n
         k = np.zeros(n + 1)
         k[list(self.rows)] = np.exp(theta[2 * n : self.base_size])
         return Chain(m=np.exp(theta[:n]), c=np.exp(theta[n : 2 * n]), k=k)
 
     def model(self, theta: Array) -> AugmentedChain:
-        """Return the chain and its effects in a vector."""
+        """Return the chain with its effects for a vector."""
         terms = []
         for index, candidate in enumerate(self.effects):
             coordinates = theta[self.span(index)]
@@ -140,7 +140,7 @@ class Structure:
         return AugmentedChain(chain=self.chain(theta), terms=tuple(terms))
 
     def start(self, chain: Chain, values: Sequence[Sequence[float]] = ()) -> "GapModel":
-        """Return the model of a chain and the effects' parameter values."""
+        """Return the model with this chain and these parameter values of the effects."""
         tiny = 1e-3 * np.sqrt(chain.m * np.maximum(np.diag(chain.stiffness), 1e-12 * chain.m))
         parts = [np.log(chain.m), np.log(np.maximum(chain.c, tiny))]
         k = chain.k[list(self.rows)] if self.n > 1 else chain.k.sum(keepdims=True)[: len(self.rows)]
@@ -152,14 +152,14 @@ class Structure:
         return GapModel(structure=self, theta=np.concatenate(parts))
 
     def visible(self, theta: Array) -> bool:
-        """Return whether all hidden masses swing slowly enough to differ from the carts."""
+        """Return whether all hidden masses swing slowly enough to differ from their carts."""
         cart = self.model(theta).tables().cart
         hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
         if not hidden.any():
             return True
         of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
         rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
-        # A hidden mass with 20 times its cart's frequency moves as one with it.
+        # A hidden mass with over 20 times the frequency of its cart moves with the cart.
         return bool(np.all((of_cart[hidden] == 0.0) | (rate < 20.0**2 * of_cart[hidden])))
 
     def bounds(self) -> tuple[Array, Array]:
@@ -177,10 +177,10 @@ class Structure:
         return np.concatenate(low), np.concatenate(high)
 
     def steps(self) -> Array:
-        """Return the difference step of each parameter, for derivatives."""
+        """Return the step of each parameter for finite differences."""
         steps = [np.full(self.base_size, 1e-4)]
         for c in self.effects:
-            # Contacts respond irregularly to small changes.
+            # Contacts respond irregularly to small changes, so they need larger steps.
             coarse = 5.0 if c.effect.contact else 1.0
             steps.append(
                 coarse * np.array([2e-4 if p.signed else 1e-3 for p in c.effect.parameters])
@@ -188,14 +188,14 @@ class Structure:
         return np.concatenate(steps)
 
     def reach(self) -> Array:
-        """Return the largest step of each parameter."""
+        """Return the largest step of each parameter in one iteration."""
         reach = [np.full(self.base_size, 0.3)]
         for c in self.effects:
             reach.append(np.array([1.0 if p.signed else p.reach for p in c.effect.parameters]))
         return np.concatenate(reach)
 
     def physical_derivative(self, theta: Array) -> Array:
-        """Return d(parameter)/d(coordinate) of the effects; the chain stays in logarithms."""
+        """Return d(parameter)/d(coordinate) of the effects; the entries of the chain are 1."""
         out = [np.ones(self.base_size)]
         for index, c in enumerate(self.effects):
             values = c.values(theta[self.span(index)])
@@ -232,7 +232,7 @@ class GapModel:
         )
 
     def without(self, *indices: int) -> "GapModel":
-        """Return the model without some of its effects, the rest as it is."""
+        """Return the model without some of its effects; all other parameters keep their values."""
         spans = [np.r_[self.structure.span(index)] for index in indices]
         return GapModel(
             structure=self.structure.without(*indices),
@@ -240,13 +240,13 @@ class GapModel:
         )
 
 
-# ----------------------------------------------------------------- the sizes on this bench
+# ------------------------------------------------------------ typical sizes on this bench
 
 
 def bench_scales(
     runs: Sequence[GapRun], chain: Chain, *, effect: Effect, place: int
 ) -> PlaceScales:
-    """Return the typical sizes at one place, from the records and the linear model."""
+    """Return the typical sizes of parameters at one place, from records and linear model."""
     n = chain.n
     size = n if effect.place != "spring" else n + 1
     position, velocity = np.full(size + 1, 1e-12), np.full(size + 1, 1e-12)
@@ -261,7 +261,7 @@ def bench_scales(
         velocity[: len(x)] = np.maximum(velocity[: len(x)], np.abs(speed).max(axis=1))
         level = max(level, float(np.abs(run.command).max()))
         sample_time = min(sample_time, run.record.sample_time)
-    # Time constants of a drive are physical, some milliseconds, whatever the sampling.
+    # Time constants of a drive are some milliseconds, whatever the sampling.
     return chain_scales(
         chain,
         place=effect.place,

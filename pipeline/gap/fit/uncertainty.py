@@ -1,9 +1,9 @@
 """Standard errors of a fitted model whose residual is not white.
 
-While a cart rests its encoder repeats one reading, and friction lets it rest anywhere. All those
+While a cart rests, its encoder repeats one reading, and friction lets it rest anywhere. All these
 readings share one rounding error, which limits how well friction is known. So the covariance is H⁻¹
-S H⁻¹. H is the information of the fit. S is the effect of such encoder errors on the fitted motion,
-from many random draws. No variance is smaller than that of white noise, or that implied by the
+S H⁻¹. H is the information of the fit. S is the covariance that such encoder errors cause, from
+many random draws. A variance is at least that of white noise, and at least that implied by the
 residual's own correlation.
 
 Reference: L. Ljung, System Identification, 2nd ed., section 9.5, for the sandwich; B. Efron, R. J.
@@ -30,19 +30,20 @@ from pipeline.gap.fit.linearise import (
     usual_sizes,
 )
 
-_DRAWS = 60  # draws of encoder errors: a standard error is then accurate to 9 %
-_HIDDEN = 1e-9  # of the strongest: weaker directions count as unknown
+_DRAWS = 60  # random draws of encoder errors; a standard error is then accurate to 9 %
+_HIDDEN = 1e-9  # of the strongest direction; weaker ones count as unknown
 
 
 def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> GapFit:
     """Return the fit with the covariance of its parameters, or without if the model diverges.
 
-    If friction was fitted with one size for all runs, its spread is not part of the error.
+    If the fit used the same friction for all runs, the standard errors do not include its
+    variation.
     """
 
     def weigh(job: tuple[int, tuple[GapRun, Nuisance]]) -> Array:
         index, (run, nuisance) = job
-        # Seeded by the run's index, so that each run has draws of its own.
+        # Seeded by the run's index, so that each run has its own draws.
         rng = np.random.default_rng([0, index])
         return _weigh(fit, run, nuisance, rng=rng)
 
@@ -60,15 +61,16 @@ def covariance(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper = map) -> Gap
     least = np.maximum(np.diag(found), np.diag(inverse))
     more = np.sqrt(np.maximum(1.0, least / np.maximum(np.diag(expected), _HIDDEN * least)))
     cov = expected * np.outer(more, more)
-    # Directions that no run determines get no error from the encoders: they are as unknown as in H.
+    # A direction that no run determines gets no error from the encoders; its variance is that of
+    # H⁻¹.
     np.fill_diagonal(cov, np.maximum(np.diag(cov), least))
     return replace(fit, covariance=cov)
 
 
 def _weigh(fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator) -> Array:
-    """Return H, and S (each (size, size)) by encoder errors and by the residual's correlation.
+    """Return H, S from encoder errors, and S from the residual's correlation, each (size, size).
 
-    All NaN if the model, or one a little beside it, diverges.
+    All are NaN if the model diverges at these parameters or next to them.
     """
     thin, inflate = run.thin, fit.inflation
     layout = layout_of(fit.structure, thin, scatter_free=fit.scattered)
@@ -110,7 +112,7 @@ def _by_piece(columns: Array, run: GapRun) -> Array:
 def _errors(
     fit: GapFit, run: GapRun, nuisance: Nuisance, *, rng: np.random.Generator
 ) -> Iterator[Array]:
-    """Yield random encoder errors of the fitted motion, as the fit sees them (rows, samples)."""
+    """Yield random encoder errors (rows, samples) of the fitted motion, averaged as in the fit."""
     x = simulate_run(fit, run, nuisance)
     steps = np.array([run.record.encoder_step(row + 1) for row in run.rows])
     noise = [noise_beyond_rounding(s, step=step) for s, step in zip(run.sigma, steps, strict=True)]

@@ -1,6 +1,6 @@
-"""Choose the laws.
+"""Choose the laws of force that the records need.
 
-First all at once from zero, then those with a shape, then drop needless ones.
+First fit all laws at once from zero, then add laws with a shape, then drop needless ones.
 """
 
 from collections.abc import Sequence
@@ -18,16 +18,16 @@ from pipeline.plant.nonlinear.effects import CATALOGUE
 from pipeline.plant.nonlinear.simulator.terms import Kind
 from pipeline.words.progress import Progress, silent
 
-CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains
-_FIRST = 25  # iterations of the first fit, from a chain that may be far off
-_FEW = 6  # … and of a fit that shows whether a rival comes near
-_SHORT_LIST = 4  # of laws with a shape, refitted
+CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains: the share of the error that corrects the model
+_FIRST = 25  # iterations of the first fit. Its chain may be far off.
+_FEW = 6  # iterations of a fit that only shows whether a rival comes near
+_SHORT_LIST = 4  # laws with a shape. So many are refitted.
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:
     """Return the model with all laws that need no shape, fitted from zero.
 
-    It starts from each of the `chains`.
+    The fit is done from each of the `chains`; the best result is returned.
     """
     tracks = records.tracks
     largest = max(float(np.abs(track.command).max()) for track in tracks)
@@ -51,11 +51,11 @@ def choose_laws(
     chains: Sequence[Chain],
     progress: Progress = silent,
 ) -> Follow:
-    """Return the model found by following: the remaining laws, fitted to free runs."""
+    """Return the model with the laws that are needed, fitted to free simulations if possible."""
     full = start_all(records, springs=springs, chains=chains)
     lean = let_go(full, records)
     progress(f"all laws fitted together: {len(lean.laws.groups())} are left")
-    # A real bench has several.
+    # Add at most six laws with a shape; a real bench has several.
     for _ in range(6):
         if lean.gain == FREE and lean.chi < limits.AT_FLOOR:
             break
@@ -82,7 +82,8 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
             best = trial
     if best is None or not is_better(best, follow):
         return None
-    # Behind a contact, known only to a factor, another law would absorb its error.
+    # The law of a contact is only approximate. A further law could absorb its error, so it must
+    # remove at least half of the excess.
     if is_rough(follow) and best.total > _half_way(follow):
         return None
     return best
@@ -96,13 +97,13 @@ def _half_way(follow: Follow) -> float:
 def let_go(full: Follow, records: Records) -> Follow:
     """Drop needless laws, then lower the gain to zero, dropping again at each step.
 
-    If a looser model leaves a larger error, an effect is missing. That error swings with the carts,
-    and would be taken for laws that are not there.
+    If the error grows with a lower gain, an effect is missing. That error swings with the carts,
+    and would be taken for laws that do not exist.
     """
     lean = _one_friction(drop_needless(full, records), records)
     for gain in (0.02, FREE):
         loose = records.fit(lean, gain=gain)
-        # A looser model whose error is larger by a half lacks an effect.
+        # An effect is missing if the error grows by half.
         if not loose.chi < 1.5 * max(lean.chi, limits.AT_FLOOR):
             break
         lean = drop_needless(loose, records)
@@ -110,7 +111,7 @@ def let_go(full: Follow, records: Records) -> Follow:
 
 
 def _look_again(lean: Follow, records: Records) -> Follow:
-    """Fit all laws again, as a free run shows errors that add up; then drop needless ones."""
+    """Fit all laws once more to free simulations, which show small errors; drop needless ones."""
     everything = smooth_laws(lean.laws.bench, columns=records.columns)
     missing = [key for key in everything.keys if key not in lean.laws.keys]
     extra = [TrialLaw(kind=kind, place=place, values=(0.0,)) for kind, place in missing]
@@ -121,7 +122,7 @@ def _look_again(lean: Follow, records: Records) -> Follow:
 
 
 def _one_friction(follow: Follow, records: Records) -> Follow:
-    """Keep one law of dry friction on each cart where two exclude each other."""
+    """Keep only one kind of dry friction on each cart, since two kinds exclude each other."""
     for place in range(follow.laws.bench.n):
         here = [i for i, key in enumerate(follow.laws.keys) if key[1] == place]
         sides = [

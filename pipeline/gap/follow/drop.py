@@ -1,4 +1,4 @@
-"""Drop needless laws one by one, as long as the Bayesian criterion allows."""
+"""Drop needless laws one by one, as long as the Bayesian criterion improves."""
 
 import numpy as np
 
@@ -11,15 +11,16 @@ _CONTACTS = {Kind.BACKLASH}
 
 
 def is_rough(follow: Follow) -> bool:
-    """Return whether there are contacts that the model does not fully describe."""
+    """Return whether the model has contacts that it does not describe to the noise."""
     meets = _CONTACTS & {kind for kind, _ in follow.laws.keys}
     return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
 def criterion(follow: Follow, news: float) -> float:
-    """Return the Bayesian criterion of `news` independent readings, with the cost of each effect.
+    """Return the Bayesian criterion for `news` independent readings, with a price per effect.
 
-    Models are compared by the independent residuals of the fuller one: only its residual is chance.
+    Two models are compared with the number of independent residuals of the fuller one, as only its
+    residual is due to chance.
     """
     low, high, _ = follow.laws.bounds()
     size = int(np.sum(low < high))
@@ -36,7 +37,7 @@ def is_better(fuller: Follow, other: Follow) -> bool:
 
 
 def drop_needless(follow: Follow, records: Records) -> Follow:
-    """Drop every law that the criterion does not need, the least needed first; refit the rest."""
+    """Drop every law that the criterion does not need, the least needed first; refit the others."""
     while order := _needless(follow, records):
         here, rough = criterion(follow, follow.news), is_rough(follow)
         while order:
@@ -52,7 +53,7 @@ def drop_needless(follow: Follow, records: Records) -> Follow:
 
 
 def _needless(follow: Follow, records: Records) -> list[int]:
-    """Return the groups that may be dropped, in order, by the quadratic form at the fit."""
+    """Return the groups that may be dropped, in order, by the quadratic form of the cost."""
     slope = records.slope(follow, factors=False)
     if not slope.sound:
         return []
@@ -84,7 +85,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
             rise = float(d @ np.linalg.solve(inverse[np.ix_(mine, mine)], d))
             price = limits.SAME_LAW + len(follow.laws.whole_group(g)) * np.log(count)
             if rough and (g < 0 or follow.laws.keys[g][0] not in _CONTACTS):
-                # Without it, at least twice the present excess over the noise would be left.
+                # A law counts only if the excess over the noise would at least double without it.
                 beyond = max(cost - follow.points, 0.0) * (1.0 / limits.CONTACT_GAIN - 1.0)
                 price = max(price, count * float(np.log1p(beyond / cost)))
             excess = count * float(np.log1p(max(rise, 0.0) / cost)) - price

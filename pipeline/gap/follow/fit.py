@@ -1,4 +1,7 @@
-"""Fit all parameters at once to the errors of a following model, by Levenberg-Marquardt."""
+"""Fit all parameters at once to the errors of a model that follows the records.
+
+The method is Levenberg-Marquardt.
+"""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -18,10 +21,10 @@ _RIDGE = 1e-12  # of the diagonal of a run's own block
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Follow:
-    """A following model: its laws and vector, every run's own parameters, and its errors.
+    """A model that follows the records: laws, vector, every run's own parameters, errors.
 
-    `cost` is the sum of squared errors over their noise; `points` is their number, `news` the
-    number of independent ones.
+    `cost` is the sum of squared errors over their noise. `points` is the number of errors, `news`
+    the number of independent ones. `gain` is the share of each error that corrects the state.
     """
 
     laws: LawSet
@@ -40,20 +43,20 @@ class Follow:
 
     @property
     def inflate(self) -> float:
-        """Factor by which the misfit of a model that is still wrong widens the noise."""
+        """Factor on the noise, at least 1, that makes it as large as the misfit."""
         return max(1.0, float(np.sqrt(self.chi))) if np.isfinite(self.chi) else 1.0
 
     @property
     def total(self) -> float:
-        """Cost with the priors."""
+        """The cost including the priors."""
         return self.cost + self.inflate**2 * self.prior
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Slope:
-    """The normal equations of a step: H and b of the vector, the runs' own parameters eliminated.
+    """The normal equations H and b of a step of the vector.
 
-    `back` computes the steps of the runs' own parameters from a step of the vector.
+    The runs' own parameters are eliminated; `back` gives their steps for a step of the vector.
     """
 
     H: Array
@@ -62,20 +65,20 @@ class Slope:
 
     @property
     def sound(self) -> bool:
-        """Whether the model diverges nowhere."""
+        """Whether the simulation diverged nowhere."""
         return bool(np.all(np.isfinite(self.H)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Records:
-    """The data of following models: the runs, their mapper, and the columns that laws may fill."""
+    """The data to follow: the runs, their mapper, and the columns that laws may fill."""
 
     tracks: tuple[Track, ...]
     mapper: Mapper
     columns: frozenset[Column]
 
     def allows(self, law: TrialLaw) -> bool:
-        """Return whether the catalogue has an effect that fills the columns of a law."""
+        """Return whether the catalogue has an effect for a law."""
         return column_set(COLUMNS[law.kind]) <= self.columns
 
     def begin(self, laws: LawSet, p: Array, *, gain: float) -> Follow:
@@ -84,7 +87,7 @@ class Records:
         return self.weigh(Follow(laws=laws, p=p, own=own, gain=gain, cost=np.inf, points=1.0))
 
     def weigh(self, follow: Follow) -> Follow:
-        """Return it with its cost, which is infinite if the model diverges."""
+        """Return the model with its cost, which is infinite if the simulation diverges."""
         laws, dry = follow.laws, follow.laws.dry
         on_springs = any(laws.bench.springs)
 
@@ -102,12 +105,12 @@ class Records:
         costs = np.array(list(self.mapper(one, zip(self.tracks, follow.own, strict=True))))
         points = sum(track.points for track in self.tracks)
         cost, prior, news = costs.sum(axis=0).tolist()
-        # Four readings of a track count as one independent reading, or more.
+        # A reading counts as at most a quarter of an independent one.
         news = min(news, points / 4.0)
         return replace(follow, cost=cost, points=points, prior=prior, news=news)
 
     def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
-        """Return the normal equations; without `factors` dry friction is equal in all runs."""
+        """Return the normal equations; without `factors` dry friction is the same in all runs."""
         laws, size, inflate = follow.laws, follow.p.size, follow.inflate
         dry = laws.dry & factors
 
@@ -139,7 +142,7 @@ class Records:
         return self.fit(replace(follow, laws=laws, p=p), **options)
 
     def fit(self, start: Follow, *, gain: float | None = None, iterations: int = 12) -> Follow:
-        """Fit from a start, at its own gain or another."""
+        """Fit from a start, with its own gain or another."""
         best = self.weigh(start if gain is None else replace(start, gain=gain))
         bounds = best.laws.steps_of_shape(best.p)
         damp = _DAMP
@@ -163,14 +166,14 @@ class Records:
                 break
             fall = 1.0 - (trial.cost + best.inflate**2 * trial.prior) / best.total
             best, damp = trial, max(damp / _CHANGE, _LEAST_DAMP)
-            # It has converged.
+            # The fit has converged.
             if fall < 1e-3:
                 break
         return best
 
 
 def _step(slope: Slope, p: Array, bounds: tuple[Array, Array, Array], *, damp: float) -> Array:
-    """Return the damped step within bounds and step limits."""
+    """Return the damped step, within bounds and step limits."""
     low, high, _ = bounds
     power = np.maximum(np.diag(slope.H), 0.0)
 

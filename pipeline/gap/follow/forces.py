@@ -1,4 +1,4 @@
-"""The forces of the laws of a following model, and their derivatives by each parameter."""
+"""The forces of the laws of a model that follows a record, and their derivatives."""
 
 from math import exp
 from typing import NamedTuple
@@ -19,8 +19,8 @@ from pipeline.plant.nonlinear.simulator.terms import (
     terms,
 )
 
-DRIVE = 4  # parameters of the drive: dead zone, limit, delay, lag
-OWN = 2  # size of a law's own state, that of its friction or of a body; its terms follow
+DRIVE = 4  # number of the drive's parameters: dead zone, limit, delay, lag
+OWN = 2  # size of the state of a law's friction or body, at the start of its row
 ROOM = OWN + TERMS
 
 
@@ -40,13 +40,20 @@ class ActingLaws(NamedTuple):
 
 
 class FollowedRun(NamedTuple):
-    """One run of n carts that a model follows.
+    """One run of n carts and the options of its simulation.
 
-    `t` (samples,), `y` (samples, n) are its readings. `seen` and `free` (n,) mark compared and
-    moving carts. `guided` (samples, n) is the motion of held carts. `held` (3, 2, knots) is the
-    shaped input and its derivatives by dead zone and limit, with their integrals. `zero` and
-    `factor` (n,) are this run's encoder zeros and factors on dry friction. `gain` is the share of
-    the error that corrects the state, `longest` the longest step, s.
+    Attributes
+    ----------
+    t, y : (samples,) times and (samples, n) readings.
+    seen, free : (n,) which carts are compared. Which carts move.
+    guided : (samples, n) motion of held carts.
+    knots, command : the input, held from knot to knot.
+    held : (3, 2, knots) the input after dead zone and limit, and its derivatives by both. Each
+        comes
+        with its integral.
+    zero, factor : (n,) this run's encoder zeros and factors on dry friction.
+    gain : share of the error that corrects the state.
+    longest : longest step, s.
     """
 
     t: Array
@@ -64,11 +71,11 @@ class FollowedRun(NamedTuple):
 
 
 class FollowedState(NamedTuple):
-    """Positions and velocities (n,), the laws' own states and terms `aux` (laws, ROOM).
+    """Positions and velocities (n,), and the laws' own states and terms `aux` (laws, ROOM).
 
-    Also their derivatives by every lane: `DX`, `DV` (n, lanes), `DA` (2 laws, lanes); without
-    derivatives there are no lanes. The lanes are the parameters `p`, then those of the run: zeros,
-    starts, velocities, factors on dry friction (n each).
+    `DX`, `DV` (n, lanes) and `DA` (2 laws, lanes) are their derivatives. The lanes are the
+    parameters `p`, then those of the run: zeros, starts, velocities and factors on dry friction (n
+    each). Without derivatives there are no lanes.
     """
 
     x: Array
@@ -82,9 +89,14 @@ class FollowedState(NamedTuple):
 class Room(NamedTuple):
     """Work arrays of one step.
 
-    Positions `xm` at mid-step, forces `f`, sliding friction `R` (n,); slopes of the forces by x and
-    v, `K` and `C` (n, n). `du` (4,) are the derivatives of the input by the drive's parameters,
-    `dlag` (4,) those of the lag's state. `DF`, `DR` (n, lanes): forces and friction by every lane.
+    Attributes
+    ----------
+    xm : (n,) positions at mid-step.
+    f, R : (n,) forces and sliding friction.
+    K, C : (n, n) slopes of the forces by position and velocity.
+    du : (4,) derivatives of the input by the drive's parameters.
+    dlag : (4,) derivatives of the lag's state by the same parameters.
+    DF, DR : (n, lanes) derivatives of forces and friction.
     """
 
     xm: Array
@@ -99,7 +111,7 @@ class Room(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step of `h` s: the arriving input, and whether the drive is powered (1) or not."""
+    """One step of `h` s: the input force `u`, and `on`, which is 1 while the drive is powered."""
 
     u: float
     on: float
@@ -117,7 +129,7 @@ def pull(f, j, n, value):
 
 @inlined
 def pull_lane(DF, lane, j, n, value):
-    """Add the tension of spring j to a lane of the forces on its two ends."""
+    """Add the tension of spring j to one lane of the forces on its two ends."""
     if j < n:
         DF[j, lane] -= value
     if j > 0:
@@ -132,7 +144,7 @@ def reach(x, j, n):
 
 @inlined
 def add_forces(laws, run, state, work, step):
-    """Add the laws' forces at mid-step, and their slopes by x and v."""
+    """Add the laws' forces at mid-step, and their slopes by position and velocity."""
     p, factor, aux, v, xm, h = laws.p, run.factor, state.aux, state.v, work.xm, step.h
     n, f, K, C = v.size, work.f, work.K, work.C
     for law in range(laws.kinds.size):
@@ -165,9 +177,9 @@ def add_forces(laws, run, state, work, step):
 
 @inlined
 def add_slopes(laws, run, state, work, h, crossing):
-    """Fill DF and DR: forces and friction by every lane, directly and through the state.
+    """Fill DF and DR: derivatives of forces and friction, directly and through the state.
 
-    The input's parameters act unless a play is being crossed.
+    The parameters of the input count unless a play is being crossed.
     """
     p, factor, aux, v, xm = laws.p, run.factor, state.aux, state.v, work.xm
     DX, DV, DA, DF, DR = state.DX, state.DV, state.DA, work.DF, work.DR
@@ -243,7 +255,7 @@ def add_slopes(laws, run, state, work, h, crossing):
 
 @inlined
 def settle_friction(laws, state, h):
-    """Advance the states of presliding friction by a step of h s, at its last velocities."""
+    """Advance the states of presliding friction by a step of h s at the present velocities."""
     p, aux, DV, DA, L = laws.p, state.aux, state.DV, state.DA, laws.kinds.size
     for law in range(L):
         kind, at, o, out = laws.kinds[law], laws.places[law], laws.first[law], aux[law, OWN:]

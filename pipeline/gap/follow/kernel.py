@@ -1,15 +1,15 @@
 """Simulate a chain with many laws while it follows a record: compiled, with all derivatives.
 
-At every sample the simulated state is corrected by a share `gain` of the error,
+At every sample the simulated state is corrected by a share `gain` of the error:
 
-    e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt,
+    e = y - x,   x <- x + gain e,   v <- v + 0.3 gain² e / Δt.
 
-and then moves on freely to the next. A following model is never far from the data, so the errors
-have one valley where a free run has many; with `gain` 0 it is the free run. Derivatives by all
-parameters are integrated with the state: they are exact for the numerical map.
+Then it moves freely to the next sample. So the model is never far from the data, and the cost has
+one valley where a free simulation has many. With `gain` 0 the simulation is free. Derivatives by
+all parameters are integrated with the state and are exact for the numerical scheme.
 
-Steps are those of the leapfrog. Dry friction is set-valued, and a cart that turns inside a step
-turns at that instant.
+The steps are those of the leapfrog method. Dry friction is set-valued, and a cart that turns inside
+a step turns at that instant.
 
 References: H. Abarbanel, D. Creveling, R. Farsian, M. Kostuk, SIAM J. Applied Dynamical Systems 8
 (2009) 1341-1381; L. Ljung, System Identification, 2nd ed., chapter 7 (fixed-gain predictors).
@@ -30,22 +30,22 @@ from pipeline.plant.nonlinear.simulator.compiler import jit
 from pipeline.plant.nonlinear.simulator.state import tie
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_LEAST_SHARE = 0.02  # of cart 1's mass: the least that is left of it without the motor's
-_BLOWN_UP = 1e6  # times the record's span
+_LEAST_SHARE = 0.02  # of cart 1's mass; at least this much is left without the motor
+_BLOWN_UP = 1e6  # position at which the simulation has diverged
 
 
 @jit
 def follow_run(laws, run, state, work, E, J):
-    """Fill the errors E (samples, n) and the lanes of J (lanes, samples, n); False: it diverged.
+    """Simulate a run; fill its errors E (samples, n) and derivatives J (lanes, samples, n).
 
-    The state is the start of the run, and is overwritten.
+    Return False if it diverges. `state` holds the start of the run and is overwritten.
     """
     p, kinds, places, first, play = laws.p, laws.kinds, laws.places, laws.first, laws.play
     t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
     x, v, aux, DX, DV, DA = state.x, state.v, state.aux, state.DX, state.DV, state.DA
     xm, f, R, K, C, du, dlag = work.xm, work.f, work.R, work.K, work.C, work.du, work.dlag
     DF, DR, n, gain = work.DF, work.DR, state.x.size, run.gain
-    own = p.size  # where the lanes of the run begin
+    own = p.size  # index of the first lane of the run
     lanes = DX.shape[1]
     derive = lanes > 0
     drive, L = 3 * n + 1, kinds.size
@@ -53,7 +53,8 @@ def follow_run(laws, run, state, work, E, J):
     lagged = held[0, 0, 0]
     position = 0
     on = 0
-    # A play: the motor is a separate body while it crosses; in contact it is one with cart 1.
+    # With a play, the motor is a separate body while it crosses the play. In contact it is one with
+    # cart 1.
     side_of = 0.0
     gap = p[first[play]] if play >= 0 else 0.0
     motor = p[first[play] + 1] if play >= 0 else 0.0
@@ -78,9 +79,10 @@ def follow_run(laws, run, state, work, E, J):
                 if lane_gain >= 0:
                     J[lane_gain, sample, i] += x[i]
             if gain > 0.0:
-                # A cart slightly off may be held there by dry friction, so it gets no jolt.
+                # Dry friction may hold the cart there, so only its position is corrected, without a
+                # jolt.
                 x[i] += gain * e
-                # A little over critical.
+                # This share damps the correction a little more than critically.
                 kick = 0.3 * gain * gain / step
                 v[i] += kick * e
                 if derive:
@@ -88,7 +90,8 @@ def follow_run(laws, run, state, work, E, J):
                         DX[i, q] -= gain * J[q, sample, i]
                         DV[i, q] -= kick * J[q, sample, i]
                 if i == 0 and play >= 0:
-                    # The motor with it: a correction of the cart alone would cause impacts.
+                    # The motor is corrected too, since a correction of only the cart would cause
+                    # impacts.
                     aux[play, 0] += gain * e
                     aux[play, 1] += kick * e
                     if derive:
@@ -107,7 +110,7 @@ def follow_run(laws, run, state, work, E, J):
         h = step / count
         for sub in range(count):
             now = t[sample] + sub * h
-            # ------------------------------------------------ the input, its mean over the step
+            # ------------------------------------------------ the mean input over the step
             end = now + h - delay
             if sample == 0 and sub == 0:
                 begin = now - delay
@@ -173,7 +176,7 @@ def follow_run(laws, run, state, work, E, J):
                     rise = p[o + 1] * (aux[law, 0] - xm[at]) + p[o + 2] * (aux[law, 1] - v[at])
                     aux[law, 1] -= h * rise
                     aux[law, 0] += 0.5 * h * aux[law, 1]
-            # ------------------------------------------------ the velocities, dry friction last
+            # ------------------------------------------------ velocities, with dry friction last
             for i in range(n):
                 if not free[i]:
                     x[i] = xm[i] + 0.5 * h * v[i]
@@ -239,7 +242,8 @@ def follow_run(laws, run, state, work, E, J):
                         side = 1.0 if apart > 0.0 else -1.0
                         late = min((abs(apart) - 0.5 * gap) / abs(rate), h)
                         share = min(motor / p[0], 1.0 - _LEAST_SHARE)
-                        # What is pushed together again within the step does not part.
+                        # If the bodies are pushed together again within the step, they stay in
+                        # contact.
                         bounce = p[o + 2]
                         if 2.0 * bounce * abs(rate) < side * (push - v[0] + before):
                             bounce = 0.0
@@ -250,7 +254,7 @@ def follow_run(laws, run, state, work, E, J):
                                 off = DA[at, q] - DX[0, q]
                                 if q == o:
                                     off -= 0.5 * side
-                                # The instant moves with the parameter.
+                                # The instant of contact depends on the parameter.
                                 DX[0, q] += share * whole * off / rate
                                 DA[at, q] += (share - 1.0) * whole * off / rate
                                 off = (1.0 + bounce) * (DA[vat, q] - DV[0, q])

@@ -1,4 +1,4 @@
-"""The laws of a following model, and its parameters as one vector in physical units."""
+"""The laws of a model that follows a record, and its parameters as one physical vector."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,28 +15,28 @@ from pipeline.plant.nonlinear.effects.law import ForceLaw, FrictionLaw
 from pipeline.plant.nonlinear.simulator.terms import COEFFICIENTS, Kind
 from pipeline.plant.nonlinear.tables import TABLES, Drive
 
-_CHAIN = (0.005, 20.0)  # times the largest first estimate: limit for masses and springs
-_REACH = 0.3  # of a mass or spring, in one step, …
-_SMALL = 0.1  # … or of this share of the largest, above which a first estimate is trusted
-_DELAY = (-0.05, 0.1)  # s
-_SHORT = 0.01  # s: the largest step of a delay or lag
-# For each kind, in the order of the catalogue: the coordinates in which it grows from zero.
+_CHAIN = (0.005, 20.0)  # limits of masses and springs, times the largest first estimate
+_REACH = 0.3  # largest step of a mass or spring, relative
+_SMALL = 0.1  # share of the largest. A smaller first estimate is not trusted
+_DELAY = (-0.05, 0.1)  # s, limits of a delay
+_SHORT = 0.01  # s, largest step of a delay or lag
+# For each kind, in the order of the catalogue, the coordinates in which a law grows from zero.
 GROWTHS = tuple(effect.grown for effect in CATALOGUE)
 SIZES = tuple(len(growth.coordinates) for growth in GROWTHS)
 POSITIVE = {kind for kind, growth in enumerate(GROWTHS) if not growth.signed}
 DRY = tuple(kind for kind, effect in enumerate(CATALOGUE) if effect.dry)
-SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # with a position whose sign is the side
-# The columns that the laws fill in the simulator's tables.
+SIDED = (Kind.END_STOP, Kind.SLACK_SPRING)  # laws with a position whose sign gives the side
+# The columns that each law fills in the simulator's tables.
 COLUMNS = tuple(
     tuple(effect.columns(dict.fromkeys((p.name for p in effect.own), 1.0))) for effect in CATALOGUE
 )
-# The laws that need no shape can start from zero.
+# The laws that need no shape, so they can start from zero.
 PLAIN = tuple(
     kind
     for kind, effect in enumerate(CATALOGUE)
     if isinstance(effect.law, ForceLaw | FrictionLaw) and len(COEFFICIENTS[kind]) == SIZES[kind]
 )
-Column = tuple[type[IntEnum], int]  # columns of different tables are equal as numbers
+Column = tuple[type[IntEnum], int]  # with its table: columns of different tables have equal numbers
 DRIVE_COLUMNS = (
     Drive.DEAD_ZONE_WIDTH,
     Drive.SATURATION_LIMIT,
@@ -66,20 +66,21 @@ class TrialLaw:
 
     @property
     def sided(self) -> tuple[int, int, float]:
-        """Kind, place and side, if it has one."""
+        """Kind, place, and the side (1 or -1; 0 for a law without sides)."""
         return self.kind, self.place, float(np.sign(self.values[1]) if self.kind in SIDED else 0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FollowedBench:
-    """Limits of the laws on one bench.
+    """The properties of a bench that limit the laws.
 
     Attributes
     ----------
-    chain : the first estimate; springs (n + 1,): the springs present.
-    largest : of the input, 0 without one.
-    free : which carts move, by run.
-    pinned : the mass that sets the scale if no input does.
+    chain : the first estimate.
+    springs : (n + 1,) which springs exist.
+    largest : the largest input. Zero without an input.
+    free : for each run, which carts move.
+    pinned : the cart whose mass is fixed at its first estimate. Used if no input sets a scale.
     """
 
     chain: Chain
@@ -90,12 +91,12 @@ class FollowedBench:
 
     @cached_property
     def shown(self) -> tuple[bool, ...]:
-        """(n,) The carts that move in some run."""
+        """(n,) whether each cart moves in some run."""
         return tuple(any(moves) for moves in zip(*self.free, strict=True))
 
     @cached_property
     def rows(self) -> tuple[int, ...]:
-        """The springs stretched in some run; of springs with equal stretch, one."""
+        """The springs that are stretched in some run; only one of those with equal stretch."""
         shown: dict[tuple, int] = {}
         for j in (j for j, there in enumerate(self.springs) if there):
             ends = [i for i in (j - 1, j) if 0 <= i < self.n]
@@ -106,7 +107,7 @@ class FollowedBench:
 
     @property
     def n(self) -> int:
-        """Number of carts."""
+        """The number of carts."""
         return self.chain.n
 
 
@@ -120,37 +121,37 @@ class LawSet:
 
     bench: FollowedBench
     keys: tuple[tuple[int, int], ...]
-    drive: tuple[bool, ...]  # which of its laws are free
+    drive: tuple[bool, ...]  # which of the drive's laws are free
 
     @cached_property
     def kinds(self) -> np.ndarray:
-        """(laws,) Kinds."""
+        """(laws,) the kinds."""
         return np.array([kind for kind, _ in self.keys], dtype=np.int64)
 
     @cached_property
     def places(self) -> np.ndarray:
-        """(laws,) Carts or springs, from 0."""
+        """(laws,) the carts or springs, from 0."""
         return np.array([place for _, place in self.keys], dtype=np.int64)
 
     @cached_property
     def base(self) -> int:
-        """Number of parameters of chain and drive."""
+        """The number of parameters of chain and drive."""
         return 3 * self.bench.n + 1 + forces.DRIVE
 
     @cached_property
     def first(self) -> np.ndarray:
-        """(laws,) First parameter of each law."""
+        """(laws,) index of each law's first parameter."""
         sizes = [SIZES[kind] for kind, _ in self.keys]
         return self.base + np.cumsum([0, *sizes])[:-1].astype(np.int64)
 
     @cached_property
     def size(self) -> int:
-        """Length of the vector."""
+        """The length of the vector."""
         return self.base + sum(SIZES[kind] for kind, _ in self.keys)
 
     @cached_property
     def dry(self) -> np.ndarray:
-        """(n,) on which carts dry friction acts."""
+        """(n,) whether dry friction acts on each cart."""
         there = {place for kind, place in self.keys if kind in DRY}
         return np.array([i in there for i in range(self.bench.n)])
 
@@ -160,11 +161,11 @@ class LawSet:
         return 3 * self.bench.n + 1
 
     def neutral_drive(self) -> Array:
-        """Return the values of a drive without any law."""
+        """The values of a drive without any law."""
         return np.array([0.0, self.bench.largest, 0.0, 0.0])
 
     def start(self, chain: Chain) -> Array:
-        """Return the vector of a chain without laws, with no mass or spring near zero."""
+        """Return the vector of a chain without laws; masses and springs near zero are raised."""
         p = np.zeros(self.size)
         n = self.bench.n
         p[:n] = np.maximum(chain.m, _SMALL * chain.m.max())
@@ -175,7 +176,7 @@ class LawSet:
         return p
 
     def chain(self, p: Array) -> Chain:
-        """Return the chain in a vector."""
+        """Return the chain of a vector."""
         n = self.bench.n
         k = p[2 * n : 3 * n + 1].copy()
         return Chain(m=p[:n].copy(), c=np.maximum(p[n : 2 * n], 0.0), k=k)
@@ -208,7 +209,7 @@ class LawSet:
             if kind in POSITIVE:
                 low[[o + q for q in COEFFICIENTS[kind]]] = 0.0
             if kind == Kind.SLACK_SPRING:
-                # A slack spring keeps a twentieth of its stiffness.
+                # A slack spring keeps at least a twentieth of its stiffness.
                 low[o] = -0.95 * max(chain.k[place], _SMALL * chain.k.max())
             elif kind == Kind.SENSOR_GAIN:
                 low[o], high[o] = -0.5, 0.5
@@ -228,16 +229,16 @@ class LawSet:
         return low, high, reach
 
     def with_laws(self, p: Array, extra: Sequence[TrialLaw]) -> tuple["LawSet", Array]:
-        """Return the laws and vector with more of them."""
+        """Return laws and vector with additional laws."""
         laws = LawSet(
             bench=self.bench, keys=(*self.keys, *(law.key for law in extra)), drive=self.drive
         )
         return laws, np.concatenate([p, *(law.values for law in extra)])
 
     def without(self, p: Array, groups: Sequence[int]) -> tuple["LawSet", Array]:
-        """Return the laws and vector without some groups.
+        """Return laws and vector without some groups.
 
-        Laws by index, the drive's as -1 to -4.
+        A law's group is its index; the laws of the drive are -1 to -4.
         """
         kept = [i for i in range(len(self.keys)) if i not in groups]
         drive = tuple(free and -1 - q not in groups for q, free in enumerate(self.drive))
@@ -264,13 +265,13 @@ class LawSet:
         return np.arange(o, o + SIZES[self.keys[group][0]])
 
     def neutral(self) -> Array:
-        """Return the vector's neutral values (0 but for the limit)."""
+        """Return the neutral values of the vector, 0 except for the input limit."""
         out = np.zeros(self.size)
         out[self.drive_at + LIMIT] = self.bench.largest
         return out
 
     def _shared(self, kind: int, place: int, p: Array) -> dict[str, float]:
-        """Return, by symbol, the parameters of the friction within a law: 0 where it is not."""
+        """Return, by symbol, the parameters of a law's friction; 0 if the friction does not act."""
         law = CATALOGUE[kind].law
         if not (isinstance(law, FrictionLaw) and law.beyond):
             return {}
@@ -282,7 +283,7 @@ class LawSet:
     def columns(self, p: Array) -> dict[tuple[type[IntEnum], int], dict[IntEnum, float]]:
         """Return the values of the laws in the simulator's tables.
 
-        By table and row (0 for a drive).
+        The keys are table and row (0 for a drive).
         """
         n = self.bench.n
         out: dict[tuple[type[IntEnum], int], dict[IntEnum, float]] = {}
@@ -304,10 +305,10 @@ class LawSet:
         return out
 
     def _contact(self, p: Array, *, motor: float, bounce: float) -> tuple[float, float]:
-        """Return stiffness and damping of a contact at which bodies part as they should.
+        """Return stiffness and damping of a contact with a given coefficient of restitution.
 
-        The follower's contact is rigid; a real one is not quite. W. Goldsmith, Impact (1960),
-        chapter 4.
+        The contact in this package is rigid, the simulator's slightly soft. See W. Goldsmith,
+        Impact (1960), chapter 4.
         """
         firm = 40.0 * float(p[2 * self.bench.n] + p[2 * self.bench.n + 1])
         fall = -float(np.log(np.clip(bounce, 0.02, 0.9)))
@@ -323,7 +324,7 @@ def smooth_laws(bench: FollowedBench, *, columns: frozenset[Column]) -> LawSet:
     n, driven = bench.n, bench.largest > 0.0
 
     def here(place: str) -> list[int]:
-        """Return the kinds of law that the runs may show at a place."""
+        """Return the kinds of law that the runs can show at a place."""
         return [
             kind
             for kind in PLAIN

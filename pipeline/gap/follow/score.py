@@ -1,6 +1,6 @@
 """Score laws that need a shape: how much each would lower the cost of the fitted model.
 
-A law of size zero moves nothing, but the same derivatives give its first-order effect. Beside the
+A law of size zero moves nothing, but the derivatives give its first-order effect. Together with the
 other parameters its best size is a small linear problem.
 
 Reference: T. Söderström, P. Stoica, System Identification, section 11.5 (score tests).
@@ -19,14 +19,14 @@ from pipeline.plant.nonlinear.simulator.terms import Kind
 
 @dataclass(frozen=True, kw_only=True)
 class Scored:
-    """A law with the best values for the data, and the cost it would save."""
+    """A law with its best values, and the decrease of the cost that they would give."""
 
     law: TrialLaw
     drop: float
 
 
 def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[Scored]:
-    """Return the trials that would help, each beside all laws of the model, the best first."""
+    """Return the trial laws that would help together with all laws of the model, the best first."""
     laws, p = follow.laws.with_laws(follow.p, trials)
     wide = replace(follow, laws=laws, p=p)
     slope = records.slope(wide)
@@ -52,7 +52,7 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
         taken = np.linalg.solve(A, np.column_stack([across, slope.b[base] / size]))
         S = slope.H[np.ix_(mine, mine)] - across.T @ taken[:, :-1]
         b = slope.b[mine] - across.T @ taken[:, -1]
-        # The other parameters must leave this share of a law's power.
+        # A law needs this share of its power after the other parameters are adjusted.
         S = S + 1e-9 * np.diag(np.diag(slope.H)[mine])
         found = np.linalg.solve(S, b)
         if law.kind in POSITIVE and np.any(found < 0.0):
@@ -69,7 +69,7 @@ def score(follow: Follow, records: Records, trials: Sequence[TrialLaw]) -> list[
 
 
 def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return laws that need a shape, with size zero, close enough for a fit to converge."""
+    """Return laws that need a shape, with size zero and with shapes that a fit can start from."""
     bench = follow.laws.bench
     n = bench.n
     chain = follow.laws.chain(follow.p)
@@ -90,7 +90,7 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
         if reach <= 0.0:
             continue
         omega = np.sqrt(max(diagonal[i], 1e-12) / chain.m[i])
-        # With a frequency of its own; a hidden mass decays with 3 % of critical damping.
+        # Trial frequencies of a hidden mass; its damping is 3 % of critical.
         rates = [part * omega for part in (0.45, 0.6, 0.75, 0.9, 1.05, 1.2, 1.4, 1.7, 2.3)]
         stops = _to_both_sides(position[:, i], (0.2, 0.4, 0.55, 0.7, 0.8, 0.87, 0.93, 0.97))
         shapes |= {
@@ -113,26 +113,26 @@ def shaped_laws(follow: Follow, records: Records) -> list[TrialLaw]:
 
 
 def _to_both_sides(most: Array, parts: Sequence[float]) -> list[float]:
-    """Return shares of the largest positions of either sign; a side hardly reached gets none."""
+    """Return shares of the largest positions of either sign; skip a side that is hardly reached."""
     sides = [(side, most[k]) for k, side in enumerate((1.0, -1.0)) if most[k] > 0.1 * most.max()]
     return [side * part * size for side, size in sides for part in parts]
 
 
 def cogging_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return cogging at trial pitches, spaced so that its phase fits over the whole travel."""
+    """Return cogging at trial pitches, close enough that its phase fits over the whole travel."""
     span = 0.0
     for track, own in zip(records.tracks, follow.own, strict=True):
         if track.free[0]:
             span = max(span, float(np.ptp(track.y[:, 0] - own.zero[0])))
     if span == 0.0 or (Kind.COGGING, 0) in follow.laws.keys:
         return []
-    # The number of motor pitches in the travel changes by less than one half.
+    # Numbers of motor pitches in the travel; they differ by less than one half.
     counts = np.arange(1.5, 25.0, 0.4).tolist()
     return [TrialLaw(kind=Kind.COGGING, place=0, values=(0.0, 0.0, span / n)) for n in counts]
 
 
 def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
-    """Return trial plays between motor and cart 1, which no fit from zero can find."""
+    """Return a trial play between motor and cart 1, which no fit from zero can find."""
     spans = [
         float(np.ptp(track.y[:, 0]))
         for track in records.tracks
@@ -140,7 +140,7 @@ def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
     ]
     if not spans or (Kind.BACKLASH, 0) in follow.laws.keys:
         return []
-    # In units of the travel, of cart 1's mass, of the speed.
+    # Size of the play, motor mass, and ratio of the speeds after and before an impact.
     values = 0.03 * max(spans), 0.15 * float(follow.p[0]), 0.4
     law = TrialLaw(kind=Kind.BACKLASH, place=0, values=values)
     return [law] if records.allows(law) else []
@@ -149,7 +149,7 @@ def backlash_laws(follow: Follow, records: Records) -> list[TrialLaw]:
 def shaped_trials(follow: Follow, records: Records) -> list[Scored]:
     """Return the laws with a shape that would help the model, the best first.
 
-    For each law at each place and side, the best shape.
+    Only the best shape of each law at each place and side is returned.
     """
     trials = score(follow, records, shaped_laws(follow, records))
     moving = [i for i, t in enumerate(records.tracks) if t.free[0] and np.any(t.command)]

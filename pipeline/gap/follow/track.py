@@ -1,4 +1,4 @@
-"""One run as a following model sees it: thinned readings, its own parameters, its errors."""
+"""One run for a model that follows it: thinned readings, the run's own parameters, errors."""
 
 from dataclasses import dataclass, replace
 
@@ -11,16 +11,19 @@ from pipeline.gap.follow.laws import DEAD_ZONE, LIMIT, FollowedBench, LawSet
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.nonlinear.simulator.terms import Kind
 
-_LONGEST = 2.5e-3  # s, of a step, at the usual pace …
-_FREELY = 0.4  # … times this in a free run, whose step errors add up
-_KNOCK = 0.25  # … or this if bodies meet in between
+_LONGEST = 2.5e-3  # s. Longest step, for a bench of carts
+_FREELY = 0.4  # Factor on it for a small gain. Step errors add up then
+_KNOCK = 0.25  # Factor on it if bodies may meet
 _SURE = 1e6  # weight of known quantities
 _FACTORS, _FACTOR_STEP = (0.3, 3.0), 0.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Own:
-    """The parameters of one run: (n,) zeros, shifts of the start, start velocities, factors."""
+    """The parameters of one run, (n,) each.
+
+    They are encoder zeros, shifts of the start, start velocities, and factors on dry friction.
+    """
 
     zero: Array
     shift: Array
@@ -30,7 +33,10 @@ class Own:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Track:
-    """One thinned run: y, weight over noise, and `guided` motion of held carts (samples, n)."""
+    """One thinned run, arrays (samples, n).
+
+    `weight` is over the noise; `guided` is the motion of held carts.
+    """
 
     t: Array
     y: Array
@@ -65,19 +71,20 @@ class Track:
     def prior(self, own: Own, dry: np.ndarray) -> tuple[Array, Array]:
         """Return (4 n,) weights of the priors on its own parameters, and their residuals."""
         n = self.free.size
-        # A release may be a third of the swing from its first readings.
+        # At a release the first readings may be off by a third of the swing.
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))
         speed = np.where(self.free & (not self.at_rest), 1.0 / self.start_std[1], _SURE)
         start = np.where(np.isfinite(self.start_std[0]), 1.0 / self.start_std[0], start)
-        factor = np.where(dry, 1.0 / 0.05, _SURE)  # dry friction differs by 5 % between runs
+        factor = np.where(dry, 1.0 / 0.05, _SURE)  # it differs by 5 % between runs
         weight = np.concatenate([1.0 / self.zero_std, start, speed, factor])
         off = [self.zero - own.zero, -own.shift, self.slope - own.v0, 1.0 - own.factor]
-        # An unknown velocity needs a weak prior, as a closely followed run does not determine it.
+        # An unknown velocity needs a weak prior, because following the record closely does not
+        # determine it.
         weight[2 * n : 3 * n] = np.maximum(weight[2 * n : 3 * n], 1e-3 / max(self.swing, 1e-12))
         return weight, weight * np.concatenate(off)
 
     def moved(self, own: Own, by: Array) -> Own:
-        """Return its own parameters after a step (4 n,)."""
+        """Return the run's own parameters after a step (4 n,)."""
         zero, shift, v0, factor = by.reshape(4, -1)
         step = np.clip(factor, -_FACTOR_STEP, _FACTOR_STEP)
         return Own(
@@ -92,7 +99,7 @@ def make_track(run: GapRun) -> Track:
     """Thin a run to the rate that a swing needs."""
     n = run.zero.size
     sampled = 1.0 / float(np.median(np.diff(run.t)))
-    # 100 Hz, at the usual pace: some twenty readings a swing.
+    # 100 Hz for a bench of carts, which is some twenty readings per swing.
     thin = replace(run, block=max(1, int(sampled * run.pace / 100.0))).thin
     y, weight = np.zeros((thin.t.size, n)), np.zeros((thin.t.size, n))
     seen, free = np.zeros(n, dtype=np.bool_), np.array(run.free)
@@ -122,9 +129,10 @@ def make_track(run: GapRun) -> Track:
 def errors_of(
     laws: LawSet, p: Array, track: Track, own: Own, *, gain: float, derive: bool
 ) -> tuple[Array, Array] | None:
-    """Return errors (samples, n) and derivatives of the model's readings (lanes, samples, n).
+    """Return errors (samples, n) and derivatives of the simulated readings (lanes, samples, n).
 
-    None if the model diverges. Lanes: the vector, then zeros, shifts, velocities, factors.
+    The result is None if the simulation diverges. The lanes are the vector, then zeros, shifts,
+    velocities and factors.
     """
     n, count = laws.bench.n, len(laws.keys)
     lanes = p.size + 4 * n if derive else 0
@@ -139,7 +147,7 @@ def errors_of(
             aux[law, : forces.OWN] = x[place], own.v0[place]
             DA[2 * law], DA[2 * law + 1] = DX[place], DV[place]
     play = max(np.flatnonzero(laws.kinds == Kind.BACKLASH), default=-1)
-    # At such a gain step errors do not add up.
+    # With a large gain, step errors do not add up.
     longest = track.longest * (1.0 if gain > 0.05 else _FREELY)
     if play >= 0:
         longest = min(longest, _KNOCK * track.longest)
@@ -165,9 +173,9 @@ def errors_of(
 
 
 def _shaped(track: Track, dead: float, limit: float) -> Array:
-    """Return (3, 2, knots): the input behind dead zone and limit, its derivatives by both, each …
+    """Return the input after dead zone and limit, and its derivatives by both, (3, 2, knots).
 
-    … with its integral.
+    The second axis holds the values and their integrals over time.
     """
     u = track.command
     sign, past = np.sign(u), np.maximum(np.abs(u) - dead, 0.0)
@@ -181,9 +189,9 @@ def _shaped(track: Track, dead: float, limit: float) -> Array:
 
 
 def compile_follower() -> None:
-    """Follow a record of two readings, so that the code is compiled.
+    """Compile the simulation by running it on a record of two readings.
 
-    Seconds, unless it is stored.
+    This takes seconds, unless the compiled code is stored.
     """
     one, two = np.ones(1), np.array([0.0, 0.01])
     track = Track(

@@ -1,1 +1,1 @@
-"""The laws found by following, as effects of the catalogue, fitted to whole runs and judged."""
+"""Turn the laws that `gap.follow` found into effects, fit them to whole runs, and judge them."""

@@ -1,4 +1,4 @@
-"""The time limit of a search: when it is over, the best answer so far is used."""
+"""The time limit of a search; after it, the best answer so far is used."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -8,27 +8,27 @@ from pipeline.gap.fit.levenberg_marquardt import Mapper
 
 
 class OutOfTime(Exception):
-    """The time limit is over; the caller keeps its best result."""
+    """The time limit is reached; the caller keeps its best result."""
 
 
 class Deadline:
-    """Maps work over runs until the time is over; all slow work goes through here.
+    """Maps a function over runs until the time is up; all slow work goes through here.
 
-    `cut` says whether any work was refused, so that the answer depends on the machine.
+    `cut` is true if any work was refused, so that the answer depends on the machine.
     """
 
     def __init__(self, mapper: Mapper, *, seconds: float | None) -> None:
-        """Start the clock; None means no limit."""
+        """Start the clock; `seconds` None means no limit."""
         self.cut = False
         self._mapper = mapper
         self._end = None if seconds is None else time.monotonic() + seconds
 
     def map(self, work: Callable[[Any], Any], *items: Iterable[Any]) -> Iterator[Any]:
-        """Map as `map` does.
+        """Map like the built-in `map`.
 
         Raises
         ------
-        OutOfTime : the time is over, before or between two items.
+        OutOfTime : the time is up, before or between two items.
         """
 
         def in_time(*item: Any) -> Any:

@@ -22,10 +22,10 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Hypothesis:
-    """A model with its fit on training runs and its error on held-out ones.
+    """A model with its fit to the training runs and its error on the held-out runs.
 
-    `at_floor`: only noise is left, on training and on held-out runs. `news` and `held_news` are the
-    numbers of independent residuals.
+    `at_floor` is true if only noise is left, on training and held-out runs. `news` and `held_news`
+    are the numbers of independent residuals in both.
     """
 
     fit: GapFit
@@ -44,23 +44,23 @@ class Hypothesis:
 
     @property
     def key(self) -> frozenset[tuple[str, int]]:
-        """Effects and places."""
+        """The effects and their places."""
         return frozenset(c.key for c in self.fit.structure.effects)
 
     @property
     def has_contact(self) -> bool:
-        """Whether it has contacts."""
+        """Whether an effect has a contact."""
         return self.fit.structure.has_contact
 
     @property
     def size(self) -> int:
-        """The number of laws; dry friction counts once, on however many carts it acts."""
+        """The number of laws; dry friction counts once, even on several carts."""
         effects = self.fit.structure.effects
         return len({c.effect.key if c.effect.family else c.key for c in effects})
 
     @property
     def sound(self) -> bool:
-        """Return whether every effect matches its name, with no estimate at a search bound."""
+        """Whether every effect deserves its name, and no estimate is at a bound."""
         structure, theta = self.fit.structure, self.fit.theta
         low, high = structure.bounds()
         at_bound = (theta <= low + _BOUND_MARGIN) | (theta >= high - _BOUND_MARGIN)
@@ -78,9 +78,9 @@ class Hypothesis:
 class Study:
     """The context of the search: runs, springs, catalogue, and options of fits.
 
-    `repeatability` is the relative error between runs with the same input, 0 without repeats.
-    `whole` are the training runs, with the run that was cut restored to its end: without springs,
-    errors that add up over a whole run must show in the parameters.
+    `repeatability` is the relative difference of runs with the same input, 0 without repeats.
+    `whole` is filled for benches without springs. It holds the training runs, with the run that was
+    cut in time at its full length, so that slowly growing errors show.
     """
 
     training: tuple[GapRun, ...]
@@ -94,11 +94,11 @@ class Study:
 
     @property
     def mapper(self) -> Mapper:
-        """The mapper over runs."""
+        """The function that maps work over runs."""
         return self.fitting.mapper
 
     def fit(self, start: GapModel, **how: Any) -> GapFit:
-        """Fit a model to the training runs with the options `Fitting`, changed by `how`."""
+        """Fit a model to the training runs, with the study's options changed by `how`."""
         return fit_model(start, self.training, replace(self.fitting, **how))
 
     def with_noise(self, training: Sequence[GapRun]) -> "Study":
@@ -110,7 +110,7 @@ class Study:
 
     @property
     def floor(self) -> float:
-        """Relative error on the held-out runs that encoder noise alone causes."""
+        """The relative error on the held-out runs that encoder noise alone causes."""
         noise = sum(float((run.sigma**2).sum()) * run.t.size for run in self.held_out)
         motion = sum(float((run.swing**2).sum()) * run.t.size for run in self.held_out)
         return float(np.sqrt(noise / motion))
@@ -121,12 +121,16 @@ class Study:
         return hypothesis.error <= enough
 
     def may_be_half(self, hypothesis: Hypothesis) -> bool:
-        """Return whether more is left than a contact's approximate law, or repeats, explain."""
+        """Return whether so much is left that half of the truth may be missing.
+
+        The error must exceed what repeats explain, and the model must have no contact, whose law is
+        only approximate.
+        """
         enough = max(limits.FURTHER * self.floor, limits.ENOUGH_REPEATS * self.repeatability)
         return hypothesis.error > enough and not hypothesis.has_contact
 
     def is_noise(self, hypothesis: Hypothesis) -> bool:
-        """Return whether only noise is left in every run, or repeatability in held-out ones."""
+        """Return whether only noise is left in every run, or repeatability in held-out runs."""
         quiet = hypothesis.error < limits.NOTHING * self.floor
         quiet = quiet and hypothesis.fit.chi < limits.AT_FLOOR
         as_repeats = hypothesis.error < limits.AS_REPEATS * self.repeatability
@@ -166,7 +170,7 @@ def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
     A residual beyond the noise swings with the carts, so few of its points are independent.
     """
     most = fit.n_points / limits.THINNING
-    # Without springs errors add up to a drift; a diverged model has no residuals.
+    # Without springs, errors add up to a drift. If the model diverged, there are no residuals.
     if not any(fit.structure.springs) or not np.isfinite(fit.cost):
         return most
     alone = sum(independent(row) for left in _residuals(fit, runs) for row in left)
@@ -174,10 +178,10 @@ def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
 
 
 def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
-    """Return by how much a hypothesis is more likely, in units of the criterion.
+    """Return by how much the fuller of two hypotheses is more likely, in units of the criterion.
 
-    Only the residual of the fuller one counts as chance; held-out runs, to which neither is fitted,
-    count equally.
+    Independent readings are counted in the residual of the fuller one, as only that is due to
+    chance. Held-out runs, to which neither is fitted, count equally.
     """
     share = fuller.news / (fuller.fit.n_points / limits.THINNING)
     taught = (other.bic - fuller.bic) * share
@@ -191,6 +195,6 @@ def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
 
 
 def worth_it(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Return whether further effects help, also on runs that the model has not seen."""
+    """Return whether further effects help, also on runs that the fit has not seen."""
     drop = limits.BIC_DROP * (child.size - parent.size) or limits.SAME_LAW
     return lowers_error(child, parent, study) and evidence(child, parent) > drop

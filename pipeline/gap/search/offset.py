@@ -1,7 +1,7 @@
-"""A constant force: the common cause of rest points in runs with different carts held.
+"""Find a constant force that explains the rest points of runs with different carts held.
 
-On a linear chain a constant force only shifts the rest, as a wrong encoder zero would. But the
-springs that carry it change with the held carts, while the force does not.
+On a linear chain, a constant force only shifts the rest, like a wrong encoder zero. But if other
+carts are held, other springs carry the same force.
 """
 
 from collections.abc import Sequence
@@ -28,11 +28,11 @@ class Offset:
 def find_offset(
     chain: Chain, runs: Sequence[GapRun], nuisance: Sequence[Nuisance]
 ) -> Offset | None:
-    """Return the constant force implied by the fitted zeros, or None."""
+    """Return the constant force implied by the fitted encoder zeros, or None."""
     if not np.any(chain.k > 0):
         return None
     if len({run.free for run in runs}) == 1 and not any(run.at_rest for run in runs):
-        return None  # neither other springs nor a known start: a zero like any other
+        return None  # the force would look like a wrong encoder zero
     best: tuple[float, Offset] | None = None
     total, step = 0.0, 0.0
     for run, one in zip(runs, nuisance, strict=True):
@@ -69,7 +69,7 @@ def find_offset(
 
 
 def _compliance(chain: Chain, run: GapRun, cart: int) -> Array:
-    """Return the displacement of the measured carts under a unit force on one cart."""
+    """Return the displacement of the measured carts by a unit force on one cart."""
     free = [i for i, moves in enumerate(run.free) if moves]
     if cart - 1 not in free:
         return np.zeros(len(run.rows))

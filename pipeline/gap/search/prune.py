@@ -1,4 +1,4 @@
-"""Remove needless effects, and order the others: the most helpful first."""
+"""Remove needless effects, and order the others so that the most helpful comes first."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,15 @@ from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import finish, fit_on
 from pipeline.plant.nonlinear.effects import find_effect
 
-_FEW = 4  # effects tried at a time: the least certain are only roughly the least needed
+_FEW = 4  # effects to try at a time. Certainty is only a rough guide to need
 
 
 def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothesis:
-    """Drop effects, and richer laws, that others have made needless; all tried are in `found`.
+    """Drop effects that are needless beside the others; append all that is tried to `found`.
 
-    Effects that may be zero within their error are dropped too. Of the few least certain, the least
-    needed goes first. Losses add up, so each is compared with the best so far.
+    An effect may also be replaced by a simpler law. An effect that may be zero within its standard
+    error is dropped too. Of the few least certain effects, the least needed goes first. Losses add
+    up, so each is compared with the best hypothesis so far.
     """
     best = chosen
     while chosen.key:
@@ -37,7 +38,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
                 if len(effects) > 1:
                     without = _without(chosen, effects[index], study)
                     found.append(without)
-                nothing = sure[index] < SURE  # it is dropped, whatever follows for the others
+                nothing = sure[index] < SURE  # may be zero, so it must go
                 if nothing or (without.sound and _as_good(without, best, study)):
                     needless.append(without)
             if needless:
@@ -50,9 +51,9 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
 
 
 def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
-    """Return a hypothesis without its least certain effect, if that may be zero; or None.
+    """Return a hypothesis without the least certain effect, if that may be zero; or None.
 
-    `final` is its fit with the covariance.
+    `final` is the fit of `chosen` with its covariance.
     """
     sure = sureness(final)
     if not sure or min(sure) >= SURE:
@@ -63,8 +64,8 @@ def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothes
 def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
     """Return whether a hypothesis without one of the effects does about as well.
 
-    If much is left for another reason, the criterion hardly changes. Then an effect that lowers the
-    error of unseen runs by a tenth stays, if the criterion favours it at all.
+    If much is left for another reason, the criterion hardly changes. Then an effect stays if it
+    lowers the error of unseen runs by a tenth and the criterion does not oppose it.
     """
     if worth_it(chosen, without, study):
         return False
@@ -74,7 +75,7 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
 
 
 def sureness(fit: GapFit) -> list[float]:
-    """Return each effect's distance from zero in standard errors, by its least certain one."""
+    """Return each effect's distance from zero in standard errors (its least certain parameter)."""
     structure = fit.structure
     if fit.covariance is None:
         return [np.inf] * len(structure.effects)
@@ -101,7 +102,7 @@ def _without(hypothesis: Hypothesis, effect: Candidate, study: Study) -> Hypothe
 
 
 def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesis | None:
-    """Return the hypothesis with the plainer law from which a richer one grew."""
+    """Return the hypothesis with the simpler law from which a richer one grew, or None."""
     if rich.effect.grows_from is None:
         return None
     index = hypothesis.fit.structure.effects.index(rich)
@@ -117,7 +118,7 @@ def _plainer(hypothesis: Hypothesis, rich: Candidate, study: Study) -> Hypothesi
 def steps_to(
     chosen: Hypothesis, found: Sequence[Hypothesis], study: Study
 ) -> tuple[Hypothesis, ...]:
-    """Return the linear model, one effect, … chosen: the most helpful one alone comes first."""
+    """Return the path from the linear model to the chosen one, the most helpful effect first."""
     steps = [chosen]
     while effects := steps[0].fit.structure.effects:
         known = {h.key: h for h in found}

@@ -22,16 +22,18 @@ from pipeline.words.phrases import phrases
 
 
 class Search:
-    """A search, whose steps each continue from the last one's state.
+    """A search; each step continues from the state after the last one.
 
     Attributes
     ----------
-    study : runs and options of fits; replaced if another noise or split is better.
+    study : runs and options of fits. It is replaced if another noise or split is better.
     linear : the linear chain that fits the training runs.
-    chosen, found : the best hypothesis so far, and all that were judged, the linear one first.
-    path : from the linear model to the chosen one, an effect at a time.
-    verdict, close : the result; under `ambiguous`, its rivals.
-    final : the chosen fit with its covariance, with parameters from whole runs to their end.
+    chosen : the best hypothesis so far.
+    found : all hypotheses judged so far. The linear one comes first.
+    path : the hypotheses from the linear model to the chosen one. Each has one effect more.
+    verdict : the result.
+    close : under the verdict `ambiguous`, the rivals.
+    final : the chosen fit with its covariance. Its parameters come from whole runs.
     notes : notes for the reader.
     """
 
@@ -50,13 +52,13 @@ class Search:
     # ------------------------------------------------------------------------ the steps
 
     def find_effects(self) -> None:
-        """Choose the effects, unless the linear model leaves no more than noise or repeats do."""
+        """Choose the effects, unless the linear model already fits down to noise or repeats."""
         self.chosen, self.found = self._look(self.study)
 
     def measure_noise_anew(self) -> None:
-        """Search again if less is left than the assumed noise.
+        """Search again if the remaining error is smaller than the assumed noise.
 
-        The noise had included the misfit of the linear model.
+        The assumed noise included the misfit of the linear model.
         """
         for _ in range(2):
             if self.chosen.fit.chi > limits.TOO_GOOD or self.deadline.cut:
@@ -65,7 +67,7 @@ class Search:
             self._try(self.study.with_noise(measure_noise(self.chosen.fit, training, training)))
 
     def change_sides(self) -> None:
-        """Search again if an effect is missing in the held-out runs only.
+        """Exchange training and held-out runs and search again, if only the latter lack an effect.
 
         An effect that acts only in the held-out runs cannot be found from the training runs.
         """
@@ -79,8 +81,8 @@ class Search:
     def add_constant_force(self) -> None:
         """Add a constant force if the rest points imply one.
 
-        With the force in the model the encoder zeros are those of the file, within half the noise;
-        everything is then judged so.
+        With the force in the model, the encoder zeros are those of the file, to half the noise. All
+        hypotheses are then judged under this assumption.
         """
         self.path = steps_to(self.chosen, self.found, self.study)
         with suppress(OutOfTime):
@@ -101,7 +103,7 @@ class Search:
             without = without_nothing(self.chosen, self.final, study)
             if without is None:
                 break
-            # Fitted to its end, an effect may turn out to be zero.
+            # In a complete fit, an effect may turn out to be zero.
             self.found = [*self.found, *self.path, without]
             self.path = steps_to(without, self.found, study)
         if not study.whole:
@@ -110,7 +112,7 @@ class Search:
         if self.verdict == "named" and not study.explains(self.chosen):
             self.verdict = "partial"
 
-    # ------------------------------------------------------------------- what they leave
+    # ------------------------------------------------------------------- judged runs
 
     @property
     def judged(self) -> list[tuple[GapRun, Nuisance]]:
@@ -121,7 +123,7 @@ class Search:
         nuisance = (*self.final.nuisance, *self.chosen.held.nuisance)
         return list(zip((*study.training, *study.held_out), nuisance, strict=True))
 
-    # ------------------------------------------------------------------------- inside
+    # ------------------------------------------------------------------- private parts
 
     def _timed(self, study: Study) -> Study:
         """Return a study whose fits obey the time limit."""
@@ -136,7 +138,7 @@ class Search:
         return find_hypotheses(baseline, self._timed(study))
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
-        """Search in another study; return whether it was kept, which needs time."""
+        """Search with another study; keep the result if it was complete, and return whether."""
         self.linear = fit_model(self.linear.anew, study.training, study.fitting)
         chosen, found = self._look(study)
         kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)
@@ -154,8 +156,8 @@ class Search:
             return
         holding = holding_force(structure.model(chosen.fit.theta).tables())
         if abs(offset.force) < holding[offset.cart - 1]:
-            # Effects that can hold a cart so far from its equilibrium: no proof of a constant
-            # force.
+            # Effects such as friction can hold a cart this far from its equilibrium, so it is no
+            # proof.
             return
         pinned, loose = (
             replace(
@@ -163,7 +165,7 @@ class Search:
                 training=tuple(run.with_zeros(width=width) for run in study.training),
                 held_out=tuple(run.with_zeros(width=width) for run in study.held_out),
             )
-            for width in (1e-4, 0.5)  # noises: exact; off by the rounding
+            for width in (1e-4, 0.5)  # in noises: exact zeros, zeros off by rounding
         )
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
@@ -174,14 +176,14 @@ class Search:
         as_good = limits.OFFSET_AS_FREE * chosen.error
         if final.error > min(limits.OFFSET_GAIN * without[-1].error, as_good):
             return
-        # The others were judged with free encoder zeros.
+        # Replace the other hypotheses, which were judged with free encoder zeros.
         self.path, self.found = (*without, final), [*without, final]
         self.study = replace(loose, fitting=self.study.fitting)
 
     def _settle(self, study: Study) -> None:
-        """Continue until the cost falls no more, as a search ends within some standard errors.
+        """Continue the fit until the cost falls no more; a search stops earlier.
 
-        The `bic` stays: rivals and the chosen one are compared as the search left them.
+        The `bic` is not changed, so that rivals and chosen one are compared at the same stage.
         """
         fit = self.chosen.fit
         # A hundredth of chi-square is a tenth of a standard error.

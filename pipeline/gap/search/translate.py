@@ -1,4 +1,4 @@
-"""From the laws left in a following model to effects of the catalogue, and their values."""
+"""Translate the laws that `gap.follow` found into effects of the catalogue, with values."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from enum import IntEnum
@@ -24,7 +24,8 @@ def filled(effect: Effect) -> frozenset[Column]:
 def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, ...]:
     """Return the parameter values for given columns: the inverse of `effect.columns`.
 
-    The columns are sums of the parameters, so values at one point and a unit away suffice.
+    The columns are linear in the parameters. So their values at one point, and one unit away for
+    each parameter, give the inverse.
     """
     order = list(effect.columns(dict.fromkeys(effect.names, 1.0)))
     base = np.arange(1.0, 1.0 + len(effect.names))
@@ -39,7 +40,7 @@ def values_of(effect: Effect, columns: Mapping[IntEnum, float]) -> tuple[float, 
 def as_model(
     follow: Follow, *, springs: Sequence[bool], catalogue: Iterable[Effect], runs: Sequence[GapRun]
 ) -> GapModel:
-    """Return the model with the effects for these laws, the largest that fit first."""
+    """Return the model with the effects for these laws; richer effects are tried first."""
     by_size = sorted(catalogue, key=lambda effect: -len(filled(effect)))
     chain = follow.laws.chain(follow.p)
     candidates: list[Candidate] = []

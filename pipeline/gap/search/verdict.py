@@ -15,8 +15,8 @@ def reach_verdict(
     """Return the verdict, the accepted steps, and under `ambiguous` the rivals.
 
     `steps` lead from the linear model to the chosen one; `found` are all hypotheses judged. If much
-    is left, a step that another effect could replace is withdrawn, and so is every effect without
-    which a hypothesis does about as well.
+    is left, a step is withdrawn if another effect could replace it, or if a hypothesis without it
+    does about as well.
     """
     baseline, chosen = steps[0], steps[-1]
     if not chosen.key:
@@ -45,7 +45,7 @@ def reach_verdict(
 
 
 def _needless(chosen: Hypothesis, found: Sequence[Hypothesis], study: Study) -> Hypothesis | None:
-    """Return the best hypothesis without one of the effects, if that effect does not pay."""
+    """Return the best hypothesis without one of the effects, if that effect helps too little."""
     smaller = [h for h in found if h.key < chosen.key and len(h.key) == len(chosen.key) - 1]
     as_good = [h for h in smaller if not lowers_error(chosen, h, study)]
     return min(as_good, key=lambda h: h.error, default=None)
@@ -65,7 +65,7 @@ def _place(key: tuple[str, int]) -> tuple[int, str]:
 
 
 def _same_kind(rival: Hypothesis, chosen: Hypothesis) -> bool:
-    """Return whether the laws have one family and the same places, as dry friction does."""
+    """Return whether both have the same family of laws at the same places, such as dry friction."""
     return all(
         mine[1] == other[1] and find_effect(mine[0]).family == find_effect(other[0]).family != ""
         for mine, other in _stand_ins(rival, chosen)

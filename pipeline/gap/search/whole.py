@@ -14,16 +14,17 @@ from pipeline.gap.fit.uncertainty import covariance
 from pipeline.gap.limits import AT_FLOOR
 from pipeline.gap.search.hypothesis import Study
 
-_LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s of a piece: with a contact the misfit of whole runs is rugged
-# Factors on a contact's size and damping: the follower's is rigid, a real one is not quite.
+_LENGTHS = (0.3, 0.6, 1.2, 2.4)  # s. With a contact, pieces grow to whole runs
+# Factors on size and damping of a contact to start from. The contact in `gap.follow` is rigid, the
+# simulator's slightly soft.
 _VARIED = ((1.0, 1.0), (1.2, 1.0), (1.0, 0.65), (1.2, 0.65))
-_NEAR = 8  # iterations of a fit that begins near its end
-# Without springs the misfit of a whole run is rugged everywhere: small gains add up.
+_NEAR = 8  # iterations of a fit that starts near its end
+# Options without springs: the cost of a whole run has many valleys, and small improvements add up.
 _FINISHED: dict[str, Any] = {"iterations": 60, "tolerance": 1e-6}
 
 
 def fit_on(fit: GapFit, model: GapModel, study: Study) -> GapFit:
-    """Fit a slightly changed model from where the fit of the original left every run."""
+    """Fit a slightly changed model, starting from the nuisance parameters of the original fit."""
     if not any(study.springs):
         return fit_whole(model, study)
     moved = replace(fit, structure=model.structure, theta=model.theta)
@@ -31,17 +32,17 @@ def fit_on(fit: GapFit, model: GapModel, study: Study) -> GapFit:
 
 
 def fit_whole(start: GapModel, study: Study) -> GapFit:
-    """Fit whole runs; friction first with one size for all runs, then for each run."""
+    """Fit whole runs; friction is first the same in all runs, then different from run to run."""
     structure = start.structure
     steps = {} if any(study.springs) else _FINISHED
     fit = study.fit(start, scatter_free=False, **steps)
     if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
         fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
-    # Rounds of run-by-run friction, with the worst runs restarted before each.
+    # Two rounds with friction by run; before each, the worst runs are restarted.
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
             break
-        # If the better runs are nearly right, a restart of the bad ones is worthwhile.
+        # A restart of the worst runs makes sense only if the better ones are nearly right.
         if np.quantile(fit.run_chi, 0.25) < 6.0:
             fit = restart_runs(fit, study.training, study.mapper)
         elif attempt:
@@ -51,7 +52,7 @@ def fit_whole(start: GapModel, study: Study) -> GapFit:
 
 
 def finish(fit: GapFit, study: Study) -> GapFit:
-    """Return a fit with its covariance, with parameters from whole runs to their end."""
+    """Return a fit with its covariance; its parameters come from whole runs."""
     if not study.whole:
         return covariance(fit, study.training, study.mapper)
     how = replace(study.fitting, scatter_free=False, **_FINISHED)
@@ -59,7 +60,7 @@ def finish(fit: GapFit, study: Study) -> GapFit:
 
 
 def _grown_contact(start: GapModel, study: Study) -> GapFit:
-    """Fit a contact to pieces that grow into whole runs, from several of its sizes."""
+    """Fit a contact to pieces that grow to whole runs, from several sizes of the contact."""
     structure = start.structure
     spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
 

@@ -1,4 +1,4 @@
-"""The account of a search: effects with their errors, rivals, traces, errors by record."""
+"""Describe a search in numbers: effects with their errors, rivals, traces, errors by record."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -16,8 +16,8 @@ from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.plant.nonlinear.effects.base import EffectTerm
 from pipeline.set_up import Units
 
-_MOST_RIVALS = 4  # listed
-_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # share of the samples, and of the largest input: a repeat
+_MOST_RIVALS = 4  # rivals to list
+_SAME_LENGTH, _SAME_LEVEL = 0.9, 0.01  # shares of samples and of input, for a repeat
 
 
 def list_effects(
@@ -37,13 +37,14 @@ def list_effects(
         (added,) = after.key - before.key
         index = places.index(added)
         term, rest = final.terms[index], chosen.key - {added}
-        # A rival has one effect in place of this one, or none of the chosen ones.
+        # A rival has one other effect in place of this one, or shares no effect with the chosen
+        # one.
         rivals = [
             h
             for key, h in same_size.items()
             if key != chosen.key and (rest < key or not key & chosen.key)
         ]
-        # In one of many narrow valleys the curvature does not give the error.
+        # If the cost has many narrow valleys, its curvature does not give the standard error.
         rugged = term.effect.contact and final.chi > AT_FLOOR
         known = None if std is None or rugged else std[structure.span(index)]
         values = _named_values(term, known, units)
@@ -111,7 +112,7 @@ def chain_std(fit: GapFit) -> dict[str, float]:
     values = {f"{letter}_{i}": v for letter, row in (("m", chain.m), ("c", chain.c))
               for i, v in enumerate(row, start=1)}  # fmt: skip
     values |= {f"k_{j + 1}": chain.k[j] for j in structure.rows}
-    # The vector holds their logarithms, whose errors are relative.
+    # The vector holds logarithms, so its standard errors are relative.
     relative = np.sqrt(np.diag(fit.covariance))[: structure.base_size]
     return {name: float(v * r) for (name, v), r in zip(values.items(), relative, strict=True)}
 
@@ -136,7 +137,7 @@ def _sides_of(hypothesis: Hypothesis, study: Study) -> list[tuple[GapRun, Nuisan
 
 
 def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Trace, ...]:
-    """Return every cart of every run beside the models without and with effects."""
+    """Return the measured and simulated motion of every cart in every run, for both models."""
     out = []
     for (run, nuisance_before, held), (_, nuisance_after, _) in zip(
         _sides_of(before, study), _sides_of(after, study), strict=True
@@ -162,9 +163,10 @@ def make_traces(before: Hypothesis, after: Hypothesis, study: Study) -> tuple[Tr
 
 
 def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap, ...]:
-    """Return the relative error of every cart in every record, before and after, as traced.
+    """Return the relative error of every cart in every record, without and with effects.
 
-    The held-out part of a record is separate; its runs between interventions are pooled.
+    The held-out part of a record is listed separately. The runs of a record between interventions
+    are pooled.
     """
     order = (*study.training, *study.held_out)
     rows = [(run, j) for run in order for j in range(len(run.rows))]
@@ -198,8 +200,9 @@ def compare_by_record(traces: Sequence[Trace], study: Study) -> tuple[RecordGap,
 def repeatability(runs: Sequence[GapRun]) -> float | None:
     """Return the relative difference of runs with the same input, or None without repeats.
 
-    The second of two runs is read at the times of the first, with their inputs' first edges
-    aligned. Two pieces of one record are no repeats, as the later one begins in motion.
+    The second of two runs is interpolated at the times of the first, with the first edges of their
+    inputs aligned. Two pieces of one record are not repeats, because the later one begins in
+    motion.
     """
     squares, sizes = 0.0, 0.0
     for i, a in enumerate(runs):
@@ -213,14 +216,14 @@ def repeatability(runs: Sequence[GapRun]) -> float | None:
             difference = [
                 x[inside] - np.interp(t[inside], b.t, y) for x, y in zip(a.y, b.y, strict=True)
             ]
-            # Encoders are zeroed for every run, so a constant is no difference.
+            # Encoders are zeroed for every run, so a constant difference does not count.
             squares += sum(float(((d - d.mean()) ** 2).sum()) for d in difference) / 2.0
             sizes += float((a.swing**2).sum()) * np.count_nonzero(inside)
     return float(np.sqrt(squares / sizes)) if sizes else None
 
 
 def _edge(run: GapRun) -> float:
-    """Return when the input first changes, or the run's start."""
+    """Return the time at which the input first changes, or the run's start."""
     return float(run.knots[int(np.argmax(run.command != run.command[0]))])
 
 
@@ -232,20 +235,20 @@ def _same_input(a: GapRun, b: GapRun, t_a: Array, t_b: Array) -> bool:
         run.command[np.searchsorted(run.knots, t, side="right") - 1]
         for run, t in ((a, t_a), (b, t_b))
     )
-    # A few samples may differ, by one at each edge of the input.
+    # 2 % of the samples may differ, as an edge may be one sample off.
     return bool(np.mean(np.abs(u - v) > _SAME_LEVEL * np.abs(u).max()) < 0.02)
 
 
 def list_contenders(chosen: Hypothesis, others: Sequence[Hypothesis]) -> tuple[Contender, ...]:
     """Return the models that may be true: the chosen one, then the likeliest others.
 
-    A model that lacks some of the chosen effects is no alternative. Nor is one with more effects,
-    if the chosen one leaves only noise.
+    A model is not an alternative if it only lacks some of the chosen effects. Nor is one with
+    additional effects, if the chosen one leaves only noise.
     """
     rivals = [one for one in others if one.key and not one.key <= chosen.key]
     if chosen.at_floor:
         rivals = [one for one in rivals if not one.key > chosen.key]
-    # At most three, which an experiment can distinguish.
+    # At most three models, so that an experiment can distinguish them.
     kept = [chosen, *sorted(rivals, key=lambda one: one.bic)[:2]]
     likely = np.exp(-0.5 * np.array([one.bic - min(k.bic for k in kept) for one in kept]))
     return tuple(

@@ -1,8 +1,9 @@
 """The shortest formula for the unexplained force, by regression in weak form.
 
 The force is known as a mean over windows, and so is each term of a library. Masses, dampings,
-springs and encoder zeros were fitted without the missing law, so they are fitted again beside the
-terms. The formula is the sum of a few terms with the best criterion, if it beats having no term.
+springs and encoder zeros were fitted without the missing law, so they are fitted again together
+with the terms. The formula is the sum of the few terms with the best criterion, if that is better
+than no term.
 
 References: S. L. Brunton, J. L. Proctor, J. N. Kutz, PNAS 113 (2016), 3932-3937 (sparse regression
 for laws of motion); D. A. Messenger, D. M. Bortz, J. Computational Physics 443 (2021), 110525 (in
@@ -22,7 +23,7 @@ from pipeline.gap.types import ForceFormula, FormulaTerm, LeftForce
 
 @dataclass(frozen=True)
 class _Term:
-    """A candidate law of force, and its powers of x, v and u, for its unit."""
+    """A candidate term of the formula; the powers of x, v and u give its unit."""
 
     name: str
     law: Callable[[Array, Array, Array], Array]
@@ -31,7 +32,7 @@ class _Term:
     u: float = 0.0
 
     def unit(self, *, position: str, drive: str) -> str:
-        """Return the unit of its coefficient."""
+        """Return the unit of the coefficient."""
         above = [_power(drive, 1.0 - self.u), _power("s", self.v)]
         below = _power(position, self.x + self.v)
         text = " ".join(part for part in above if part) or "1"
@@ -67,8 +68,8 @@ def find_formula(
 ) -> tuple[ForceFormula | None, Array]:
     """Return the formula for the force on one cart, and its value in every window (n,).
 
-    Without a formula the values are zero. `on_springs` : a wrong encoder zero is a constant force
-        in its run.
+    Without a formula the values are zero. `on_springs` means that a wrong encoder zero looks like a
+    constant force in its run, so each run gets a constant.
     """
     force = np.concatenate([one.force for one in forces])
     linear = np.concatenate(
@@ -88,11 +89,11 @@ def find_formula(
     left = force - basis @ (basis.T @ force)
     alone = columns - basis @ (basis.T @ columns)
     size = np.linalg.norm(columns, axis=0)
-    # The other columns must not explain all of a column.
+    # A term is usable if the other columns do not explain all of it.
     usable = [j for j in range(len(LIBRARY)) if np.linalg.norm(alone[:, j]) > 1e-8 * size[j] > 0]
     best, lowest = (), _criterion(left, 0)
     free = force.size - linear.shape[1]
-    # Ten windows for each term, and at most three terms.
+    # At least ten windows for each term, and at most three terms.
     for count in range(1, min(3, free // 10) + 1):
         for chosen in combinations(usable, count):
             A = alone[:, chosen]
@@ -121,7 +122,7 @@ def find_formula(
 
 
 def _criterion(rest: Array, terms: int) -> float:
-    """Return the Bayesian criterion, with the gain that each of many trial terms must exceed."""
+    """Return the Bayesian criterion, with the extra price for trying many terms."""
     count = rest.size
     cost = count * float(np.log(max(float(rest @ rest), 1e-300) / count))
     return cost + terms * (float(np.log(count)) + BIC_DROP)

@@ -15,10 +15,10 @@ from pipeline.gap.types import FreeRun
 def free_runs(
     fit: GapFit, runs: Sequence[GapRun], zeros: Mapping[str, Array]
 ) -> tuple[FreeRun, ...]:
-    """Return the error of each record, all carts together, in the order of their ids.
+    """Return the error of each record, all carts together, ordered by record id.
 
-    Of the values fitted to a record only its encoder `zeros` (n,) are used. A record divided by a
-    hand is simulated piece by piece, and counts as one.
+    Of the values fitted to a record, only its encoder `zeros` (n,) are used. A record that was
+    interrupted by a hand is simulated piece by piece, and counts as one.
     """
     squares: dict[str, list[Array]] = {}
     for run in runs:

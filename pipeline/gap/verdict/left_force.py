@@ -1,8 +1,8 @@
-"""The unexplained force: by position, velocity and input.
+"""The unexplained force on each cart, by position, velocity and input.
 
 The model is restarted from the measurement again and again, and runs freely over a short stretch.
-In the second part of each stretch its error has the curvature of the missing force. Modulating
-functions average that force, with little influence of the start and the noise.
+In the later part of each stretch, the curvature of its error shows the missing force. Modulating
+functions average that force and suppress the effect of the start and of noise.
 """
 
 from collections.abc import Sequence
@@ -29,11 +29,11 @@ def left_forces(
     found = []
     for run, own in zip(runs, nuisance, strict=True):
         best: list[LeftForce] = []
-        # Windows in s, at the usual pace.
+        # Lengths of the windows in s, for a bench of carts; the shortest with little noise is used.
         for length in (0.05, 0.07, 0.1, 0.15, 0.2):
             forces = _of_run(model, run, own, length=length * run.pace)
             best = [force for force, _ in forces] or best
-            # Noise makes less than a third of it.
+            # The noise must be less than a third of the force.
             if forces and all(noise < 0.3 * _rms(force.force) for force, noise in forces):
                 break
         found += best
@@ -47,7 +47,7 @@ def _of_run(
     width = round(length / run.record.sample_time) + 1
     if not 9 <= width <= run.t.size // 3:
         return []
-    # Half a window more, in which hidden states (a lag, a bent bristle) settle before one begins.
+    # A stretch is half a window longer, so that hidden states (a lag, a bent bristle) settle first.
     cut = cut_shots(run, length=(1.0 + 0.5) * length / run.pace)
     cut = replace(cut, zero=np.where(run.free, own.zero, 0.0))
     read = simulate_run(model, cut, replace(fresh_nuisance(cut), scatter=own.scatter))
@@ -70,7 +70,8 @@ def _of_run(
         for k, spring in ((i - 1, i), (i + 1, i + 1)):
             if 0 <= k < n:
                 force -= chain.k[spring] * (w * off[k][windows]).sum(1)
-        # Within four noises a cart is at rest, where friction answers any force.
+        # A cart whose motion is within four times the noise is at rest; friction could then balance
+        # any force.
         moves = np.ptp(x[i][windows], axis=1) > 4.0 * run.sigma[j]
         if not moves.any():
             continue
@@ -92,9 +93,9 @@ def _of_run(
 
 
 def _smooth(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return a polynomial through each row of (windows, samples) values, and its derivative."""
+    """Return a polynomial through each row of values (windows, samples), and its derivative."""
     span = t[:, -1:] - t[:, :1]
-    # The samples are evenly spaced, or nearly so: one basis serves all windows.
+    # The samples are evenly spaced, or nearly so, and all windows share one basis.
     s = np.linspace(-1.0, 1.0, t.shape[1])
     basis = chebyshev.chebvander(s, _DEGREE)
     coefficients = np.linalg.lstsq(basis, values.T, rcond=None)[0]

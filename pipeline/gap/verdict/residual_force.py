@@ -1,7 +1,7 @@
 """The force on each cart that masses, dampings and springs do not explain.
 
-Measured positions do not give a useful acceleration. Modulating functions give the exact mean of
-the force over a short window, together with the mean velocity, position and input.
+The second derivative of measured positions is too noisy to use. Modulating functions instead give
+the exact mean of the force over a short window, together with mean velocity, position and input.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,18 +19,21 @@ from pipeline.plant.nonlinear.simulator.laws import arriving
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ResidualForce:
-    """One cart in one run; all (n,) are weighted means over one window each.
+    """The force on one cart in one run that the linear chain does not explain.
+
+    All values (n,) are weighted means, one for each window.
 
     Attributes
     ----------
-    measured, model : residual force of the linear part for the measured motion, and for the motion
-        of the model with its effects; both agree if the effects are right.
-    u : the logged input, on cart 1; 0 elsewhere.
-    arriving : the input after the model's dead zone and saturation; it is subtracted from the
+    measured : this force for the measured motion.
+    model : this force for the motion of the model with effects. It agrees with `measured` if the
+        effects are right.
+    u : the logged input, on cart 1. Zero for other carts.
+    arriving : the input after the model's dead zone and saturation. It is subtracted from the
         forces.
-    velocity, position : of the measured cart, without its encoder zero.
-    neighbours : (2, n) positions of the carts before and after, 0 for a wall or a held cart.
-    neighbours_velocity : (2, n) their velocities.
+    velocity, position : of the cart, as measured. The encoder zero is subtracted.
+    neighbours : (2, n) positions of the carts before and after. Zero for a wall or a held cart.
+    neighbours_velocity : (2, n) velocities of these neighbours.
     """
 
     experiment: str
@@ -48,11 +51,10 @@ class ResidualForce:
 
 
 def residual_forces(gap: Gap, *, free: Mapping[str, Sequence[int]]) -> tuple[ResidualForce, ...]:
-    """Return the residual force of every cart in every run whose neighbours were measured.
+    """Return the unexplained force on every cart in every run whose neighbours were measured.
 
-    A run sampled too slowly for the longest window is left out.
-
-    `free` tells which carts move in each run.
+    A run sampled too slowly for the longest window is left out. `free` gives for each experiment
+    the carts that move.
     """
     runs: dict[tuple[str, bool, float], dict[int, Trace]] = {}
     for trace in gap.traces:
@@ -80,14 +82,15 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
     i, chain = cart - 1, model.chain
     before, after = chain.k[i], chain.k[i + 1]
     best = None
-    # Windows in s; the middle half carries most of the weight.
+    # Lengths of the windows in s; the middle half has most of the weight.
     for length in (0.05, 0.07, 0.1, 0.15, 0.2, 0.3):
         if (windows := _cut(t, length=length)) is None:
             continue
         local = t[windows]
         s = (local - local[:, :1]) / (local[:, -1:] - local[:, :1])
         w, w1, w2 = window_weights(local)
-        # An input is held over the interval that follows its sample: the weight's exact share.
+        # An input is held after its sample, so its weight is the exact share of the bump in that
+        # interval.
         held = np.diff(bump_integral(s), axis=1) / bump_integral(np.ones(1))
         pushes = [(held * push[windows[:, :-1]]).sum(1) for push in inputs]
         own = chain.m[i] * w2 - chain.c[i] * w1 + (before + after) * w
@@ -111,14 +114,14 @@ def _one(carts: Mapping[int, Trace], cart: int, model: AugmentedChain) -> Residu
             neighbours=position[[0, 2]],
             neighbours_velocity=velocity[[0, 2]],
         )
-        # Noise makes less than a fiftieth of the force's range.
+        # The noise must be less than a fiftieth of the force's range.
         if noise * float(np.sqrt(np.median((own**2).sum(1)))) <= 0.02 * np.ptp(best.measured):
             break
     return best
 
 
 def _arriving(u: Array, model: AugmentedChain) -> Array:
-    """Return the input that the drive passes on, without delays and lags."""
+    """Return the input after dead zone and saturation; delays and lags are ignored."""
     drive = model.tables().drive
     return np.array([arriving(drive, float(one)) for one in u])
 

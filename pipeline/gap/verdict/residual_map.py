@@ -1,4 +1,4 @@
-"""The residual of each cart, bin by bin against position, velocity and input, with its formula."""
+"""The unexplained force on each cart against position, velocity and input, with its formula."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from pipeline.set_up import Bench
 
 
 def map_residual(forces: Sequence[LeftForce], bench: Bench) -> tuple[Residual, ...]:
-    """Return the residual of each cart, in order."""
+    """Return the unexplained force on each cart, in the order of the carts."""
     found, position, drive = [], bench.units.position, bench.units.input
     for cart in sorted({force.cart for force in forces}):
         own = [force for force in forces if force.cart == cart]
@@ -41,7 +41,7 @@ def _binned(
 ) -> ForceAgainst:
     x, y = np.concatenate(values), np.concatenate([one.force for one in forces])
     run = np.repeat(np.arange(len(forces)), [one.force.size for one in forces])
-    # Six windows in a bin, at the least.
+    # At least six windows in a bin.
     count = int(np.clip(x.size // 6, 1, 20))
     edges = np.unique(np.quantile(x, np.linspace(0.0, 1.0, count + 1)))
     bins = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, max(edges.size - 2, 0))

@@ -1,4 +1,4 @@
-"""Where a run departs from a model, what the cart does there, and which run would show more."""
+"""Find where a run departs from a model, what the cart does there, and what to record next."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,8 @@ from pipeline.gap.types import GapWindow, Verdict
 from pipeline.plant.nonlinear.effects import find_effect
 from pipeline.words.phrases import phrases
 
-# The recording that shows more of the residual, by what the cart does there: a key of the words.
+# For each behaviour of the cart: the key of the sentence that says which recording shows more of
+# it.
 _SHOWS = {
     "velocity near zero": "show_rest",
     "fast motion": "show_motion",
@@ -28,7 +29,7 @@ _SHOWS = {
 def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
     """Return the windows with most of the misfit, the worst first.
 
-    `share` is the window's part of that cart's squared misfit in that run.
+    `share` is the window's part of the squared misfit of this cart in this run.
     """
     found: list[tuple[float, GapWindow]] = []
     for run, nuisance in zip(runs, fit.nuisance, strict=True):
@@ -55,7 +56,7 @@ def find_windows(fit: GapFit, runs: Sequence[GapRun]) -> tuple[GapWindow, ...]:
 
 
 def _what(run: GapRun, x: Array, energy: Array) -> str:
-    """Return what the cart does where the misfit grows, judged by its excess over chance."""
+    """Return in words what the cart does where the misfit is larger than chance allows."""
     v = np.gradient(x, run.t)
     u = np.interp(run.t, run.knots, run.command)
     edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * max(1e-12, float(np.ptp(u))))
@@ -95,10 +96,10 @@ def choose_experiment(
     *,
     repeated: bool,
 ) -> str:
-    """Return the next recording: it distinguishes the rivals, settles the name, or shows more.
+    """Return a sentence on the next recording, to decide, confirm, or show more of the gap.
 
-    `left` are the windows in which the chosen model still departs, the worst first. `repeated`:
-    some runs share an input, so the scatter between runs is known.
+    `left` are the windows in which the chosen model still departs, the worst first. `repeated` is
+    true if some runs have the same input, so that their scatter is known.
     """
     if verdict == "ambiguous":
         texts = {find_effect(key).deciding_run for key, _ in chosen.key ^ close[0].key}
