@@ -548,8 +548,7 @@ class HardwareCheck:
     Attributes
     ----------
     input_scale : the factor on the logged input, sign included, that explains the motion best. It
-        is
-        1 if the log is right, and None where it was not estimated.
+        is 1 if the log is right, and None where it was not estimated.
     t, measured, model : (n,).
     effort : (n,) input of the simulated loop. None in the comparison with the measured input.
     set_point : (n,) desired position of this cart. None if the loop controls another cart.

@@ -47,8 +47,7 @@ class Bench:
     ----------
     springs : (n + 1,) whether each spring exists: wall to cart 1, cart 1 to 2, …, cart n to wall.
     sign : the stated sign of the input. With -1 a positive input pushes cart 1 towards negative x.
-        None
-        if the sign must be found from the data.
+        None if the sign must be found from the data.
     """
 
     springs: tuple[bool, ...]

@@ -28,8 +28,7 @@ class Goal:
     name : as `--for` takes it.
     words : the number in words, "the error of zeta_2".
     rows : (k, n_p) derivatives of the wanted numbers by the relative parameters. For overshoot, as
-        a
-        share of the step. One row is a c-optimal design.
+        a share of the step. One row is a c-optimal design.
     mean : how several errors become one number. The "largest" is E-optimal in named parameters, the
         "root mean square" A-optimal. The "volume" of the confidence region, as its mean radius, is
         D-optimal.

@@ -52,8 +52,7 @@ class Knowledge:
     step, noise : (n,) encoder step and other noise of each cart. In position units.
     sample_time : s, of the bench.
     beyond : the ratio of the variances found to those that the encoders cause. Friction, for
-        example,
-        makes it larger.
+        example, makes it larger.
     dwells : the dwells so far. If there are any, the carts are identified from dwells alone.
     misfit : distance of a dwell from the carts beyond its standard error. As a share of its
         magnitude.

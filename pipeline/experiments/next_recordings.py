@@ -44,8 +44,7 @@ class NextPlan:
     words : description of the error.
     now : the present error, relative.
     errors : (n + 1,) the error after the open recordings of the plan. Then the error after each
-        chosen
-        one.
+        chosen one.
     planned : the error after each single open recording of the plan, by id.
     separation : only for "gap". The separation of the best separated pair of explanations, in noise
         standard deviations.

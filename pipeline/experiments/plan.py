@@ -60,8 +60,7 @@ class Recording(TomlTable):
     frequency : Hz, of the wave. A chirp starts there.
     frequency_end : Hz, end of a chirp.
     tones : the sines of a multisine. Each has the harmonic of `frequency`, its share of the
-        amplitude
-        and its phase in rad.
+        amplitude and its phase in rad.
     cycles : number of periods. The run takes cycles/frequency seconds.
     release : the cart that is pulled out and released by hand. None without a release.
     controller : the controller that closes the loop.

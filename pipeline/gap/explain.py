@@ -80,8 +80,7 @@ def explain_gap(
     Parameters
     ----------
     records : any kind except tables. Dwells beyond a few are left out. So are feedback runs, if
-        there
-        are open-loop runs.
+        there are open-loop runs.
     chain : the identified chain, as one start of the fit.
     catalogue : the effects that may be named.
     budget : time limit in s. If it is reached, the result is the best answer so far. By default

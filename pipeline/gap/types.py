@@ -221,8 +221,7 @@ class Proposal:
     recording : a table of plan.toml.
     limits : the plan's limits for which it was chosen, by name.
     separation : root mean square difference between the deciding two, in units of the noise. Only
-        the
-        part counts that no refit of the other model absorbs.
+        the part counts that no refit of the other model absorbs.
     prediction : None if the proposal was read from a file.
     """
 

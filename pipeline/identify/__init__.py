@@ -1,1 +1,1 @@
-"""From records to carts: which records hold what happened, and the carts identified from them."""
+"""Identify the carts from records, after leaving out records that do not hold what happened."""

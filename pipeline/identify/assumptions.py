@@ -1,6 +1,6 @@
-"""The assumptions behind all numbers.
+"""The assumptions behind all numbers: springs, units, scales, sign, held carts.
 
-Springs, units, scales, sign, held carts, with their support.
+Each comes with the support that the data give it.
 """
 
 from collections.abc import Iterator, Sequence
@@ -38,7 +38,7 @@ def _springs(
 ) -> Iterator[Assumption]:
     n, names = system.carts, spring_names(system.carts)
     springs = [any(system.springs)] if n == 1 else system.springs
-    abouts = [" and ".join(names)] if n == 1 else names  # for one cart the sum is known
+    abouts = [" and ".join(names)] if n == 1 else names  # for one cart only the sum is known
     values = physical_values(fit.chain, bench=system.bench) if fit else {}
     vanishing = {check.parameter for check in failed if check.kind == "vanishing"}
     unit = system.bench.units.stiffness
@@ -51,7 +51,7 @@ def _springs(
             reason = "no carts were identified that tell it"
         elif not present:
             support = "supported" if fit.explains_data else "open"
-            explains = "explains the data" if fit.explains_data else "leaves more than the noise"
+            explains = "explains the data" if fit.explains_data else "does not fit to the noise"
             reason = f"the fit without it {explains}"
         elif name in vanishing:
             support = "contradicted"
@@ -104,7 +104,7 @@ def _units(
 
 
 def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assumption]:
-    """Yield the size of a count, if any recording holds counts that were converted."""
+    """Yield the size of a count, if counts were converted in any recording."""
     system = submission.system
     own = {e.id: e.input.per_count for e in submission.experiments if e.input}
     for role, stated, scales in (
@@ -155,7 +155,7 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
 def _free_carts(
     records: Sequence[Record], *, n: int, failed: Sequence[Check]
 ) -> Iterator[Assumption]:
-    """Yield the free carts, once for all recordings with the same ones."""
+    """Yield the free carts, one entry for all recordings with the same free carts."""
     if n == 1:
         return
     wrong = {check.run for check in failed if check.kind == "setup"}

@@ -1,4 +1,4 @@
-"""All estimates of the carts from records, and the joint fit."""
+"""Estimate the carts from single recordings, then fit all recordings together."""
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
@@ -47,7 +47,7 @@ _WORDS = phrases("skipped")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Identified:
-    """The results of the stages from some records, up to the fit."""
+    """The results of the stages up to the fit, from some of the records."""
 
     decays: Sequence[LogDecrement]
     gains: Sequence[StepGain]
@@ -73,9 +73,10 @@ def identify(
     progress: Progress,
     measured: dict[str, Any],
 ) -> Identified:
-    """Take the records, except for those left out, through the stages up to the fit.
+    """Take the records, except those in `without`, through the stages up to the fit.
 
-    `measured` caches the results of single records, for the next call with other records left out.
+    `measured` caches the results of single records for the next call, which leaves out other
+    records.
     """
     log = Log(measured=measured)
     used = [record for record in data.records if record.id not in without]
@@ -91,7 +92,7 @@ def identify(
     gains = _step_gains(runs, bench=bench, log=log)
     progress("sine dwells: steady state")
     sines = _sine_points(used, log=log)
-    # A note that a check of a decay or step gives in full is not repeated.
+    # A note is dropped if a check of the same decay or step says the same in full.
     notes = [
         *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
         *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
@@ -124,7 +125,7 @@ def identify(
 def compare_estimates(found: Identified, *, bench: Bench) -> tuple[ParameterRow, ...]:
     """Return the initial and final estimates side by side.
 
-    Those that the fit leaves open are skipped.
+    Estimates that the fit leaves open are skipped.
     """
     fit, final = found.fit, found.fit.parameters if found.fit else {}
     if fit and not final:
@@ -147,10 +148,10 @@ def _counted(carts: Sequence[int]) -> str:
 
 
 def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
-    """Return the steps and sweeps of all carts together.
+    """Return the steps and sweeps in which all carts are free.
 
-    Runs of single carts are left to the initial estimates, so that initial and final estimates use
-    different data and their comparison is a check.
+    Runs of single carts serve only for the initial estimates. So initial and final estimates use
+    different data, and comparing them is a check.
     """
     runs = [r for r in records if r.kind in ("step", "sweep") and r.u is not None]
     runs = [r for r in runs if len(r.free) == n]
@@ -167,7 +168,7 @@ def _driven(records: Sequence[Record], *, n: int, log: Log) -> list[Record]:
 def _log_decrements(
     runs: Runs, *, bench: Bench, interventions: Sequence[Intervention], log: Log
 ) -> list[LogDecrement]:
-    """For each cart alone: its decays, or the ring-down of its steps if there is no decay."""
+    """Return for each cart by itself its decays, or the ringing after its steps without a decay."""
     decays: list[LogDecrement] = []
     for cart, (before, after) in enumerate(pairwise(bench.springs), start=1):
         if not (before or after):
@@ -220,7 +221,7 @@ def _sticks(decay: LogDecrement) -> bool:
 def _skip_without(
     log: Log, stage: Stage, what: str, *, out: Sequence[Record], cart: int | None = None
 ) -> None:
-    """Note that some kind of record is missing, or that all of its records are left out."""
+    """Note that records of some kind are missing, or that all of them are left out."""
     if out:
         reason = _WORDS.text("all_left_out", what=what, runs=abridge([r.id for r in out]))
         log.skip(stage, reason, cart=cart)
@@ -265,7 +266,7 @@ def _sine_points(records: Sequence[Record], *, log: Log) -> list[SinePoint]:
 def _frequency_response(
     data: Ingested, *, sines: Sequence[SinePoint], runs: Runs, log: Log
 ) -> Sequence[FrequencyResponse]:
-    """From dwells, else from the students' own table, else from steps and sweeps."""
+    """Return the response from dwells, else from the students' table, else from other records."""
     if sines:
         return collect_dwells(sines)
     if data.tables:

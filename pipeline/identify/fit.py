@@ -23,14 +23,14 @@ _WORDS = phrases("skipped")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Fitted:
-    """The fit of all carts, if any.
+    """The fit of all carts, if there is one.
 
     Attributes
     ----------
-    fits : how all records follow it, including those that it does not use.
-    by_dwells : whether it uses dwells, and they follow it.
-    conflict : by id, the records that contradict each other so that nobody can tell which are
-        right, with the reason; then there is no fit.
+    fits : how all records follow the fit. Unused records are included.
+    by_dwells : whether the fit uses dwells and they follow it.
+    conflict : by id, the records that contradict each other, with the reason. If nothing shows
+        which are right, there is no fit.
     """
 
     fit: ChainFit | None = None
@@ -45,8 +45,9 @@ class Runs:
 
     Attributes
     ----------
-    used : for identifying the carts; `left_out` records are only compared with the fit.
-    driven : the steps and sweeps of all carts together, among those used.
+    used : the records that identify the carts.
+    left_out : records that are only compared with the fit.
+    driven : of the used ones, the steps and sweeps with all carts free.
     """
 
     used: Sequence[Record]
@@ -92,7 +93,7 @@ def fit_carts(
             return Fitted(conflict=conflict)
     if contrary and _votes(mine) != _votes(theirs):
         better = _votes(mine) < _votes(theirs)
-    else:  # a fit that dwells follow is replaced only by one that they follow more closely
+    else:  # replace a fit that dwells follow only if they follow the other more closely
         better = not bode.by_dwells or _is_closer(other, bode, dwells)
     if not better:
         return bode
@@ -103,7 +104,7 @@ def fit_carts(
 
 
 def _is_seen(cart: int, records: Sequence[Record], responses: Sequence[FrequencyResponse]) -> bool:
-    """Whether a cart moves in any recording; if the last one does not, it may not exist."""
+    """Whether a cart moves in any recording; if the last cart does not, it may not exist."""
     return cart in {response.cart for response in responses} or any(
         cart in record.carts and np.ptp(record.position(cart)) > 0 for record in records
     )
@@ -129,10 +130,10 @@ def _fit_points(
 
 
 def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
-    """Whether the points are not explained, and most motions are few encoder steps.
+    """Whether the fit does not explain the points, and most motions are only few encoder steps.
 
-    Rounding then hides the rest of a transient: near a sharp resonance a dwell's amplitude is off
-    by several of its errors.
+    Rounding then hides the rest of a transient. Near a sharp resonance, the amplitude of a dwell is
+    off by several standard errors.
     """
     assert fitted.fit is not None
     motions = [(r.position(cart), r.encoder_step(cart)) for r in dwells for cart in r.carts]
@@ -142,7 +143,7 @@ def _is_doubted(fitted: Fitted, dwells: Sequence[Record]) -> bool:
 
 
 def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
-    """Whether a fit explains its own records, and the dwells follow it more closely."""
+    """Whether the first fit explains its own records, and the dwells follow it more closely."""
     assert fitted.fit is not None
     lost = [
         sum(one.fits[r.id].share for r in dwells if r.id in one.fits) for one in (fitted, other)
@@ -151,13 +152,13 @@ def _is_closer(fitted: Fitted, other: Fitted, dwells: Sequence[Record]) -> bool:
 
 
 def _held(fit: ChainFit | None, runs: Runs) -> Fitted | None:
-    """Return a fit with a measure of how all records follow it."""
+    """Return a fit with how all records follow it, used or not."""
     records = [*runs.used, *runs.left_out]
     return Fitted(fit=fit, fits=follow(records, fit.chain)) if fit else None
 
 
 def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
-    """Return the kinds with most records following."""
+    """Return the kinds of experiment of which most records follow the fit."""
     return {
         kind
         for kind, ids in _by_kind(records, fitted).items()
@@ -166,20 +167,20 @@ def _kinds_that_follow(records: Sequence[Record], fitted: Fitted) -> set[str]:
 
 
 def _votes(kinds: Set[str]) -> int:
-    """Return the number of ways of recording that follow.
+    """Return the number of kinds, with steps and sweeps as one kind.
 
-    Steps and sweeps are logged in one way.
+    They count as one because they are logged in the same way.
     """
     return len({"step" if kind == "sweep" else kind for kind in kinds})
 
 
 def _contrary_kinds(records: Sequence[Record], fitted: Fitted) -> set[str]:
-    """Return the kinds with most records following no carts like the fitted ones."""
+    """Return the kinds of which most records follow no carts similar to the fitted ones."""
     assert fitted.fit is not None
     chain, by_id = fitted.fit.chain, {record.id: record for record in records}
 
     def contrary(name: str) -> bool:
-        # Inches in place of centimetres leave 0.37.
+        # With inches in place of centimetres, this share is 0.37.
         return all(fit.share > 0.3 for fit in near(by_id[name], chain))
 
     return {
@@ -201,9 +202,10 @@ def _by_kind(records: Sequence[Record], fitted: Fitted) -> dict[str, list[str]]:
 def _conflict(
     records: Sequence[Record], fitted: Fitted, *, mine: Set[str], theirs: Set[str]
 ) -> dict[str, RecordingFault]:
-    """Return why kinds that follow different chains may not be used.
+    """Return why kinds that follow different chains may not be used, by record.
 
-    There is no conflict if no known mistake relates the two: the carts may be that way.
+    There is a conflict only if a known mistake would turn one into the other. Otherwise the carts
+    may really behave in both ways.
     """
     assert fitted.fit is not None
     chain, ids = fitted.fit.chain, _by_kind(records, fitted)
@@ -224,7 +226,7 @@ def _conflict(
 
 
 def _decay_dampings(initial: Mapping[str, Estimate], *, n: int) -> dict[int, Estimate]:
-    """Return by cart its damping ratio alone, if decays give it."""
+    """Return by cart its own damping ratio, if decays give it."""
     own = {cart: initial.get(own_zeta(cart, n=n)) for cart in range(1, n + 1)}
     return {
         cart: zeta

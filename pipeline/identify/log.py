@@ -1,4 +1,4 @@
-"""Stages that could not run, and warnings."""
+"""Collect the stages that could not run, and warnings."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -12,14 +12,17 @@ T = TypeVar("T")
 
 @dataclass
 class Log:
-    """Skipped stages and warnings, collected along the way."""
+    """Skipped stages and warnings of one analysis."""
 
     skipped: list[Skipped] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    measured: dict[Any, Any] = field(default_factory=dict)  # by stage, run and cart
+    measured: dict[Any, Any] = field(default_factory=dict)  # results by stage, run and cart
 
     def attempt(self, stage: Stage, run: Callable[[], T], *, of: str = "") -> T | None:
-        """Run one stage, perhaps for one recording `of`; unsuitable data are noted as a reason."""
+        """Run one stage; if the data are unsuitable, note the reason and return None.
+
+        `of` is the id of the recording, if the stage uses a single one.
+        """
         try:
             return run()
         except DataError as error:
@@ -27,7 +30,7 @@ class Log:
             return None
 
     def attempt_once(self, stage: Stage, run: Callable[[], T], *, of: str, cart: int) -> T | None:
-        """Run a stage of one record, whose result does not depend on which others are left out."""
+        """Run a stage of one record once, as its result does not depend on the other records."""
         key = stage, of, cart
         if key not in self.measured:
             try:
@@ -55,7 +58,7 @@ class Log:
         )
 
     def warn(self, texts: Iterable[str]) -> None:
-        """Add a warning, unless it exists already."""
+        """Add warnings that do not exist already."""
         self.warnings += [text for text in texts if text and text not in self.warnings]
 
     def add(self, other: "Log") -> None:

@@ -1,4 +1,4 @@
-"""Warnings about the records as such, beside those of the checks."""
+"""Warnings about records, in addition to those of the checks."""
 
 from collections.abc import Sequence
 from math import ceil
@@ -14,15 +14,15 @@ from pipeline.words.numbers import by_note
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("skipped")
-# m/s: the carts of a bench reach 0.4, those of inverted pendulums 3; centimetres read as metres
+# m/s. The carts of a bench reach 0.4, those of inverted pendulums 3. Centimetres read as metres
 # give 15 to 40.
 _FASTEST = 10.0
 
 
 def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
-    """Return the notes of reading, decays in another unit, and a `unit` that fits no record.
+    """Return the notes from reading, decays in another unit, and a `unit` that fits no record.
 
-    The unit of decays does no harm.
+    A wrong unit of decays does no harm.
     """
     units = find_other_units(data.records, decays=True)
     return [
@@ -37,7 +37,7 @@ def reading_remarks(data: Ingested, *, unit: str) -> list[str]:
 
 
 def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Record]) -> list[str]:
-    """Return in which records a hand acts on a cart, and when, except for releases of decays."""
+    """Return in which records and when a hand moves a cart, except for releases of decays."""
     return by_note(
         (
             one.experiment,
@@ -54,7 +54,10 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
 
 
 def _too_fast(records: Sequence[Record], *, unit: str) -> list[str]:
-    """Return that the carts are impossibly fast in two kinds of experiments; one may be a slip."""
+    """Return a warning if the carts are impossibly fast in two kinds of experiments.
+
+    A single kind may be an accident.
+    """
     metres = conversion(unit, "m")
     fastest: dict[str, tuple[float, str]] = {}
     for record in records if metres else ():
@@ -72,12 +75,13 @@ def _speed(record: Record) -> float:
     moved, took = record.y[:, span:] - record.y[:, :-span], record.t[span:] - record.t[:-span]
     if not took.size:
         return 0.0
-    # An encoder's jump is not a speed: over 20 ms, without the fastest hundredth.
+    # Taken over 20 ms and without the fastest hundredth, since a jump of the encoder is not a
+    # speed.
     return float(np.quantile(np.abs(moved) / took, 0.99, axis=1).max())
 
 
 def is_reversed(records: Sequence[Record]) -> bool:
-    """Whether a positive input, in the bench's counting, drives cart 1 towards negative x."""
+    """Whether a positive input, with the bench's sign, pushes cart 1 towards negative x."""
     signs = [r.input_scale for r in records if r.u is not None and r.kind != "closed_loop"]
     return sum(1 if sign > 0 else -1 for sign in signs) < 0
 

@@ -1,4 +1,4 @@
-"""The records used to identify the carts: those that hold what happened."""
+"""Choose the records that identify the carts: those that hold what happened."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -19,7 +19,7 @@ from pipeline.soundness.repeats import find_outlier_repeats
 from pipeline.stages.bode_fit import fit_bode
 from pipeline.words.progress import Progress
 
-_ROUNDS = 4  # rounds of leaving out records that the remaining ones show to be wrong
+_ROUNDS = 4  # rounds. In each, the used records may show that others are wrong
 
 
 def identify_from_sound(
@@ -29,13 +29,14 @@ def identify_from_sound(
     bench: Bench,
     progress: Progress,
 ) -> tuple[Identified, list[LeftOut]]:
-    """Identify the carts without records that the carts, or repeats, show to be wrong.
+    """Identify the carts; leave out records that the carts or repeats show to be wrong.
 
-    Records with a constant reading are not trusted until the carts found from the others confirm
+    Records with a constant reading are used only if the carts found from the other records confirm
     it.
     """
     driven = [r for r in data.records if r.kind in ("step", "sweep")]
-    # Faults shown by input or encoder alone are kept, as later numbers no longer include them.
+    # Faults that input or encoder show by themselves stay, because later rounds do not see these
+    # records.
     shown = {
         **find_other_units(data.records),
         **find_stuck(data.records),
@@ -56,15 +57,15 @@ def identify_from_sound(
     )
     found = again(without=without)
     for _ in range(_ROUNDS):
-        # If nothing is left to identify the carts from, the verdict before stays.
+        # If too little is left to identify the carts, the earlier result stays.
         chain, fits = _witness(found, data, bench=bench) or (chain, fits)
         faults = find_faults(data.records, chain=chain, fits=fits)
         shown |= find_impossible_gains(found.gains)
         shown |= {**found.repeats.odd, **found.fitted.conflict}
-        # Most repeats may be wrong: the odd one is found among the others.
+        # Search for odd repeats among good records only, because most repeats may be wrong.
         sound = [record for record in driven if record.id not in faults]
         odd = find_outlier_repeats(sound, unit=bench.units.position)
-        # A statement how a record is wrong comes before one that it is odd.
+        # A fault that says how a record is wrong has priority over one that only calls it odd.
         doubted = {name: one for name, one in faults.items() if not one.is_wrong}
         left_out = {**odd, **doubted, **shown, **{n: f for n, f in faults.items() if f.is_wrong}}
         if left_out.keys() == without:
@@ -87,7 +88,10 @@ def identify_from_sound(
 def _witness(
     found: Identified, data: Ingested, *, bench: Bench
 ) -> tuple[Chain, Mapping[str, Followed]] | None:
-    """Return the chain that the records follow, and how; or would, with two columns swapped."""
+    """Return the chain that the records follow, and how they follow it.
+
+    If swapping two columns gives a chain that explains the data, that one is returned.
+    """
     if found.fit and found.fit.converged and most_follow(found.fitted.fits):
         return found.fit.chain, found.fitted.fits
     for i, j in combinations(sorted(response.cart for response in found.responses), 2):

@@ -1,8 +1,8 @@
-"""The springs of a new submission, as far as its steps show them; unsure ones are marked.
+"""Find the springs of a new submission from its steps; mark the unsure ones.
 
-Beyond cart 1 the motor's static force goes through every spring equally. So the static gains give
-ratios of stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall all carts
-move equally, and then a spring wall-1 holds them, if anything does.
+Beyond cart 1, all springs carry the same static force. So the static gains give ratios of
+stiffnesses: k_(n+1) / k_n = K_(n-1) / K_n - 1. Without a spring at the far wall all carts move
+equally, and only the spring wall-1 can hold them.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ from pipeline.submission.load import NAME, spring_names
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
-    """The results of `fill`: by file, and for the set-up the open questions."""
+    """The results of `fill`: the files, and the open questions on the set-up."""
 
     files: tuple[Found, ...]
     doubts: tuple[str, ...]
@@ -40,7 +40,7 @@ class Filled:
 
 @dataclass(frozen=True, kw_only=True)
 class Springs:
-    """The springs present, the reason, and the unsure ones (numbers from 1)."""
+    """The springs present, the reason, and the unsure springs (numbers from 1)."""
 
     present: tuple[bool, ...]
     why: str
@@ -48,7 +48,7 @@ class Springs:
 
 
 def fill(folder: Path) -> Filled:
-    """Write the tables of the files in `data/`, and into a new file the springs.
+    """Write the tables of the files in `data/`, and into a new `submission.toml` the springs too.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def fill(folder: Path) -> Filled:
 
 
 def find_springs(submission: Submission) -> Springs:
-    """Return the springs of a submission by its steps, if these can be read."""
+    """Return the springs of a submission from its steps, if these can be read."""
     steps = tuple(one for one in submission.experiments if one.kind == "step")
     try:
         records = read_data(submission.model_copy(update={"experiments": steps})).records
@@ -91,7 +91,7 @@ def _state_springs(submission: Submission) -> None:
 
 
 def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
-    """Return the springs of n carts by their steps; those between carts are assumed.
+    """Return the springs of n carts from their steps; springs between carts are assumed.
 
     Only steps with all carts free and measured are used.
     """
@@ -111,7 +111,7 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
     low, high = np.median(ratios, axis=0)
     if low > NEGLIGIBLE:
         return Springs(present=every, why="static gains cannot tell", open=(1,))
-    # A bench's weakest spring is at least a tenth of the one before it.
+    # On a bench, a spring is at least a tenth as stiff as the one before it.
     if high < 0.1:
         why = "static gains are equal, so none at the far wall"
         return Springs(present=(*every[:-1], False), why=why, open=())
@@ -119,16 +119,16 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
 
 
 def _stays_away(step: Record) -> bool:
-    """Whether the carts end a step far from where they began it, at the same input."""
+    """Whether the carts end a step far from their start, although the input is the same."""
     u, moved = step.u, np.ptp(step.y, axis=1)
     if u is None or not np.all(moved > 0) or abs(u[-1] - u[0]) > 0.02 * np.ptp(u):
         return False
-    # Friction holds a cart off by far less than half of its motion.
+    # Friction keeps a cart away from its rest by far less than half of its motion.
     return bool(np.all(np.abs(step.y[:, -1] - step.y[:, 0]) > 0.5 * moved))
 
 
 def _gains(step: Record) -> list[StepGain]:
-    """Return the static gains of all carts, [] if one does not settle."""
+    """Return the static gains of all carts, [] if a cart does not settle."""
     try:
         return [fit_step_gain(step, cart=cart) for cart in sorted(step.carts)]
     except DataError:
@@ -136,13 +136,13 @@ def _gains(step: Record) -> list[StepGain]:
 
 
 def _ratio(before: StepGain, last: StepGain) -> tuple[float, float]:
-    """Return the least and largest stiffness of the last spring over that of the one before."""
+    """Return the least and largest ratio of the last spring to the one before, as steps allow."""
     (near, far), (low, high) = _bounds(before), _bounds(last)
     return near / high - 1, far / low - 1 if low > 0 else np.inf
 
 
 def _bounds(gain: StepGain) -> tuple[float, float]:
-    """Return the smallest and the largest static gain, in size, that a step allows."""
+    """Return the smallest and the largest absolute static gain that a step allows."""
     slack = SIGMA_LIMIT * gain.gain_std
     ends = gain.interval or (gain.gain - slack, gain.gain + slack)
     low, high = sorted(abs(end) for end in ends)

@@ -1,1 +1,1 @@
-"""From every known file form to `Record`, with units, signs and clocks settled."""
+"""Read every known file format into a `Record`, with units, signs and clocks settled."""

@@ -1,4 +1,4 @@
-"""Tables of amplitude ratios the students reduced themselves."""
+"""Tables of amplitude ratios that the students computed themselves."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,7 +10,7 @@ from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import FileTable, refuse_extreme
 from pipeline.results import FrequencyResponse
 
-_RATIO_SPREAD = 0.01  # relative standard error of a ratio read off two plots, without repeats
+_RATIO_SPREAD = 0.01  # relative standard error of a ratio read off two plots, used without repeats
 Points = dict[int, list[tuple[float, float]]]
 
 
@@ -54,7 +54,7 @@ def _ratios(table: FileTable, column: Column) -> Array:
 
 
 def _measured(values: Array, table: FileTable, column: Column) -> Array:
-    """Return the values, all of them positive and within those of a bench."""
+    """Return the values, after checking that they are positive and possible on a bench."""
     for extreme in (values.min(), values.max()):
         refuse_extreme(extreme, what=f"{table.source}: {column.name!r}")
     return values
@@ -74,10 +74,10 @@ def _positive(table: FileTable, column: Column) -> Array:
 def frequency_responses(
     points: Points, *, experiments: Sequence[str] = ()
 ) -> tuple[tuple[FrequencyResponse, ...], str]:
-    """Return one response for each cart, repeats averaged, and the source of its standard errors.
+    """Return one response per cart with repeats averaged, and the source of its standard errors.
 
     Rows at one frequency are repeats: their pooled relative spread is the standard error of all
-    points. Without enough of them it is 1 %.
+    points. If there are too few repeats, it is 1 %.
     """
     squares, freedom = 0.0, 0
     averaged: dict[int, tuple[Array, Array, Array]] = {}
@@ -89,7 +89,7 @@ def frequency_responses(
         squares += float(((logs - means[which]) ** 2).sum())
         freedom += logs.size - omega.size
         averaged[cart] = (omega, np.exp(means), repeats)
-    # Degrees of freedom from which repeats show the true spread.
+    # Fewer than three degrees of freedom do not show the true spread.
     spread = np.sqrt(squares / freedom) if freedom >= 3 and squares > 0 else None
     relative = _RATIO_SPREAD if spread is None else float(spread)
     source = (

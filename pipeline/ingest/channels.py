@@ -1,4 +1,4 @@
-"""Properties of single channels: an encoder's step, a mirror, a stuck encoder, a clipped input."""
+"""Checks of single channels: encoder step, copied column, stuck encoder, clipped input."""
 
 import numpy as np
 
@@ -8,10 +8,10 @@ _MOST_LEVELS = 20_000  # an encoder on a lab cart has a few thousand counts over
 
 
 def encoder_step(x: Array) -> float:
-    """Return the step of which all values are multiples, 0 without such a step.
+    """Return the step of which all values are multiples, 0 if there is no such step.
 
-    The smallest distances between levels are one step; the step is refined by a line through all
-    levels, which must lie on it.
+    The smallest distances between levels are one step. A straight line through all levels then
+    gives the step more precisely; the levels must lie on that line.
     """
     levels = np.unique(x)
     span = levels[-1] - levels[0]
@@ -29,46 +29,46 @@ def encoder_step(x: Array) -> float:
         return 0.0
     step = float(counts @ at / (counts @ counts))
     off_grid = distances / step - np.round(distances / step)
-    # Of a step, rms: farther off, the values are not multiples of one step.
+    # With a larger rms distance (in steps), the values are not multiples of one step.
     return step if np.sqrt(np.mean(off_grid**2)) < 0.15 else 0.0
 
 
 def mirrors(reference: Array, x1: Array) -> bool:
-    """Return whether a commanded position only repeats encoder 1, as an ECP logs it in open loop.
+    """Return whether a commanded position only repeats encoder 1, as in ECP's open-loop logs.
 
-    Both in counts. The copy is read a little later than the sample before and a little earlier than
-    the sample itself, so it lies between the two; a true reference leads or lags.
+    Both are in counts. The copy is read slightly before the sample itself. So it lies between that
+    sample and the one before, whereas a real reference leads or lags.
     """
     moving = np.flatnonzero(np.diff(x1)) + 1
     if moving.size < 3 or np.ptp(reference) == 0.0:
         return False
     before, now, copy = x1[moving - 1], x1[moving], reference[moving]
     between = (copy >= np.minimum(before, now) - 1.0) & (copy <= np.maximum(before, now) + 1.0)
-    # Of the samples in motion.
+    # Most samples in motion must agree.
     return bool(np.mean(between) > 0.8)
 
 
 def stuck_spans(x: Array) -> list[tuple[int, int]]:
-    """Return (first, last) sample of every stretch in which a moving encoder stood still.
+    """Return (first, last) sample of every stretch in which a moving cart's encoder was stuck.
 
-    The reading freezes at speed and, if it comes back, comes back with a jump; a cart that stops
-    slows down first. A coarse encoder does not show speed: there only the jump counts, if it is far
-    larger than any other move.
+    A stuck reading stops abruptly while the cart moves and continues, if at all, with a jump. A
+    cart that really stops slows down first. A coarse encoder does not show the speed. For it only
+    the jump counts, which must be far larger than any other move.
     """
     moves = np.abs(np.diff(x))
-    # At rest for this long at a turning point a cart moves less than one step.
+    # A cart at a turning point may rest for fewer samples than this.
     still = [run for run in _runs(moves == 0.0, least=10) if run[0] > 0]
     moving = moves[moves > 0]
     if not still or moving.size < 3:
         return []
-    # Encoder steps a sample: no cart stops from that speed between two samples.
+    # In encoder steps per sample: no cart stops from that speed between two samples.
     abrupt = 5.0 * (encoder_step(x) or float(np.median(moving)))
     after = [last for _, last in still if last < moves.size]
-    # Times the fastest other move between two samples: no cart starts so from rest.
+    # Relative to the fastest other move between two samples: no cart starts from rest so fast.
     jump = max(abrupt, 1.5 * float(np.delete(moves, after).max(initial=0.0)))
 
     def is_stuck(first: int, last: int) -> bool:
-        on = moves[last : last + 2]  # it may move on between two samples
+        on = moves[last : last + 2]  # the jump may take two samples
         back = bool(on.max(initial=np.inf if last == moves.size else 0.0) >= abrupt)
         return (moves[first - 1] >= abrupt and back) or bool(on[:1].max(initial=0.0) >= jump)
 
@@ -76,29 +76,30 @@ def stuck_spans(x: Array) -> list[tuple[int, int]]:
 
 
 def _runs(still: np.ndarray, *, least: int) -> list[list[int]]:
-    """Return [first, last] of each run of `least` equal samples or more.
+    """Return [first, last] of each stretch of at least `least` equal samples.
 
-    still[i]: x[i] = x[i + 1].
+    still[i] means x[i] = x[i + 1].
     """
     runs = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])))).reshape(-1, 2)
     return runs[runs[:, 1] - runs[:, 0] + 1 >= least].tolist()
 
 
 def saturation(u: Array) -> float | None:
-    """Return the limit at which a varied input was clipped, or None.
+    """Return the level at which the input was clipped, or None.
 
-    A clipped input enters its extreme with a jump, holds it, leaves with a jump, and takes it far
-    more often than the next value. The crest of a sine, even if rounded to a few digits, does not,
-    nor does a controller that creeps up to its last value.
+    A clipped input reaches its extreme with a jump, stays there and leaves it with a jump. Far more
+    samples have that value than the next one. This does not hold for the crest of a sine, even if
+    it is rounded to a few digits. Nor does it hold for a controller that slowly approaches its last
+    value. An input with few levels, such as a step, is never called clipped.
     """
     levels, counts = np.unique(u, return_counts=True)
-    # A stepped input with few levels is at its extremes by design.
+    # An input with few levels, such as a step, has its extremes by design.
     if levels.size <= 20:
         return None
     for top, following in ((-1, -2), (0, 1)):
         limit, gap = levels[top], abs(levels[top] - levels[following])
-        # This many times as often as the next level; the rounded crest of a sine takes it 1.4
-        # times.
+        # The limit must be five times as frequent as the next level. For a rounded sine's crest it
+        # is 1.4 times.
         if limit == 0.0 or counts[top] < 5 * counts[following]:
             continue
         at_limit = u == limit
@@ -106,20 +107,21 @@ def saturation(u: Array) -> float | None:
             entry = abs(limit - u[first - 1]) if first > 0 else np.inf
             leave = abs(limit - u[last + 1]) if last + 1 < u.size else np.inf
             m = last - first + 1
-            # m samples of a crest, a parabola, are within one level if it falls by this many to the
-            # next; rounding adds one.
+            # Limit of the jump at both ends, in levels. The m samples of a sine's crest (a
+            # parabola) can be one level only if the next sample is within this many levels;
+            # rounding adds one.
             if min(entry, leave) > max(3, 4 * m / (m - 1) ** 2 + 1) * gap:
                 return abs(float(limit))
     return None
 
 
 def never_changes(name: str) -> str:
-    """Return a sentence if a position stands still while another or the input changes."""
+    """Return the sentence for a position that never changes while another or the input does."""
     return f"{name!r} never changes: a held cart, or an encoder that is stuck"
 
 
 def channel_problems(t: Array, u: Array | None, positions: dict[str, Array]) -> list[str]:
-    """Return the faults of the input and the positions (heading to values), in words."""
+    """Return the faults of the input and of the positions (heading to values), in words."""
     problems = []
     moving = any(np.ptp(x) > 0 for x in positions.values())
     for name, x in positions.items():

@@ -1,7 +1,7 @@
-"""Sample times: checked, and straightened if the file had rounded them.
+"""Check sample times, and straighten them if the file has rounded them.
 
-Near 1 kHz the stamps of a millisecond clock hardly show its period: a short record looks perfectly
-even. The records of a session share one clock, so together they do.
+Near 1 kHz, the stamps of a millisecond clock hardly show its true period: a short record looks
+perfectly even. The records of a session share one clock, so together they do show it.
 """
 
 from collections.abc import Sequence
@@ -15,15 +15,15 @@ from pipeline.errors import SubmissionError
 from pipeline.ingest.columns import Column, conversion
 from pipeline.ingest.formats.table import FileTable
 
-SLOW = 0.5  # s between samples; no bench records more slowly
-FEWEST_SAMPLES = 8  # the least for any estimate
-_GAP = 4.0  # usual intervals without a sample: time is missing
-_ROUNDING_BAND = 0.65  # of the rounding step: half of it, plus the error of a short piece's fit
-# Rounding steps around a line: one if stamps are only rounded, more if some of the clock's ticks
-# are late.
+SLOW = 0.5  # s between samples. No bench records more slowly
+FEWEST_SAMPLES = 8  # fewest samples for any estimate
+_GAP = 4.0  # usual intervals. After so long without a sample, time is missing
+_ROUNDING_BAND = 0.65  # of the rounding step. Half of it, plus the error of a short piece's fit
+# Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
+# ticks of the clock are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
-_HAIR = 1e-6  # of a rounding step: the error of doubles
-_NO_ROOM = 10 * _HAIR  # a strip this sure of its slope is held by stamps that flicker, not by time
+_HAIR = 1e-6  # of a rounding step. The error of doubles
+_NO_ROOM = 10 * _HAIR  # a smaller range of slopes comes from stamps that flicker, not from time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,11 +32,11 @@ class Clock:
 
     Attributes
     ----------
-    t : (n,) s; straightened unless `pieces` is 0.
-    rounding : s; the decimal step of which all stamps are multiples, 0 without one.
-    pieces : number of straight lines that replaced the rounded stamps; 0: the stamps are unchanged.
-    period : s; the interval of those lines if they share one, which is the session's; or None.
-    stopped : sample (from 0) where time does not advance, or None.
+    t : (n,) s. Straightened unless `pieces` is 0.
+    rounding : s, the decimal step of which all stamps are multiples. Zero without such a step.
+    pieces : number of straight lines that replaced the rounded stamps. With 0 they are unchanged.
+    period : s, the interval of these lines if they share the session's. Otherwise None.
+    stopped : sample (from 0) at which time does not advance, or None.
     gaps : samples (from 0) before which time is missing.
     """
 
@@ -59,7 +59,7 @@ class Clock:
 
     @property
     def jitter(self) -> float:
-        """Root-mean-square deviation of the intervals (gaps aside) from their median, s."""
+        """Root-mean-square deviation of the intervals from their median, without gaps, s."""
         steps = np.diff(self.t)
         usual = np.median(steps)
         return float(np.sqrt(np.mean((steps[steps < _GAP * usual] - usual) ** 2)))
@@ -70,7 +70,8 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 
     Raises
     ------
-    SubmissionError : too few samples; no time column and no rate (Hz), or one in no unit of time.
+    SubmissionError : there are too few samples, or neither a time column nor a rate (Hz), or the
+        time column has no unit of time.
     """
     n = table.values.shape[1]
     if n < FEWEST_SAMPLES:
@@ -95,11 +96,11 @@ def time_stamps(table: FileTable, column: Column | None, *, sample_rate: float |
 def clock_notes(
     table: FileTable, column: Column, clock: Clock, *, sample_rate: float | None
 ) -> list[str]:
-    """Return notes on the clock behind a time column.
+    """Return notes on the clock that a time column shows.
 
     Raises
     ------
-    SubmissionError : time stands still or goes back; names the line.
+    SubmissionError : time stands still or goes back; the message names the line.
     """
     if clock.stopped is not None:
         i = clock.stopped
@@ -126,7 +127,7 @@ def clock_notes(
         )
     if len(clock.gaps) > 3:
         notes.append(f"and {len(clock.gaps) - 3} more gaps in time")
-    # Relative difference of a stated rate that the time column contradicts.
+    # A stated rate may differ by 1 % from the time column.
     if sample_rate is not None and abs(sample_rate * clock.mean_interval - 1) > 0.01:
         notes.append(
             f"sample_rate = {sample_rate:g} Hz is not used: the time column says "
@@ -143,10 +144,10 @@ def read_clock(stamps: Array) -> Clock:
 def read_clocks(session: Sequence[Array]) -> list[Clock]:
     """Check the time stamps of every record of a session and undo their rounding.
 
-    Stamps rounded to a step that matters against the sample interval are replaced by straight lines
-    that stay within the rounding: one if the clock is even; more if it drifts or missed a beat. All
-    lines have one period if one explains them. A clock that no such lines explain is truly uneven,
-    and its stamps are kept.
+    Stamps are straightened if their rounding step matters compared with the sample interval.
+    Straight lines that stay within the rounding replace them: one line if the clock is even, more
+    if it drifts or missed a tick. All lines share one period if that explains them. If no such
+    lines explain a clock, it is really uneven, and its stamps are kept.
     """
     rounded = [_rounded(stamps) for stamps in session]
     clocks: list[Clock] = []
@@ -175,13 +176,14 @@ def _checked(t: Array, rounding: float, *, pieces: int, period: float | None) ->
 
 def decimal_step(values: Array) -> float:
     """Return the largest power of ten (1 s at most) of which all values are multiples, or 0."""
-    # A file that prints time beyond the nanosecond has not rounded it.
+    # A time printed beyond the nanosecond has not been rounded.
     for digits in range(10):
         step = 10.0**-digits
         multiples = values / step
-        # A double near 1e5 s in steps of 1e-9 s is itself accurate only to a hundredth of the step.
+        # A double near 1e5 s, in steps of 1e-9 s, is itself accurate only to a hundredth of the
+        # step.
         rounding = 1e-6 + 4 * np.finfo(np.float64).eps * np.abs(multiples).max()
-        # Of a step; a value farther off is no multiple.
+        # In steps; a value further off is not a multiple.
         if np.abs(multiples - np.round(multiples)).max() < min(rounding, 0.02):
             return step
     return 0.0
@@ -194,8 +196,8 @@ def decimal_step(values: Array) -> float:
 class _Rounded:
     """The stamps of a record, and the stretches (start, end) that a straight line explains.
 
-    `even`: the stamps are on a line already, so nothing is straightened unless other records
-    determine the period better.
+    `even` means that the stamps already are on a line. They are then straightened only if other
+    records give a better period.
     """
 
     stamps: Array
@@ -204,7 +206,7 @@ class _Rounded:
     even: bool
 
     def straight(self, period: float | None) -> tuple[Array, int]:
-        """Return the times and the number of lines, with slope `period` or one for each."""
+        """Return the times and the number of lines; without `period` each has its own slope."""
         if self.even and period is None:
             return self.stamps, 0
         t = self.stamps.copy()
@@ -213,9 +215,9 @@ class _Rounded:
         return t, len(self.stretches)
 
     def slopes(self, band: float) -> tuple[float, float]:
-        """Return the least and the greatest period all stretches allow; least > greatest: none.
+        """Return the least and greatest period that all stretches allow; least > greatest if none.
 
-        The usual stamps must be within `band` rounding steps of one line.
+        The usual stamps must be within a strip of `band` rounding steps around one line.
         """
         least, greatest = 0.0, np.inf
         for start, end in self.stretches:
@@ -233,7 +235,7 @@ def _rounded(stamps: Array) -> _Rounded:
     record = _Rounded(stamps=stamps, rounding=rounding, stretches=(), even=False)
     mean = (stamps[-1] - stamps[0]) / (stamps.size - 1)
     steps = np.diff(stamps)
-    # Of the interval: finer rounding of the stamps does no harm.
+    # A rounding step of up to 0.2 % of the interval does no harm.
     if (steps < 0).any() or mean <= 0 or rounding <= 2e-3 * mean:
         return record
     if np.ptp(steps) <= 1e-6 * mean:
@@ -242,36 +244,37 @@ def _rounded(stamps: Array) -> _Rounded:
 
 
 def _stretches(stamps: Array, rounding: float) -> tuple[tuple[int, int], ...]:
-    """Return the stretches that straight lines explain; none if they are not most of the record."""
+    """Return the stretches that straight lines explain; () if they cover too little."""
     found = []
     waiting = [(0, stamps.size)]
     while waiting:
         start, end = waiting.pop()
         if _usual(stamps[start:end], rounding).any():
             found.append((start, end))
-        # Samples; a fit of fewer leaves the band by chance.
+        # Pieces of fewer than 32 samples would fit a line by chance.
         elif end - start >= 2 * 32:
             middle = (start + end) // 2
             waiting += [(start, middle), (middle, end)]
     explained = sum(end - start for start, end in found)
-    # Share of samples on straight pieces below which the clock itself is uneven.
+    # If straight pieces cover less than 80 %, the clock itself is uneven.
     return tuple(sorted(found)) if explained >= 0.8 * stamps.size else ()
 
 
 def _usual(stamps: Array, rounding: float) -> NDArray[np.bool_]:
     """Return which stamps (n,) are within the rounding of one line.
 
-    All but a few late ones, or none.
+    These are all stamps except for a few late ones; if more are off, none.
     """
     off = np.abs(_line(stamps) - stamps) / rounding
     near = off <= _ROUNDING_BAND
-    # A rare stamp may be a step off: a late tick, a beat.
+    # A rare stamp may be one step off, because a tick was late or missing.
     if off.max() <= 1.5 and near.mean() >= 0.99:
         return near
-    # A least-squares line tilts where few stamps jump; a strip of the rounding's width does not.
+    # If a few stamps jump, a least-squares line tilts, but a strip of the rounding's width does
+    # not.
     every = np.ones(stamps.size, dtype=np.bool_)
     low, high = _slopes(stamps, every, width=_BANDS[-1] * rounding)
-    # Of the rounding step off the line: more is a stamp that did not advance.
+    # A stamp further from the line than this (in steps) did not advance.
     return every & (low <= high and off.max() < 0.9)
 
 
@@ -285,11 +288,12 @@ def _line(stamps: Array, *, slope: float | None = None) -> Array:
 
 
 def _periods(records: Sequence[_Rounded]) -> list[float | None]:
-    """Return the period of each record's clock: one for all records that allow it.
+    """Return the period of each record's clock; records that allow the same period share it.
 
-    Each record confines its period to an interval; the shorter the record, the wider. Records are
-    taken in order of certainty, and each joins the first whose period it allows, in the narrowest
-    band possible. None: the stamps are kept, or no single period explains the record.
+    Each record confines the period to an interval, which is wider for a shorter record. The records
+    are taken in order of certainty. Each joins the first group whose period it allows, in the
+    narrowest possible band. None means that the stamps are kept or no single period explains the
+    record.
     """
     groups: list[tuple[float, float, list[int]]] = []
     told = {
@@ -315,17 +319,18 @@ def _periods(records: Sequence[_Rounded]) -> list[float | None]:
 
 
 def _slopes(stamps: Array, usual: NDArray[np.bool_], *, width: float) -> tuple[float, float]:
-    """Return the least and greatest slope of a strip of this width over the usual stamps."""
+    """Return the least and greatest slope of a strip of this width that holds the usual stamps."""
     index = np.flatnonzero(usual).astype(np.float64)
     low, high = (_extreme_slope(index, stamps[usual], width=width, side=side) for side in (-1, 1))
     return low, high
 
 
 def _extreme_slope(index: Array, stamps: Array, *, width: float, side: int) -> float:
-    """Return the smallest (side -1) or largest (1) slope of a strip of this width over all stamps.
+    """Return the least (side -1) or greatest (1) slope of a strip of this width.
 
-    The strip's width is a convex function of its slope, piecewise straight: Newton's method from
-    outside reaches the bound exactly. Past it, on the far side, where there is no such strip.
+    The strip must hold all stamps. The width that they need is a convex, piecewise linear function
+    of the slope. So Newton's method from outside reaches the bound exactly. Without any such strip,
+    the result is infinite on the other side.
     """
     slope = (stamps[-1] - stamps[0] + side * 2 * width) / (index[-1] - index[0])
     hair = _HAIR * width + 8 * np.finfo(np.float64).eps * np.abs(stamps).max()

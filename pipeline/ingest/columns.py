@@ -1,4 +1,4 @@
-"""The meaning of columns: time, input, reference, the position of each cart; and units."""
+"""The meaning of columns: time, input, reference, positions of carts; and their units."""
 
 import re
 from collections.abc import Collection, Mapping
@@ -17,15 +17,15 @@ _POSITION = re.compile(
     r"x ?(\d)|enc(?:oder)? ?(\d)(?: pos(?:ition)?)?|(?:cart|pos|position) ?(\d) ?(?:pos(?:ition)?)?"
 )
 _ONE_POSITION = re.compile(r"x|y|pos|position|displacement")
-_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known, but unused
-_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # forms whose numbers are in the submission's units
+_NO_ROLE = re.compile(r"|sample|samples|index|n|no|nr")  # known headings without a role
+_IN_UNITS = ("csv", "workbook", "lvm", "tdms")  # formats that hold the submission's units
 _COUNTED = re.compile(r"\benc|counts?\b|commanded pos", re.IGNORECASE)
-# "time [ms]", "x1 (cm)", "x1_cm"; not for every unit, since "u_in" is no inch.
+# Such as "time [ms]", "x1 (cm)", "x1_cm". Not for every unit: "u_in" does not mean inches.
 _UNIT = re.compile(
     r"[\[(]\s*([^\])]+?)\s*[\])]\s*$|(?<=[a-z0-9])_(s|ms|us|m|cm|mm|V|mV|N|counts?|Hz|dB)$"
 )
 
-# Factors to one unit of the same quantity.
+# For each unit, the factor to a common unit of the same quantity.
 _FACTORS = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "inch": 0.0254},
@@ -39,13 +39,13 @@ _FACTORS = {
 }
 _OF_POSITIONS = ("length", "angle")
 _OF_INPUTS = ("voltage", "current", "force", "torque")
-_PLAIN = ("count", "counts", "pulse", "pulses")  # of an encoder, or of a controller's output
-_SHARES = ("duty", "%")  # of the largest input
+_PLAIN = ("count", "counts", "pulse", "pulses")  # counts of an encoder, or of a controller's output
+_SHARES = ("duty", "%")  # shares of the largest input
 
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column with its meaning: `index` in the table, `unit` as the heading states it."""
+    """One column with its meaning: `index` in the table, `unit` as stated in the heading."""
 
     role: str
     index: int
@@ -54,22 +54,22 @@ class Column:
 
     @property
     def cart(self) -> int:
-        """The cart whose position this is."""
+        """The cart whose position this column holds."""
         return int(self.role[1:])
 
     @property
     def is_counted(self) -> bool:
-        """The heading says that this column holds encoder counts."""
+        """Whether the heading says that this column holds encoder counts."""
         return bool(_COUNTED.search(self.name)) or self.unit in ("count", "counts")
 
     @property
     def is_duty(self) -> bool:
-        """The heading says that this column holds duty counts of the motor's amplifier."""
+        """Whether the heading says that this column holds duty counts of the motor's amplifier."""
         return "duty" in self.name.casefold()
 
 
 def holds_counts(table: FileTable, column: Column) -> bool:
-    """Return whether it holds counts: whole numbers, if form or heading names an encoder."""
+    """Return whether a column holds counts: whole numbers, and format or heading say encoder."""
     return table.whole[column.index] and (table.form not in _IN_UNITS or column.is_counted)
 
 
@@ -82,23 +82,23 @@ def conversion(found: str | None, wanted: str) -> float | None:
 
 
 def is_count(unit: str) -> bool:
-    """Return whether a position unit is the encoder's own."""
+    """Return whether a position unit is the encoder count."""
     return unit.rstrip("s") == "count"
 
 
 def position_units() -> tuple[str, ...]:
-    """Return the units that positions are known in."""
+    """Return the known units of positions."""
     return (*_PLAIN, *(unit for quantity in _OF_POSITIONS for unit in _FACTORS[quantity]))
 
 
 def input_units() -> tuple[str, ...]:
-    """Return the units that inputs are known in."""
+    """Return the known units of inputs."""
     known = (unit for quantity in _OF_INPUTS for unit in _FACTORS[quantity])
     return (*_PLAIN, *_SHARES, *known)
 
 
 def is_known(unit: str, known: Collection[str]) -> bool:
-    """Return whether a unit is known, whichever way its µ is typed."""
+    """Return whether a unit is known, with either Unicode character for µ."""
     return _plain_micro(unit) in known
 
 
@@ -111,12 +111,12 @@ def assign_columns(
 ) -> tuple[dict[str, Column], tuple[str, ...]]:
     """Return the column of each role, and the headings without a role.
 
-    `explicit` (role to heading or number) wins over headings. A single position column without a
-    number belongs to the one cart in `free`.
+    `explicit` (role to heading or number) has priority over headings. A single position column
+    without a number belongs to the only cart in `free`.
 
     Raises
     ------
-    SubmissionError : a column that is not there, or two columns for one role.
+    SubmissionError : a stated column does not exist, or two columns have the same role.
     """
     columns: dict[str, Column] = {}
     for role, wanted in (explicit or {}).items():
@@ -148,7 +148,7 @@ def _column(table: FileTable, index: int, role: str) -> Column:
 
 
 def _plain(name: str) -> str:
-    """Return a heading in lower case without its unit and signs."""
+    """Return a heading in lower case, without its unit and special characters."""
     return re.sub(r"[^a-z0-9]+", " ", _UNIT.sub("", name).casefold()).strip()
 
 

@@ -1,7 +1,7 @@
 """Find out what the files of a submission are, and write it into its `submission.toml`.
 
 Every recording in `data/` without a table gets one, and an incomplete table is completed from its
-file. Existing entries are never changed; doubts become comments.
+file. Existing entries are never changed. Doubts become comments.
 """
 
 import filecmp
@@ -41,7 +41,7 @@ from pipeline.submission.template import write_templates
 from pipeline.submission.toml_file import Value, parse_toml
 from pipeline.words.numbers import by_note, first_few
 
-UNSURE = "unsure: "  # begins a comment below a table, to be removed by a person who knows
+UNSURE = "unsure: "  # begins a comment below a table; a person who knows the answer removes it
 _TO_STATE = {  # facts that a file does not show
     "columns": "columns = { }    # by name or number: time, input, x1, …",
     "sample_rate": "sample_rate = 0    # Hz",
@@ -59,15 +59,17 @@ class Found:
 
     Attributes
     ----------
-    file : below the submission's folder.
-    state : its table is new, completed or was there. Or it has no table, because it is a copy,
-        unknown, unreadable, or cannot be named by one. Or it has a table but is missing. Or it is
-        not read, because its name is not that of a recording, or it lies beside `data/`.
-    experiment : the id of its table; "" without one.
-    carts : the free ones, as far as the file shows; () all.
+    file : path below the submission's folder.
+    state : what happened to its table. It is new, was completed, or already existed. Without a
+        table, the file is a copy, unknown, unreadable, or its name cannot be written. A file with a
+        table may be missing. A file may also be ignored because of its name, or because it is
+        outside `data/`.
+    experiment : the id of its table. Empty without one.
+    carts : the free carts, as far as the file shows. () means all.
     inspection : None if the file cannot be read.
-    remarks : faults; unsure : questions for a person.
-    advice : what to do about a file that is not read; "" if it may stay as it is.
+    remarks : faults of the file.
+    unsure : questions for a person.
+    advice : what to do about a file that is not read. Empty if it may stay as it is.
     """
 
     file: str
@@ -81,20 +83,20 @@ class Found:
     advice: str = ""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what was found as plain values for JSON."""
+        """Return the findings as plain values for JSON."""
         return asdict(self)
 
 
 def data_files(folder: Path) -> list[str]:
-    """Return the recordings in `data/`, with their paths for `submission.toml`."""
+    """Return the recordings in `data/`, as paths for `submission.toml`."""
     found = data_files_in(folder / "data")
     names = [path.relative_to(folder).as_posix() for path in found]
     return [name for name in names if outside(folder, name) is None]
 
 
 def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
-    """Return the files of a submission that are not inspected; those `named` have a table."""
-    if problem := leaves(folder, "data"):  # other files there are ignored
+    """Return the files of a submission that are not inspected; those in `named` have a table."""
+    if problem := leaves(folder, "data"):  # in this case other files are ignored too
         return [Found(file="data", state="refused", remarks=(problem,))]
     names = [path.relative_to(folder).as_posix() for path in data_files_in(folder / "data")]
     closed = [one for name in names if name not in named and (one := refused(folder, name))]
@@ -111,7 +113,7 @@ def passed_over(folder: Path, *, named: Collection[str] = ()) -> list[Found]:
 
 
 def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -> Found:
-    """Return what a file of a submission is; `state` is "broken" or not settled yet ("unknown").
+    """Return what a file of a submission is; its `state` is "broken", or "unknown" until later.
 
     Parameters
     ----------
@@ -135,9 +137,10 @@ def look_at(folder: Path, file: str, *, columns: Mapping[str, str | int] = {}) -
 
 
 def free_carts(inspection: Inspection) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """Return the carts that move in a file, and what is unsure.
+    """Return the carts that move in a file, and questions about them.
 
-    () means all: for a table of ratios, and if no cart moves, which proves nothing.
+    () means all carts. It is returned for a table of ratios, and if no cart moves, because that
+    proves nothing.
     """
     carts = _moving(inspection)
     little = hardly_moving(inspection)
@@ -153,7 +156,7 @@ def hardly_moving(inspection: Inspection) -> tuple[int, ...]:
     if inspection.kind == "sine":  # near a null, a free cart hardly moves
         return ()
     ranges, carts = _ranges(inspection), _moving(inspection)
-    # Of the largest cart motion.
+    # Less than 5 % of the largest cart motion.
     return tuple(cart for cart in carts if ranges[cart] < 0.05 * max(ranges.values()))
 
 
@@ -161,7 +164,7 @@ def _moving(inspection: Inspection) -> tuple[int, ...]:
     if inspection.kind == "bode":
         return ()
     step = max((column.step or 0.0 for column in inspection.positions.values()), default=0.0)
-    # Encoder steps over a whole record; a free cart moves more.
+    # A free cart moves more than two encoder steps over a whole record.
     return tuple(cart for cart, travel in _ranges(inspection).items() if travel > 2.0 * step)
 
 
@@ -172,7 +175,7 @@ def _ranges(inspection: Inspection) -> dict[int, float]:
 def experiment_entry(
     inspection: Inspection, *, name: str, kind: Kind, file: str, carts: Sequence[int], n: int
 ) -> dict[str, Value]:
-    """Return the keys of the `[[experiments]]` table of a file; the system has `n` carts."""
+    """Return the keys of a file's `[[experiments]]` table, in a system with `n` carts."""
     entry: dict[str, Value] = {"id": name, "kind": kind}
     known = [cart for cart in carts if cart <= n]
     if known and len(known) < n:
@@ -185,7 +188,7 @@ def experiment_entry(
 
 
 def free_id(stem: str, taken: Iterable[str]) -> str:
-    """Return a name for an experiment like that of its file, but unused."""
+    """Return an unused id for an experiment, similar to its file's name."""
     base = _NO_NAME.sub("-", stem).strip("-.") or "record"
     names, number, name = set(taken), 1, base
     while name in names:
@@ -195,7 +198,7 @@ def free_id(stem: str, taken: Iterable[str]) -> str:
 
 
 def fill_submission(folder: Path) -> tuple[Found, ...]:
-    """Write the tables of the files in `data/`; without a `submission.toml`, one is made.
+    """Write the tables of the files in `data/`; make `submission.toml` if it does not exist.
 
     Raises
     ------
@@ -222,7 +225,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
         if new:
             _state_units(document, looked)
         filling = _Filling(document, folder, looked)
-        missing = list(filling.missing())  # before a file under its new name gets a table
+        missing = list(filling.missing())  # before a renamed file gets a second table
         found.extend(filling.add(one) for one in looked)
         found.extend(missing)
 
@@ -231,7 +234,7 @@ def fill_submission(folder: Path) -> tuple[Found, ...]:
 
 
 class _Filling:
-    """A document to which the tables of files are added one after the other."""
+    """A document to which the tables of files are added one by one."""
 
     def __init__(
         self, document: tomlkit.TOMLDocument, folder: Path, looked: Sequence[Found]
@@ -246,7 +249,7 @@ class _Filling:
         return [table for table in self._document.get("experiments", ()) if "file" in table]
 
     def add(self, found: Found) -> Found:
-        """Add the table of one file, or complete the one that is there; return what was done."""
+        """Add the table of one file, or complete the existing one; return what was done."""
         if found.inspection is None:
             return found
         for table in self._tables:
@@ -283,7 +286,7 @@ class _Filling:
         return replace(found, state="new", experiment=name, remarks=remarks, unsure=unsure)
 
     def _complete(self, table: Any, found: Found, inspection: Inspection) -> Found:
-        """Add the keys that a table needs and its file determines."""
+        """Add the missing keys of a table that can be found from its file."""
         before = len(table)
         if "id" not in table:
             taken = [str(one.get("id", "")) for one in self._tables]
@@ -293,7 +296,7 @@ class _Filling:
         if "columns" not in table and inspection.guessed:
             table["columns"] = toml_item(inspection.guessed)
         carts = tuple(table.get("carts", range(1, self._n + 1)))
-        known = {NO_CLOCK} if "sample_rate" in table else set()  # written in the table, no news
+        known = {NO_CLOCK} if "sample_rate" in table else set()  # already stated in the table
         if "columns" in table and not inspection.guessed:
             known.add(inspection.ranges)
         return replace(
@@ -307,7 +310,7 @@ class _Filling:
         )
 
     def missing(self) -> Iterator[Found]:
-        """Yield the files that have a table but are missing, with what may be meant."""
+        """Yield the files that have a table but are missing, with likely alternatives."""
         files = {posix(str(table["file"])): table for table in self._tables}
         for file, table in files.items():
             wrong = outside(self._folder, file, taken=files)
@@ -328,7 +331,7 @@ class _Filling:
         return None
 
     def _same_ranges(self, *files: str) -> bool:
-        """Whether files may hold the same samples, without reading them again."""
+        """Whether files may hold the same samples, judged without reading them again."""
         seen = [
             one and {c.role: (one.samples, c.low, c.high) for c in one.columns if c.role}
             for one in map(self._inspections.get, files)
@@ -342,7 +345,7 @@ class _Filling:
         return {c.role: table.values[i].tobytes() for i, c in enumerate(columns) if c.role}
 
     def _say_unknown(self, found: Found) -> None:
-        """Leave a table as a comment, once, for a person who knows the file to fill in."""
+        """Write a table as a comment, once; a person who knows the file can complete it."""
         line = f"file = {json.dumps(found.file, ensure_ascii=False)}"
         if f"# {line}" in tomlkit.dumps(self._document).splitlines():
             return
@@ -356,7 +359,7 @@ class _Filling:
 
 
 def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:
-    """Return the remarks except those on carts that the table declares held."""
+    """Return the remarks except those on carts that are declared as held."""
     assert found.inspection is not None
     positions = found.inspection.positions.items()
     known = {never_changes(column.name) for cart, column in positions if cart not in carts}
@@ -364,7 +367,7 @@ def _beside_held(found: Found, carts: Collection[int]) -> tuple[str, ...]:
 
 
 def has_fractions(found: Found) -> bool:
-    """Whether a position of a recording is not in whole numbers, as counts are."""
+    """Whether a position has values that are not whole numbers, unlike counts."""
     if found.inspection is None or found.kind == "bode":
         return False
     return not all(column.whole for column in found.inspection.positions.values())
@@ -375,7 +378,7 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
 
     Parameters
     ----------
-    fractions : the files that hold some.
+    fractions : the files with values that are not whole numbers.
     """
     if not is_known(unit, position_units()):
         return f"the unit {unit!r} is not known: is it right?"
@@ -386,14 +389,14 @@ def unit_doubt(unit: str, *, fractions: Sequence[str]) -> str:
 
 
 def system_doubts(folder: Path) -> dict[str, str]:
-    """Return the doubts marked beside the keys of `[system]`, by key."""
+    """Return the doubts marked next to the keys of `[system]`, by key."""
     system: Any = _read(folder).get("system", {})
     comments = {key: item.trivia.comment.removeprefix("# ") for key, item in system.value.items()}
     return {key: said for key, said in comments.items() if said.startswith(UNSURE)}
 
 
 def experiment_doubts(folder: Path) -> list[tuple[str, ...]]:
-    """Return the doubts marked right below each table of an experiment."""
+    """Return the doubts marked directly below each table of an experiment."""
     tables: Any = _read(folder).get("experiments", ())
     return [_marked(table) for table in tables]
 
@@ -403,7 +406,7 @@ def _read(folder: Path) -> tomlkit.TOMLDocument:
 
 
 def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = None) -> None:
-    """Put a value into `[system]`, with a doubt or a reason as the comment behind it."""
+    """Write a value into `[system]`, followed by a doubt or a reason as a comment."""
 
     def change(document: tomlkit.TOMLDocument) -> None:
         system: Any = document["system"]
@@ -415,19 +418,19 @@ def mark_system(folder: Path, key: str, *, doubt: str, value: "Value | None" = N
 
 
 def unsure(doubt: str) -> str:
-    """Return a comment that marks a doubt, to be removed by a person who knows."""
+    """Return a comment that marks a doubt; a person who knows the answer removes it."""
     return UNSURE + doubt
 
 
 def _marked(table: Any) -> tuple[str, ...]:
-    """Return the doubts marked right below a table."""
+    """Return the doubts marked directly below a table."""
     own = table.as_string().partition("\n\n")[0]
     lines = [line.strip().removeprefix("# ") for line in own.splitlines()]
     return tuple(line.removeprefix(UNSURE) for line in lines if line.startswith(UNSURE))
 
 
 def _unsure(found: Found, n: int) -> Iterator[str]:
-    """Yield the facts that a person knows and no file shows."""
+    """Yield questions on facts that a person knows but no file shows."""
     assert found.inspection is not None
     if found.inspection.guessed:
         yield from (f"columns: {doubt}" for doubt in found.inspection.doubts)
@@ -442,7 +445,7 @@ def _unsure(found: Found, n: int) -> Iterator[str]:
 
 
 def _carts_seen(looked: Sequence[Found]) -> int:
-    """Return the last cart that moves in any file; an exporter writes columns for more."""
+    """Return the number of the last cart that moves in any file; exports may have more columns."""
     carts = [
         cart for one in looked if one.inspection for cart in one.carts or one.inspection.positions
     ]
@@ -461,9 +464,9 @@ def _state_units(document: tomlkit.TOMLDocument, looked: Sequence[Found]) -> Non
 
 
 def format_found(found: Sequence[Found]) -> str:
-    """Return a table with one line for each file, and faults and doubts below.
+    """Return a table with one line per file, and faults and doubts below.
 
-    Not for unread files.
+    Unread files are left out.
     """
     found = [one for one in found if one.state != "not_read"]
     rows = [
@@ -488,7 +491,7 @@ def format_found(found: Sequence[Found]) -> str:
 
 
 def format_passed_over(found: Iterable[Found]) -> list[str]:
-    """Return which files are not read, one line for each reason, and what to do."""
+    """Return a line for each reason why files are not read, with what to do."""
     return _not_looked_into([one for one in found if one.state == "not_read"])
 
 

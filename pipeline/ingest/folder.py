@@ -1,4 +1,4 @@
-"""The files of a folder: which hold recordings, and why others are not read."""
+"""List the files of a folder: which hold recordings, and why others are not read."""
 
 import re
 from collections.abc import Iterable, Iterator
@@ -10,9 +10,9 @@ from pipeline.ingest.formats.recognise import ENDINGS, is_recording, read_table
 from pipeline.submission.load import outside
 from pipeline.words.numbers import first_few
 
-_DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # what a system leaves; the rest of it is hidden
+_DEBRIS = frozenset({"thumbs.db", "desktop.ini"})  # of operating systems; all others are hidden
 _AS_TEXT = "save the recording as .csv"
-# Forms that are not read but may hold a recording, with the advice to give.
+# Formats that are not read but may hold a recording, with the advice to give.
 _FORMS = {
     ".xlsm .xlsb .xls .ods .numbers": ("a spreadsheet", "save each recording as .xlsx or .csv"),
     ".zip .rar .7z .gz .tgz .tar": ("an archive", "unpack it"),
@@ -26,13 +26,13 @@ _FORM_OF = {ending: form for endings, form in _FORMS.items() for ending in endin
 
 @dataclass(frozen=True, kw_only=True)
 class NotRead:
-    """A file that no recording is read from.
+    """A file that is not read.
 
     Attributes
     ----------
     file : its name, printable.
     reason : why it is not read.
-    advice : what to do if it may hold a recording; else "".
+    advice : what to do if it may hold a recording. Otherwise empty.
     """
 
     file: str
@@ -41,21 +41,21 @@ class NotRead:
 
 
 def data_files_in(folder: Path) -> list[Path]:
-    """Return the files that may hold data, in a folder and those below, "2" before "10"."""
+    """Return the files that may hold data, in a folder and its subfolders; "2" before "10"."""
     return [path for path in _entries(folder) if _is_recording(path)]
 
 
 def files_not_read(folder: Path, *, root: Path) -> list[NotRead]:
-    """Return every other file of a folder and those below, with advice.
+    """Return all other files of a folder and its subfolders, with advice.
 
-    Names are below `root`, which no file may leave by a link. Hidden files are passed over.
+    Names are relative to `root`, and no link may lead out of it. Hidden files are skipped.
     """
     names = [p.relative_to(root).as_posix() for p in _entries(folder) if not _is_recording(p)]
     return [refused(root, name) or _not_read(root, name) for name in names]
 
 
 def refused(root: Path, name: str) -> NotRead | None:
-    """Return why a file below `root` is not opened, None if it may be."""
+    """Return why a file below `root` must not be opened; None if it may be."""
     problem = outside(root, name)
     if problem is None:
         return None
@@ -66,7 +66,7 @@ def refused(root: Path, name: str) -> NotRead | None:
 
 
 def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
-    """Return the recordings beside `data/`, except those `named` in submission.toml."""
+    """Return the recordings outside `data/`, except those `named` in submission.toml."""
     known = set(named)
     found = []
     for path in sorted(folder.iterdir(), key=_natural) if folder.is_dir() else ():
@@ -80,16 +80,16 @@ def recordings_beside(folder: Path, *, named: Iterable[str]) -> list[NotRead]:
 
 
 def not_read_notes(found: Iterable[tuple[str, str, str]]) -> list[str]:
-    """Return a line for each reason and advice, with its files."""
+    """Return one line per reason and advice, with the files concerned."""
     about: dict[str, list[str]] = {}
     for file, reason, advice in found:
         about.setdefault("; ".join(filter(None, (reason, advice))), []).append(file)
-    # In a sentence; the JSON names all.
+    # The sentence names four files, the JSON names all.
     return [f"not read: {first_few(names, 4)} ({why})" for why, names in about.items()]
 
 
 def _not_read(root: Path, name: str) -> NotRead:
-    """Describe a file that is not a recording by its ending: by ending, then by content."""
+    """Return why a file is not a recording: from its ending if known, else from its content."""
     ending = Path(name).suffix.casefold()
     if ending in _FORM_OF:
         reason, advice = _FORM_OF[ending]
@@ -105,9 +105,9 @@ def _not_read(root: Path, name: str) -> NotRead:
 def _is_table(root: Path, name: str) -> bool:
     try:
         with (root / name).open("rb") as file:
-            # Bytes that show whether a file is text.
+            # 1000 bytes show whether a file is text.
             head = file.read(1000)
-        if b"\0" in head and not is_recording(head):  # a film may be large
+        if b"\0" in head and not is_recording(head):  # not read whole, as a video may be large
             return False
         read_table(root, name)
     except (SubmissionError, OSError):
@@ -120,7 +120,7 @@ def _is_recording(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> list[Path]:
-    """Return everything except folders in a folder and those below; links are not followed."""
+    """Return all files in a folder and its subfolders; links are not followed."""
     return sorted(_walk(folder), key=_natural)
 
 

@@ -1,15 +1,15 @@
-"""The sign of the input: stated, found from the data, or as in the other records.
+"""The sign of the input: stated, found from the data, or the same as in other records.
 
-The direction in which the motor pushes shows in the input, compared with the force that cart 1's
-motion requires:
+The input, compared with the force that cart 1's motion requires, shows in which direction the motor
+pushes. The equation of motion is
 
-    s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1
+    s u = m x_1'' + c x_1' + k x_1 + k' (x_1 - x_2),   m, c, k, k' ≥ 0,   s = ±1.
 
-holds for every record of a bench with one m, c, k and k', so all records decide s together. No
-derivative is taken: both sides are weighted with a bump that slides along the record
-(`modulating`). An input that is late, by a delay or a lag, turns the phases above the resonance so
-far that such a record alone seems to have the other sign. Together with the others' inertia and
-stiffness it does not.
+It holds for every record of a bench with the same m, c, k and k', so all records together decide s.
+No data are differentiated: both sides are averaged with a bump that slides along the record
+(`modulating`). A late input (a delay or a lag) turns the phase above the resonance so far that such
+a record by itself seems to have the other sign. Together with the inertia and stiffness from the
+other records, it does not.
 """
 
 from collections.abc import Mapping, Sequence
@@ -26,13 +26,13 @@ from pipeline.submission import Submission
 from pipeline.words.numbers import abridge
 
 _NARROWEST = 8  # samples under a bump
-_BUMPS = 6  # side by side in a record, at least
-FEW_NAMES = 6  # more are not listed one by one
+_BUMPS = 6  # bumps side by side in a record
+FEW_NAMES = 6  # names to list; further ones are only counted
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signs:
-    """By record, the stated sign, and the sign of its data: 0 if unclear."""
+    """For each record the stated sign, and the sign found in its data: 0 if unclear."""
 
     stated: Mapping[str, int]
     found: Mapping[str, int]
@@ -41,11 +41,13 @@ class Signs:
 def with_signs(
     records: list[Record], submission: Submission
 ) -> tuple[list[Record], list[str], Signs]:
-    """Return the records with signed inputs, notes on signs found, and those stated.
+    """Return the records with signed inputs, notes on the signs found, and the signs.
 
-    A record with an unclear sign takes that of most others of its kind (under feedback or not: a
-    controller's log may count the other way), else of most others. A record with a stated sign
-    other than the system's takes the sign of its data, else the stated one.
+    A record with an unclear sign takes the sign of most other records of its kind. Records under
+    feedback are one kind, as a controller's log may have another sign; all others are the second.
+    Without such records, it takes the sign of most others. If the sign stated for a record differs
+    from the system's, the record takes the sign of its data, or the stated one if the data are
+    unclear.
     """
     stated: dict[str, int] = {}
     disputed: set[str] = set()
@@ -87,7 +89,7 @@ def with_signs(
 def _say_signs(
     driven: list[str], *, stated: dict[str, int], found: dict[str, int], signs: dict[str, int]
 ) -> list[str]:
-    """Return which signs were found, and which were only assumed."""
+    """Return notes on which signs were found, and which were only assumed."""
     searched = [name for name in driven if name not in stated]
     if not searched:
         return []
@@ -113,15 +115,15 @@ def _say_signs(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Weighed:
-    """Both sides of the equation under the sliding bump, over the norm of the input's.
+    """Both sides of the equation under the sliding bump, divided by the norm of the input's side.
 
     Attributes
     ----------
-    drive : (3, n) the input a sample early, as logged, and a sample late.
+    drive : (3, n) the input one sample early, as logged, and one sample late.
     motion : (n, 4) factors of m, c, k and k'.
-    complete : False if cart 2 is free and was not measured.
-    decisive : False for a dwell that is not complete: it may not be called reversed.
-    closed : recorded under feedback.
+    complete : whether all terms are known. It is False if cart 2 is free and was not measured.
+    decisive : whether the record may be called reversed. It is False for an incomplete dwell.
+    closed : whether it was recorded under feedback.
     """
 
     drive: Array
@@ -133,15 +135,15 @@ class _Weighed:
 
 @np.errstate(all="ignore")  # overflow gives no finite number and no sign
 def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[str, int]:
-    """Return by record the sign of its logged input; 0, or nothing, if the data are unclear.
+    """Return by record the sign of its logged input; 0 or no entry if the data are unclear.
 
-    One bench has one sign. A record has another only if its input is the opposite of the force that
-    the others' equation gives. A signal logged under feedback may be something else, so it is left
-    out of the equation if there are other records.
+    A bench has one sign. A record gets another one only if its input is opposite to the force that
+    the others' equation gives. A signal logged under feedback may be something else. It is left out
+    of the equation if there are other records.
 
     Parameters
     ----------
-    stated : by record, its stated sign; the others count as 1.
+    stated : by record, its stated sign. Other records count as 1.
     """
     weighed = {record.id: found for record in records if (found := _weigh(record)) is not None}
     if not weighed:
@@ -149,7 +151,7 @@ def find_signs(records: Sequence[Record], *, stated: Mapping[str, int]) -> dict[
     said = {name: stated.get(name, 1) for name in weighed}
     rule = [name for name, w in weighed.items() if w.complete] or list(weighed)
     rule = [name for name in rule if not weighed[name].closed] or rule
-    # If equally many count either way, the sign of each record alone is the better start.
+    # If as many records have either sign, the sign of each record by itself is the better start.
     alone = {n for n, w in weighed.items() if w.decisive and _bench([w], [said[n]])[0] < 0}
     for turned in (set[str](), alone):
         found = _settle(weighed, said, turned, rule=rule)
@@ -165,8 +167,11 @@ def _settle(
     *,
     rule: Sequence[str],
 ) -> dict[str, int]:
-    """Reverse records that contradict the equation of `rule` until none does; see `find_signs`."""
-    # Rounds of reversing such records and fitting again.
+    """Reverse records that contradict the equation of `rule`, until no record does.
+
+    Return the sign of each record, as in `find_signs`; empty if no solution is found.
+    """
+    # At most five rounds of reversing records and fitting again.
     for _ in range(5):
         signs = {name: -said[name] if name in turned else said[name] for name in weighed}
         sign, weights = _bench([weighed[name] for name in rule], [signs[name] for name in rule])
@@ -175,9 +180,9 @@ def _settle(
         cosines = {name: sign * said[name] * _cosine(w, weights) for name, w in weighed.items()}
         contrary = {n for n, w in weighed.items() if w.decisive and cosines[n] < -0.7}
         if contrary == turned:
-            # Of the cosine between an input and the force that the bench's equation gives. A lag
-            # (at most 90°) and any likely delay stay above zero; a log that counts the other way is
-            # near -1.
+            # The cosine is between an input and the force that the bench's equation gives. It stays
+            # positive with a lag (at most 90°) and any likely delay. For a log with the opposite
+            # sign it is near -1.
             return {
                 name: sign * signs[name] if name in turned or cosines[name] > 0.3 else 0
                 for name in weighed
@@ -187,10 +192,10 @@ def _settle(
 
 
 def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Array]:
-    """Return the sign, on top of `signs`, and m, c, k, k' of the equation that explains them all.
+    """Return the sign, relative to `signs`, and m, c, k, k' of the equation that explains all.
 
-    The sign is 0 if the other explains them nearly as well, or if a log early or late by a sample
-    would change it (a feedback law is never early).
+    The sign is 0 if the other one explains them nearly as well. It is also 0 if a log that is one
+    sample early or late would change it (under feedback, early is not tried).
     """
     motion = np.vstack([w.motion for w in weighed])
     size = np.linalg.norm(motion, axis=0)
@@ -200,10 +205,10 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
     for shift in shifts:
         drive = np.concatenate([s * w.drive[shift] for s, w in zip(signs, weighed, strict=True)])
         (ahead, left), (back, right) = (_explain(motion / size, s * drive) for s in (1, -1))
-        share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has the norm one
-        # Of the input's power: how much more the other sign must leave unexplained to be excluded.
-        # It is far above the effect of an encoder's steps; a cart's damping has a larger effect at
-        # every frequency that moves it.
+        share = np.array([left, right]) ** 2 / len(weighed)  # each record's input has norm 1
+        # A sign is excluded if more of the input's power stays unexplained with it, by this margin.
+        # The margin is far above the effect of an encoder's steps, and below that of a cart's
+        # damping.
         sure = abs(share[0] - share[1]) > 1e-3 + 0.1 * share.min()
         found.add((1 if share[0] < share[1] else -1) if sure else 0)
         if shift == 1:
@@ -212,22 +217,22 @@ def _bench(weighed: Sequence[_Weighed], signs: Sequence[int]) -> tuple[int, Arra
 
 
 def _explain(motion: Array, drive: Array) -> tuple[Array, float]:
-    """Return the weights (4,), none negative, and the norm of the unexplained drive."""
+    """Return the weights (4,), never negative, and the norm of the unexplained drive."""
     try:
         return nnls(motion, drive)
-    except RuntimeError:  # no solution was found: nothing is explained
+    except RuntimeError:  # no solution, so nothing is explained
         return np.zeros(motion.shape[1]), float(np.linalg.norm(drive))
 
 
 def _cosine(w: _Weighed, weights: Array) -> float:
-    """Return the cosine between the logged input and the force of the equation."""
+    """Return the cosine between the logged input and the force by the equation."""
     force = w.motion @ weights
     size = float(np.linalg.norm(force) * np.linalg.norm(w.drive[1]))
     return float(w.drive[1] @ force) / size if size > 0 else 0.0
 
 
 def _weigh(record: Record) -> _Weighed | None:
-    """Return both sides of a record's equation; None if nothing drives or moves cart 1."""
+    """Return both sides of a record's equation; None if cart 1 is not driven or does not move."""
     if record.u is None or 1 not in record.carts or 1 not in record.free:
         return None
     t, u, x = record.t, record.u, record.position(1)
@@ -244,11 +249,11 @@ def _weigh(record: Record) -> _Weighed | None:
     width = int(np.clip(period, _NARROWEST, t.size // _BUMPS))
     weight, slope, bend = bump((np.arange(width) + 0.5) / width, span=width * dt)
     sides = [(x, bend), (x, -slope), (x, weight), (x - other, weight)]
-    last = x.size - width  # place of a bump
+    last = x.size - width  # start of the last bump
     places = np.arange(1, last, max(width // 6, last // 400, 1))
     centred = [sliding_window_view(u, width)[places + shift] @ weight for shift in (-1, 0, 1)]
     centred += [sliding_window_view(a, width)[places] @ weights for a, weights in sides]
-    early, now, late, *terms = (a - a.mean() for a in centred)  # an encoder's zero cancels
+    early, now, late, *terms = (a - a.mean() for a in centred)  # encoder zeros cancel
     drive = np.array([early, now, late]) / np.linalg.norm(now)
     motion = np.array(terms).T / np.linalg.norm(now)
     if not (np.all(np.isfinite(drive)) and np.all(np.isfinite(motion))):

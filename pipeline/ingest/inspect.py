@@ -1,4 +1,4 @@
-"""The content of a data file, before it is used."""
+"""Inspect the content of a data file before it is used."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -19,15 +19,15 @@ from pipeline.results import Kind
 from pipeline.words.numbers import by_note, first_few
 
 NO_CLOCK = "no time column: state `sample_rate`"
-_MOST_COLUMNS = 16  # spelt out in a sentence
-_COPIED = 0.999  # correlation from which a target is the input itself
+_MOST_COLUMNS = 16  # columns to list in a sentence
+_COPIED = 0.999  # correlation. Above it, a target is the input itself
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColumnInspection:
-    """One column: its heading, the role it would play, its range and the encoder step seen.
+    """One column: its heading, its likely role, its range and the encoder step found.
 
-    `whole` : it holds only whole numbers, like an encoder's counts.
+    `whole` is true if it holds only whole numbers, like an encoder's counts.
     """
 
     name: str
@@ -41,20 +41,21 @@ class ColumnInspection:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspection:
-    """A data file at a glance.
+    """A summary of a data file.
 
     Attributes
     ----------
-    duration, interval, jitter : s; jitter is the rms deviation of the sample interval.
+    duration, interval, jitter : s. Jitter is the rms deviation of the sample interval.
     rate : Hz. None, like the other times, if the file has no time column.
-    kind : the kind of experiment it looks like; `frequency` (Hz) of a sine dwell.
+    kind : the kind of experiment that it looks like.
+    frequency : for a sine dwell, its frequency. Hz.
     problems : points to check before using the file.
-    unusable : those problems for which a report does not use the file.
-    needs : keys that its table in `submission.toml` must state ("columns", "sample_rate").
-    variables : of a binary file, read or not.
-    guessed : column numbers by role, if the file has no headings but the signals reveal them.
-    doubts : why a person should look at those numbers.
-    cut_short : the file ends in the middle of a recording.
+    unusable : those problems because of which a report does not use the file.
+    needs : keys that its table in `submission.toml` must state. Such as "columns" or "sample_rate".
+    variables : the variables of a binary file, read or not.
+    guessed : column numbers by role. Given if the file has no headings but the signals reveal them.
+    doubts : why a person should check these numbers.
+    cut_short : whether the file seems to end in the middle of a recording.
     """
 
     file: str
@@ -77,13 +78,13 @@ class Inspection:
 
     @property
     def positions(self) -> dict[int, ColumnInspection]:
-        """The columns that are a cart's position, by cart."""
+        """The columns that hold a cart's position, by cart."""
         roles = {column.role: column for column in self.columns if column.role}
         return {int(role[1:]): roles[role] for role in sorted(roles) if role[0] == "x"}
 
     @property
     def ranges(self) -> str:
-        """The range of each column, for a person who must name them; "" if they are named."""
+        """The range of each column without a name, for a person who must name them; else ""."""
         if "columns" not in self.needs:
             return ""
         said = [f"{one.name} ({one.low:.4g} to {one.high:.4g})" for one in self.columns]
@@ -92,7 +93,7 @@ class Inspection:
     def to_dict(self) -> dict:
         """Return the inspection as plain values for JSON."""
         shown = asdict(self)
-        del shown["cut_short"]  # one of the problems
+        del shown["cut_short"]  # it is one of the problems
         return {"state": "read", **shown, "advice": ""}
 
 
@@ -101,13 +102,13 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
 
     Parameters
     ----------
-    columns : their roles, if stated; a missing column states nothing.
+    columns : their roles, if stated. A missing column states nothing.
 
     Raises
     ------
-    SubmissionError : the file is missing, of no known form, or broken; names the path as given.
+    SubmissionError : the file is missing, of unknown format, or broken; the path is as given.
     """
-    real = Path(path).resolve()  # a link given on the command line is the caller's own choice
+    real = Path(path).resolve()  # a link on the command line is the user's own choice
     table, _ = read_table(real.parent, real.name, shown=str(path))
     unusable = [table.cut_short] if table.cut_short else []
     problems = [*unusable]
@@ -127,7 +128,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(_name_them(told))
     elif unused and not unnamed:
         problems.append(f"not used: {', '.join(unused)}; name them in `columns` to use them")
-    # Without names everything else is missing too.
+    # Without column names, all other things are missing too.
     further = [] if bare and not guessed else problems
     try:
         clock = _clock(table, assigned, further) if "frequency" not in assigned else None
@@ -172,7 +173,7 @@ def _inspect_columns(
             name=name,
             role=roles.get(i),
             unit=assigned[roles[i]].unit if i in roles else None,
-            low=float(values.min()) + 0.0,  # never "-0"
+            low=float(values.min()) + 0.0,  # + 0.0 turns -0.0 into 0.0
             high=float(values.max()) + 0.0,
             step=encoder_step(values) or None if roles.get(i, " ")[0] == "x" else None,
             whole=bool(table.whole[i]),
@@ -182,7 +183,7 @@ def _inspect_columns(
 
 
 def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> dict[str, Any]:
-    """Return the JSON entry of a file that is not inspected, with the keys of an inspected one.
+    """Return the JSON entry of a file that is not inspected, with the same keys as others.
 
     `state` is "broken" or "not_read"; `advice` says what to do.
     """
@@ -193,7 +194,7 @@ def unread_entry(file: Path, state: str, problem: str, *, advice: str = "") -> d
 
 
 def _name_them(told: Roles) -> str:
-    """Return how to name columns without headings, as far as their signals tell."""
+    """Return how to name columns without headings, as far as their signals show it."""
     said = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
     if line and not told.doubts:
@@ -208,11 +209,11 @@ def _name_them(told: Roles) -> str:
 
 
 def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str]) -> Clock | None:
-    """Return the clock, or None without one; its notes go to `problems`.
+    """Return the clock, or None without one; its notes are added to `problems`.
 
     Raises
     ------
-    SubmissionError : its time stands still or goes back.
+    SubmissionError : time stands still or goes back.
     """
     column, n = columns.get("time"), table.values.shape[1]
     factor = conversion(column.unit, "s") if column else None
@@ -221,7 +222,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
         return None
     clock = read_clock(table.values[column.index] * factor)
     problems += clock_notes(table, column, clock, sample_rate=None)
-    # Of the interval, rms: jitter worth mentioning.
+    # Jitter above 1 % of the interval (rms) is worth mentioning.
     if not clock.pieces and clock.jitter > 0.01 * clock.mean_interval:
         problems.append(
             f"the sample interval varies by {clock.jitter / clock.mean_interval:.1%} (rms); "
@@ -233,7 +234,7 @@ def _clock(table: FileTable, columns: Mapping[str, Column], problems: list[str])
 def _guess(
     table: FileTable, columns: Mapping[str, Column], clock: Clock | None, problems: list[str]
 ) -> tuple[Kind | None, float | None]:
-    """Return the kind of experiment that the signals look like, and the frequency of a dwell."""
+    """Return the likely kind of experiment, and the frequency of a dwell."""
     if "frequency" in columns:
         return "bode", None
     signals = {role: table.values[column.index] for role, column in columns.items()}
@@ -264,9 +265,9 @@ def _guess(
 
 
 def _follows(u: Array, reference: Array) -> bool:
-    """Return whether the target is the commanded input itself, as in an open loop.
+    """Return whether the target is the commanded input itself, as in open loop.
 
-    It may be rounded to counts, and logged up to a sample apart from the input.
+    It may be rounded to counts, and logged up to one sample apart from the input.
     """
     if np.ptp(reference) == 0.0:
         return False
@@ -275,32 +276,32 @@ def _follows(u: Array, reference: Array) -> bool:
     near = np.column_stack((reference[:-2], reference[1:-1], reference[2:], np.ones(u.size - 2)))
     weights = np.linalg.lstsq(near, u[1:-1])[0]
     left = np.var(u[1:-1] - near @ weights) / np.var(u)
-    # Weights that cancel make a derivative: that is a controller's output.
+    # Weights of opposite sign form a derivative, as in a controller's output.
     blend = np.abs(weights[:3]).sum() < 1.5 * abs(weights[:3].sum())
     return bool(blend and left < 1.0 - _COPIED**2)
 
 
 def is_stepped(u: Array) -> bool:
     """Return whether the input is constant between a few edges."""
-    # Of the input's range.
+    # A change by 20 % of the input's range is an edge.
     edges = np.flatnonzero(np.abs(np.diff(u)) > 0.2 * np.ptp(u)) + 1
     # A sweep has more edges.
     if edges.size > 20:
         return False
     pieces = np.split(u, edges)
     spread = np.sqrt(sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces) / u.size)
-    # Of the input's range, rms between edges.
+    # Between edges the input may vary by 3 % of its range (rms).
     return bool(spread < 0.03 * np.ptp(u))
 
 
 def line_frequency(t: Array, u: Array) -> float | None:
-    """Return the frequency (Hz) of an input that is one sine, else None."""
+    """Return the frequency (Hz) of an input that is a single sine, otherwise None."""
     even = np.linspace(t[0], t[-1], t.size)
     signal = np.interp(even, t, u)
     power = np.abs(np.fft.rfft((signal - signal.mean()) * np.hanning(t.size))) ** 2
     peak = int(np.argmax(power))
     line = slice(max(peak - 2, 0), peak + 3)
-    # Share of the input's power in one spectral line: a dwell.
+    # A dwell has 90 % of the input's power in one spectral line.
     if power[line].sum() < 0.9 * power.sum():
         return None
     centre = float(np.arange(power.size)[line] @ power[line] / power[line].sum())
@@ -308,7 +309,7 @@ def line_frequency(t: Array, u: Array) -> float | None:
 
 
 def format_inspections(inspections: Sequence[Inspection]) -> str:
-    """Return a table with one line for each file, and each fault once below it."""
+    """Return a table with one line per file, and each fault once below it."""
     head = ("file", "format", "samples", "s", "Hz", "looks like", "columns")
     rows: list[tuple[str, ...]] = [head]
     for one in inspections:

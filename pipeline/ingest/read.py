@@ -1,4 +1,4 @@
-"""From the files of a submission to records in its units: every conversion happens here."""
+"""Read the files of a submission into records; all conversions of units happen here."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,8 +19,8 @@ from pipeline.ingest.input_sign import Signs, with_signs
 from pipeline.results import FrequencyResponse, HeadingUnit, Record
 from pipeline.submission import Experiment, Submission, System
 
-_FEW_COUNTS = 10  # a motor does not move at so few; smaller whole numbers are typed volts
-DUTY_COUNT = 5 / 4096  # V; the UCSD bench's amplifier gives 5 V for 4096 counts
+_FEW_COUNTS = 10  # counts. No motor moves with so few, so smaller whole numbers are typed volts
+DUTY_COUNT = 5 / 4096  # V. The amplifier of the UCSD bench gives 5 V for 4096 counts
 _NEED_INPUT = ("step", "sine", "sweep")
 
 
@@ -31,12 +31,12 @@ class Ingested:
     Attributes
     ----------
     records : the time series, in the order of the submission.
-    tables : frequency responses that the students reduced, one for each cart.
-    files : SHA-256 of each data file, by path, sorted.
-    unreadable : by experiment, why its file is not included: missing, broken, of another
-        experiment.
-    signs : of the inputs, as stated and from the data.
-    warnings : those that concern more than one record.
+    tables : frequency responses that the students computed, one for each cart.
+    files : SHA-256 of each data file. Sorted by path.
+    unreadable : by experiment, the reason why its file is not used. It is missing, broken, or from
+        another experiment.
+    signs : signs of the inputs, as stated and from the data.
+    warnings : the warnings that concern more than one record.
     """
 
     records: tuple[Record, ...]
@@ -50,7 +50,7 @@ class Ingested:
 def read_data(submission: Submission) -> Ingested:
     """Read every experiment's file into a record in position and input units.
 
-    A missing or broken file, or one that does not fit its experiment, affects that experiment only.
+    If a file is missing, broken or unsuitable, only its experiment is affected.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def read_data(submission: Submission) -> Ingested:
             else:
                 opened.append(_open(table, experiment, submission.system))
     records: list[Record] = []
-    clocks = read_clocks([o.stamps for o in opened])  # all of them share one clock
+    clocks = read_clocks([o.stamps for o in opened])  # the files of a session share one clock
     for one, clock in zip(opened, clocks, strict=True):
         with _noted(one.experiment, unreadable):
             records.append(_read_record(one, clock))
@@ -102,7 +102,7 @@ def read_data(submission: Submission) -> Ingested:
 
 @contextmanager
 def _noted(experiment: Experiment, unreadable: dict[str, str]) -> Iterator[None]:
-    """Keep an error with its experiment."""
+    """Catch an error and note it for its experiment."""
     try:
         yield
     except SubmissionError as error:
@@ -115,7 +115,7 @@ def _none_readable(unreadable: Mapping[str, str]) -> str:
 
 
 def _unused_scale(records: Sequence[Record], system: System) -> list[str]:
-    """Return a warning if the input has a stated scale that no record uses."""
+    """Return a warning if the stated scale of the input is used by no record."""
     per_count = system.input.per_count
     driven = [record for record in records if record.u is not None and np.any(record.u)]
     if per_count is None or not driven or any(r.input_scale == per_count for r in driven):
@@ -139,7 +139,7 @@ def _copies(tables: Mapping[str, tuple[FileTable, str]]) -> list[str]:
 def _read_bode(
     table: FileTable, experiment: Experiment, system: System, points: Points, warnings: list[str]
 ) -> bool:
-    """Add the rows of a Bode table to `points`; return whether it can be used."""
+    """Add the rows of a Bode table to `points`; return whether the table can be used."""
     if len(experiment.carts) < system.carts:
         warnings.append(
             f"{experiment.id}: not used: a bode table needs all carts free, here only "
@@ -165,9 +165,9 @@ def _refuse_cut(table: FileTable) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Opened:
-    """A file with its columns identified; `positions` by cart, `stamps` (n,) s as written in it.
+    """A file with its columns identified; `positions` by cart, `stamps` (n,) in s as written.
 
-    Reading it adds `notes`, and to `headed` the units of its headings.
+    Reading it adds `notes`, and adds the units of headings to `headed`.
     """
 
     system: System
@@ -207,7 +207,7 @@ def _open(table: FileTable, experiment: Experiment, system: System) -> _Opened:
 
 
 def _read_record(opened: _Opened, clock: Clock) -> Record:
-    """Return the record with the input's scale applied, but not yet an unknown sign."""
+    """Return the record with the input's scale applied, but without an unknown sign."""
     table, experiment, columns = opened.table, opened.experiment, opened.columns
     positions, notes = opened.positions, opened.notes
     notes += table.notes
@@ -276,7 +276,7 @@ def _window(clock: Clock, experiment: Experiment) -> slice:
         return slice(None)
     start, end = experiment.window
     first, last = float(clock.t[0]), float(clock.t[-1])
-    # Of the record's length: "to the end" is often rounded up.
+    # 1 % of the length, since the end of the window is often rounded up.
     slack = max(0.01 * (last - first), 2 * clock.mean_interval)
     if start < first - slack or end > last + slack:
         raise SubmissionError(
@@ -330,7 +330,7 @@ def _unit_scale(
 
 
 def _input(opened: _Opened) -> tuple[Array | None, float]:
-    """Return the input in input units and the scale used, both without an unknown sign."""
+    """Return the input in input units and the scale used; an unknown sign is not applied."""
     table, experiment, stated = opened.table, opened.experiment, opened.system.input
     column = opened.columns.get("input")
     if column is None:
@@ -361,7 +361,7 @@ def _input(opened: _Opened) -> tuple[Array | None, float]:
 
 
 def _beyond_volts(values: Array) -> bool:
-    """Return whether they are counts, not volts: large whole numbers, perhaps written "512.0"."""
+    """Return whether values are counts, not volts: large whole numbers, even as "512.0"."""
     return bool(np.all(values == np.round(values)) and np.abs(values).max() > _FEW_COUNTS)
 
 

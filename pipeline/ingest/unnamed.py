@@ -1,6 +1,6 @@
-"""Columns without names: what each one is, told by what it does.
+"""Find the roles of columns without names from their signals.
 
-Time rises evenly. An input jumps between levels, or is what the other columns answer: with it their
+Time rises evenly. An input jumps between levels, or the other columns respond to it: with it their
 accelerations follow a linear law, without it they do not. Positions never jump.
 """
 
@@ -17,30 +17,30 @@ from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.formats.table import FileTable
 from pipeline.submission.models import MOST_CARTS
 
-_JUMP = 0.2  # of its range between two samples: no cart moves so fast
-_ADVANCES = 0.2  # of the samples, at least: a clock may have rounded stamps
-_EQUAL = 0.05  # rms of what two signals differ by: a position and what it has to follow
+_JUMP = 0.2  # of its range between two samples. No cart moves so fast
+_ADVANCES = 0.2  # share of samples that advance. A clock may have rounded stamps
+_EQUAL = 0.05  # relative rms difference of a position and its reference
 _ALIKE = 0.999  # correlation of one signal in two scales
-_FASTEST = 1e-5  # s between samples; no bench records faster
-_CLEARER = 0.5  # of the next best input's: share of the accelerations that is left unexplained
-_FOLLOWS = 0.5  # share left, at most, of columns that an input moves
-_PURER = 0.1  # of the next purest column's: share of the curvature that is no sine
-_FREE = 0.1  # share left, at most, of carts that nothing moves
-_WINDOW = 0.4  # of the fastest motion's period
+_FASTEST = 1e-5  # s between samples. No bench records faster
+_CLEARER = 0.5  # ratio of the unexplained shares of acceleration, best input to next best
+_FOLLOWS = 0.5  # unexplained share. Columns that an input moves stay below
+_PURER = 0.1  # ratio of the curvatures that are not a sine, purest column to next
+_FREE = 0.1  # unexplained share. Carts in free motion stay below
+_WINDOW = 0.4  # of the period of the fastest motion
 _FEWEST, _MOST_WINDOWS = 9, 4000
 
 
 @dataclass(frozen=True, kw_only=True)
 class Roles:
-    """Column numbers, from 1, by role; `doubts`: why a person should look at them."""
+    """Column numbers (from 1) by role; `doubts` say why a person should check them."""
 
     columns: Mapping[str, int] = field(default_factory=dict)
     doubts: tuple[str, ...] = ()
 
 
 def tell_columns(table: FileTable) -> Roles:
-    """Return what the columns of a table without names are; none where that is out of reach."""
-    with np.errstate(all="ignore"):  # shares of nothing compare as false
+    """Return the roles of the columns of a table without names; empty if they cannot be found."""
+    with np.errstate(all="ignore"):  # undefined shares compare as false
         return _tell(table)
 
 
@@ -90,13 +90,13 @@ def _is_clock(values: Array) -> bool:
 
 
 def _rises_evenly(values: Array) -> bool:
-    """Tell the number of a sample, or a time in small units."""
+    """Return whether values may be sample numbers, or a time in small units."""
     steps = np.diff(values)
     return bool(steps.size > 0 and steps.min() > 0 and np.ptp(steps) < 0.5 * np.median(steps))
 
 
 def _other_clock(values: Array) -> tuple[str, ...]:
-    """Return what to say of a column that may be a time in milliseconds or microseconds."""
+    """Return a note on a column that may be a time in milliseconds or microseconds."""
     for i, column in enumerate(values):
         if column.size < 3 or (np.diff(column) <= 0).any():
             continue
@@ -109,11 +109,11 @@ def _other_clock(values: Array) -> tuple[str, ...]:
     return ()
 
 
-# -------------------------------------------------------------------- what is of no use twice
+# -------------------------------------------------------------------- redundant columns
 
 
 def _without_copies(table: FileTable, signals: Sequence[int]) -> list[int]:
-    """Return the columns but a commanded position that only mirrors an encoder behind it."""
+    """Return the columns without a commanded position that only repeats a later encoder column."""
     values, whole = table.values, table.whole
     return [
         i for i in signals
@@ -122,7 +122,7 @@ def _without_copies(table: FileTable, signals: Sequence[int]) -> list[int]:
 
 
 def _without_rates(values: Array, signals: Sequence[int], *, interval: float) -> list[int]:
-    """Return the columns but those that are the velocity of another."""
+    """Return the columns without those that are the velocity of another."""
     parts = _averages(values, signals)
     if parts is None:
         return list(signals)
@@ -163,10 +163,10 @@ def _tell_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, i
 def _by_jumps(
     values: Array, signals: Sequence[int], stepped: Sequence[int], left: Mapping[int | None, float]
 ) -> tuple[int, int | None] | None:
-    """Return input and reference where one column steps, None where that is not clear.
+    """Return input and reference if one column has steps; None if that is not clear.
 
-    A position answers a step without a jump. A controller's output jumps with its reference, or
-    explains the motion better.
+    A position responds to a step without a jump. The output of a controller jumps with its
+    reference, or it explains the motion better.
     """
     first, *copies = stepped
     if any(not _is_alike(values, first, i) for i in copies):
@@ -190,10 +190,10 @@ def _by_jumps(
 def _by_law(
     values: Array, signals: Sequence[int], left: Mapping[int | None, float]
 ) -> tuple[int | None, None] | None:
-    """Return the input, if there is one, by what moves the other columns; None if not clear."""
+    """Return the input as the column that explains the motion of the others; None if not clear."""
     if not left:
         return None
-    if left[None] < _FREE:  # nothing pushes, or a sine, of which every column is an answer
+    if left[None] < _FREE:  # no input is needed, or all columns are sines
         if _dies_away(values[list(signals)]):
             return None, None
         pure = _purest(values, signals)
@@ -211,19 +211,19 @@ def _is_alike(values: Array, i: int, j: int) -> bool:
 
 
 def _is_stepped(column: Array) -> bool:
-    """Tell a signal that is flat between a few jumps."""
+    """Return whether a signal is flat between a few jumps."""
     steps = np.abs(np.diff(column))
     edges = np.flatnonzero(steps > _JUMP * np.ptp(column)) + 1
     if not 0 < edges.size <= 20:
         return False
     pieces = np.split(column, edges)
     spread = sum(((piece - np.median(piece)) ** 2).sum() for piece in pieces)
-    # Of its range, rms between edges.
+    # Between jumps it may vary by 3 % of its range (rms).
     return bool(np.sqrt(spread / column.size) < 0.03 * np.ptp(column))
 
 
 def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Array] | None:
-    """Return mean, slope and curvature (signals, windows) by sample, None in a short record."""
+    """Return mean, slope and curvature (signals, windows) by sample; None for a short record."""
     n = values.shape[1]
     if not signals:
         return None
@@ -242,9 +242,10 @@ def _averages(values: Array, signals: Sequence[int]) -> tuple[Array, Array, Arra
 
 
 def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None, float]:
-    """Return by input tried, None for no input, the share of accelerations that no law explains.
+    """Return for each trial input the share of accelerations that no linear law explains.
 
-    The law is linear in all other columns and their slopes; the share is the mean over them.
+    The key None stands for no input. The law is linear in all other columns and their slopes. The
+    share is the mean over these columns.
     """
     parts = _averages(values, signals)
     if parts is None:
@@ -263,7 +264,7 @@ def _left_unexplained(values: Array, signals: Sequence[int]) -> dict[int | None,
 
 
 def _purest(values: Array, signals: Sequence[int]) -> int | None:
-    """Return the column that is a sine as a computer makes it; no measured one is so pure."""
+    """Return the column that is a computed sine; no measured signal is so pure."""
     parts = _averages(values, signals)
     if parts is None:
         return None
@@ -278,7 +279,7 @@ def _purest(values: Array, signals: Sequence[int]) -> int | None:
 
 
 def _dies_away(rows: Array) -> bool:
-    """Tell motion that nothing keeps up: little is left of it at the end."""
+    """Return whether a motion dies away: little of it is left at the end."""
     parts = np.array_split(rows, 3, axis=1)
     first, last = (
         np.sqrt(((part - part.mean(1, keepdims=True)) ** 2).mean(1))
@@ -288,6 +289,6 @@ def _dies_away(rows: Array) -> bool:
 
 
 def _as_exported(table: FileTable, signals: Sequence[int]) -> int:
-    """Return the one column that is not in whole numbers, or the last, as an ECP writes it."""
+    """Return the only column with fractions, otherwise the last one, as in ECP exports."""
     fractions = [i for i in signals if not table.whole[i]]
     return fractions[0] if len(fractions) == 1 else signals[-1]

@@ -1,1 +1,1 @@
-"""Faults of recordings, and contradictions between them: found here, worded in one place."""
+"""Find faults of recordings, and contradictions between recordings, and describe them."""

@@ -1,8 +1,9 @@
-"""Recordings that do not hold what happened: a dead or swapped channel, a wrong clock, a cut.
+"""Find recordings that do not hold what happened, by comparing them with the identified carts.
 
-Friction may hold a cart still, a held cart is meant to be still, and a coarse encoder does not show
-a small motion. So a channel is called dead only if the identified carts would have moved it far,
-and if the runs that follow them limit friction to less than would hold it.
+The faults are a dead or swapped channel, a wrong clock, or a truncated file. A constant reading is
+not always a fault: friction may hold a cart, a held cart should not move, and a coarse encoder does
+not show a small motion. So a channel is called dead only if the identified carts would have moved
+it far. In addition, the records that follow these carts must show too little friction to hold it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence, Set
@@ -27,11 +28,11 @@ from pipeline.results import Record, StepGain
 from pipeline.soundness.fault import SAME, SIGMAS, RecordingFault
 from pipeline.soundness.other_readings import find_other_readings
 
-# A constant reading while the input changes over half its range, and for this share of the record
-# after it. Meanwhile the identified carts must move by this many encoder steps, and by three tenths
-# of their motion, as a delay or play may hold one for a moment.
+# A reading is suspicious if it is constant while the input changes over half its range, and for
+# this share of the record afterwards. It is a fault if the identified carts move meanwhile by this
+# many encoder steps and by three tenths of their motion. A delay or play holds a cart only briefly.
 _STILL, _SEEN_COUNTS = 0.2, 5.0
-_FEWEST_CYCLES = 1.5  # of a dwell: with fewer there is no steady state, whatever the damping
+_FEWEST_CYCLES = 1.5  # cycles of a dwell; with fewer there is no steady state at any damping
 
 
 def standing_still(records: Sequence[Record]) -> set[str]:
@@ -50,15 +51,15 @@ def find_faults(
 
     Parameters
     ----------
-    chain : the carts as identified from the undoubted records; None if that failed: then only
-        faults that no carts could cause are found.
+    chain : the carts as identified from the undoubted records. None if that failed; then only
+        faults are found that no carts could cause.
     fits : how the records follow it, from `follow`.
     """
     readings = find_other_readings(records, chain=chain, fits=fits)
     misread = readings.mistaken
     everywhere = len({m.words for m in misread.values()}) == 1 and misread.keys() == fits.keys()
     copied = _copies(records)
-    steps: dict[int, float] = {}  # a dead channel shows no motion
+    steps: dict[int, float] = {}  # the largest of all records, as a dead channel shows no step
     moving: set[int] = set()
     for record in records:
         for cart in measured(record):
@@ -71,7 +72,7 @@ def find_faults(
         )
         for cart in {cart for fit in fits.values() for cart in fit.lost}
     }
-    # However many are wrong: no bench samples some recordings a thousand times more slowly.
+    # This uses all records: no bench samples some recordings a thousand times more slowly.
     clocks = [record.sample_time for record in records]
     usual_clock = min((dt for dt in clocks if dt >= FASTEST), default=0.0)
     found: dict[str, RecordingFault] = {}
@@ -98,10 +99,10 @@ def find_faults(
 
 
 def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault]:
-    """Return the steps in which a cart moves further than the one that pulls it, by id.
+    """Return the steps in which a cart moves further than the cart that pulls it, by id.
 
-    The input acts on cart 1 and springs do the rest, so a static gain is at most that of the cart
-    before.
+    The input acts on cart 1, and springs pull the other carts. So a cart's static gain is at most
+    that of the cart before it.
     """
     found: dict[str, RecordingFault] = {}
     by_cart = {(gain.experiment, gain.cart): gain for gain in gains if gain.interval is None}
@@ -110,7 +111,7 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
         if before is None:
             continue
         least = abs(gain.gain) - SIGMAS * gain.gain_std
-        # By more than friction may hold the carts off.
+        # The difference must exceed the amount by which friction may hold the carts off.
         if least > 1.3 * (abs(before.gain) + SIGMAS * before.gain_std):
             said = {"times": f"{abs(gain.gain / before.gain):.3g}", "before": str(cart - 1)}
             found[run] = RecordingFault(code="too_far", run=run, cart=cart, said=said)
@@ -121,12 +122,12 @@ def find_impossible_gains(gains: Sequence[StepGain]) -> dict[str, RecordingFault
 
 
 def _edges(y: np.ndarray) -> np.ndarray:
-    """Return the starts of stretches of constant reading, and the end of the last."""
+    """Return the starts of stretches of constant reading, and the end of the last one."""
     return np.concatenate([[0], np.flatnonzero(np.diff(y)) + 1, [y.size]])
 
 
 def _still(record: Record, cart: int) -> Iterator[slice]:
-    """Yield stretches of constant reading over which the input changes far."""
+    """Yield stretches of constant reading during which the input changes far."""
     u, y = record.u, record.position(cart)
     if u is None:
         return
@@ -147,10 +148,10 @@ def _dead_channels(
     steps: Mapping[int, float],
     moving: Set[int],
 ) -> Iterator[RecordingFault]:
-    """Yield each free cart's reading that is constant although the cart must have moved.
+    """Yield a fault for each free cart with a constant reading although the cart must have moved.
 
-    By cart, `friction` is the most that the records allow, `steps` has the encoder step; `moving`
-    are the carts that any input ever moved.
+    For each cart, `friction` is the largest that the records allow, and `steps` the encoder step.
+    `moving` are the carts that any input ever moved.
     """
     for cart in measured(record):
         y = record.position(cart)
@@ -163,7 +164,7 @@ def _dead_channels(
             continue
         force = force_on(record, chain, cart=cart)
         for still in _still(record, cart):
-            # Friction that holds a cart on one side holds it equally on the other.
+            # Friction holds a cart equally in both directions.
             if force is None or 2 * friction.get(cart, np.inf) >= np.ptp(force[still]):
                 continue
             if not _must_move(record, chain, still, cart=cart, step=steps[cart]):
@@ -180,10 +181,11 @@ def _frozen(
     friction: Mapping[int, float],
     steps: Mapping[int, float],
 ) -> Iterator[RecordingFault]:
-    """Yield each reading that stays constant for a while in which the carts moved it far.
+    """Yield a fault for each reading that is constant for a while although the carts moved it far.
 
-    For ten samples or more, by a fifth of its motion. Before and after it follows them, and the
-    force on it meanwhile exceeds any friction.
+    The stretch has ten samples or more, and the cart moves by at least a fifth of its motion.
+    Before and after it the reading follows the carts. Meanwhile the force on the cart exceeds any
+    friction.
     """
     for cart, missed in fit.missed.items():
         y = record.position(cart)
@@ -197,13 +199,15 @@ def _frozen(
             rest, force = np.delete(missed, part), force_on(record, chain, cart=cart)
             if not rest.size or force is None:
                 continue
-            # A cart at rest stays there for a moment after the input steps.
+            # A cart at rest stays there for a moment after the input steps, so only the first half
+            # counts.
             early = force[part][: (part.stop - part.start) // 2]
             if 2 * friction.get(cart, np.inf) >= np.ptp(early):
                 continue
             elsewhere = float(np.mean(rest**2))
             follows = elsewhere < FOLLOWED * float(np.var(np.delete(y, part)))
-            # It does follow them, with an error of at most a quarter of that motion.
+            # The reading follows the carts if its error elsewhere is below a quarter of that
+            # motion.
             if follows and np.sqrt(elsewhere) < 0.25 * moved:
                 said = _span(record, part)
                 yield RecordingFault(code="froze_in_motion", run=record.id, cart=cart, said=said)
@@ -215,19 +219,19 @@ def _span(record: Record, part: slice) -> dict[str, str]:
 
 
 def _must_move(record: Record, chain: Chain, still: slice, *, cart: int, step: float) -> bool:
-    """Whether the input moves a cart far within some samples, from rest and in steady state."""
+    """Whether the input moves a cart far during these samples, from rest and in steady state."""
     assert record.u is not None
     free = tuple(sorted(record.free))
     y = simulate_linear(chain, record.t, record.u, free=free, hold=record.hold)[free.index(cart)]
     far = float(np.ptp(y[still]))
-    if record.kind == "sine" and record.omega is not None:  # it may start in motion
+    if record.kind == "sine" and record.omega is not None:  # a dwell may start in motion
         G = chain.frequency_response(np.array([record.omega]))[cart - 1, 0]
         far = min(far, float(abs(G) * np.ptp(record.u)))
     return far >= max(_SEEN_COUNTS * step, 0.3 * float(np.ptp(y)))
 
 
 def _copies(records: Sequence[Record]) -> dict[str, RecordingFault]:
-    """Return the records with exactly the samples of an earlier one of their kind."""
+    """Return the records with exactly the samples of an earlier record of their kind."""
     first: dict[tuple[object, ...], str] = {}
     copies = {}
     for record in records:
@@ -248,9 +252,12 @@ def _short_dwell(record: Record) -> Iterator[RecordingFault]:
 
 
 def _wrong_clock(record: Record, *, usual: float) -> Iterator[RecordingFault]:
-    """Yield the unit of a time column that makes this record's sampling the usual one."""
+    """Yield a fault if the time column of a record is in another unit than usual.
+
+    In that unit, the record's sampling would be the usual one.
+    """
     for factor, words in TIME_FACTORS.items():
-        # A hundred times as slow is another unit of time; twice may be another setting.
+        # A factor of 100 or more is another unit of time; a factor of 2 may be another setting.
         is_unit = max(factor, 1 / factor) >= 100.0
         if is_unit and abs(record.sample_time - factor * usual) < SAME * factor * usual:
             said = {"apart": f"{record.sample_time:.3g}", "usual": f"{usual:.3g}", "look": words}
@@ -269,19 +276,19 @@ def _misread(record: Record, misread: Misread, everywhere: bool) -> RecordingFau
 def _strays(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> Iterator[RecordingFault]:
-    """Yield the records that follow no carts like those of most records, and by how far.
+    """Yield the records that do not follow carts similar to those of most records.
 
-    One cart that follows is enough: another may be near its null, and hardly move. A cart that
-    moves less than it should proves nothing: friction may hold it.
+    It is enough if one cart follows: another may be near its null and hardly move. A cart that
+    moves less than it should proves nothing, because friction may hold it.
     """
     if chain is None or not most_follow(fits):
         return
     for record in records:
         fit = fits.get(record.id)
-        # Friction makes no cart move further, so a cart that moves less is not judged.
+        # Friction makes no cart move further, so a record whose carts all move less is not judged.
         if fit is None or fit.belongs or max(fit.reach.values()) < 0.8:
             continue
-        # More than half of the power of every cart.
+        # More than half of the power of every cart must be unexplained.
         if all(min(near_by.lost.values()) > 0.5 for near_by in near(record, chain)):
             said = {"percent": f"{100 * min(fit.share, 1.0):.0f}"}
             yield RecordingFault(code="stray", run=record.id, said=said, is_wrong=False)

@@ -1,4 +1,4 @@
-"""Every recording with a fault: left out, clipped, or not as stated."""
+"""List every recording with a fault: left out, clipped, or not as stated."""
 
 from collections.abc import Iterator
 
@@ -11,7 +11,7 @@ from pipeline.soundness.fault import RecordingFault, say, sound_ones
 from pipeline.soundness.late_channels import late_experiments
 from pipeline.soundness.stated import find_other_scales, find_wrong_setups, why_other_frequency
 
-# Relative: a stated frequency further from that of the input belongs to another run.
+# Relative. A stated frequency further from that of the input belongs to another run.
 _OTHER_RUN = 0.08
 
 
@@ -28,7 +28,7 @@ def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
         )
     }
     late = late_experiments(analysis.late_channels)
-    # A cart that sticks rests where it turns, which looks like a clipped reading.
+    # A cart that sticks rests at its turning points, which looks like a clipped reading.
     sticky = analysis.fit is not None and not analysis.fit.explains_data
     for record in analysis.records:
         if record.id in setups:
@@ -42,7 +42,7 @@ def find_bad_recordings(analysis: Analysis) -> dict[str, str]:
 
 
 def _channels_at_fault(record: Record, *, sticky: bool) -> Iterator[RecordingFault]:
-    """Yield clipped channels, and inputs with another frequency than stated."""
+    """Yield a fault for each clipped channel, and for an input with a wrong frequency."""
     for cart in record.carts:
         if cart not in record.free or sticky or record.kind not in ("sine", "sweep"):
             continue

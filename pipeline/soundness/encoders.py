@@ -1,4 +1,4 @@
-"""Faults that encoders alone show: another unit of length, or a stuck encoder."""
+"""Find faults that the encoder alone shows: another unit of length, or a stuck encoder."""
 
 from collections.abc import Sequence
 
@@ -14,12 +14,12 @@ from pipeline.soundness.fault import SAME, WITNESSES, RecordingFault
 def find_other_units(
     records: Sequence[Record], *, decays: bool = False
 ) -> dict[str, RecordingFault]:
-    """Find the records whose encoder step is that of the others in another unit, by id.
+    """Find the records whose encoder step is the usual one in another unit, by id.
 
-    A class of a dozen dwells may have been exported together, and so may all be wrong: the usual
-    step is that of most kinds of experiment, not of most records. A step of 0.01 beside one of
-    0.001 only shows the number of decimals. A decay defines no length, so any unit is good: those
-    are searched alone, with `decays`.
+    The usual step is that of most kinds of experiment, not of most records. A dozen dwells may have
+    been exported together, and so may all be wrong. Steps of 0.01 and 0.001 only differ in the
+    number of decimals. For a decay any unit of length is good; decays are searched separately, with
+    `decays`.
     """
     found: dict[str, RecordingFault] = {}
     for cart in sorted({cart for record in records for cart in record.carts}):
@@ -49,15 +49,15 @@ def _alike(step: float, other: float) -> bool:
 
 
 def _is_decimal(step: float) -> bool:
-    """Whether a step is 1 in some decimal place, as numbers are written."""
+    """Whether a step is a power of ten, so that it may come from the number of decimals."""
     return step > 0 and _alike(step, 10.0 ** round(np.log10(step)))
 
 
 def find_stuck(records: Sequence[Record]) -> dict[str, RecordingFault]:
-    """Return the records in which a free cart's encoder stuck, by id.
+    """Return the records in which the encoder of a free cart was stuck, by id.
 
-    Static friction stops a cart from a crawl, far below the fastest 2 % of its moves between
-    samples. It does not stop a fast cart, nor is the cart elsewhere when it moves on.
+    Static friction stops only a slow cart, far below the fastest 2 % of its moves between samples.
+    It does not stop a fast cart. And a cart that moves on starts from where it stopped.
     """
     found: dict[str, RecordingFault] = {}
     for record in records:

@@ -1,7 +1,7 @@
 """A fault of a recording, with its sentence from `templates/words/soundness.toml`.
 
-`tests/statistics/test_honest_records.py` shows that honest records are not accused, even with
-sticking carts and coarse encoders; `tests/grading/mistakes/test_faults.py` shows that wrong ones
+`tests/statistics/test_honest_records.py` shows that good records are not accused, even with
+sticking carts and coarse encoders. `tests/grading/mistakes/test_faults.py` shows that wrong records
 are found.
 """
 
@@ -13,11 +13,11 @@ from pipeline.words.phrases import phrases
 
 _WORDS = phrases("soundness")
 
-# The unit of evidence: one record, or one kind of record, may be wrong by chance.
+# Independent records, or kinds of record, that must agree. A single one may be wrong by chance.
 WITNESSES = 2
-SIGMAS = 4.0  # standard errors: by chance one number in 16,000 is as far off
-SAME = 0.02  # relative: of an encoder step, a clock or a length that a program sets for all
-SAME_SIZE = 0.2  # relative: two steps that friction affects equally
+SIGMAS = 4.0  # standard errors. By chance one number in 16,000 is as far off
+SAME = 0.02  # relative. For an encoder step, a clock or a length that a program sets for all
+SAME_SIZE = 0.2  # relative. Friction affects two such steps equally
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,11 +26,12 @@ class RecordingFault:
 
     Attributes
     ----------
-    code : its kind; the key of its sentence.
-    run, cart : its place; no cart if it concerns none.
-    said : values in the sentence, as text.
-    value, limit : the number that shows it, and its largest allowed value, if there is one.
-    is_wrong : the recording does not hold what happened; else it only differs from others.
+    code : its kind, the key of its sentence.
+    run, cart : where it is. Without a cart it concerns the whole recording.
+    said : values for the sentence, as text.
+    value, limit : the number that shows the fault, and its largest allowed value. None without one.
+    is_wrong : whether the recording does not hold what happened. Otherwise it only differs from
+        others.
     """
 
     code: str
@@ -48,11 +49,11 @@ class RecordingFault:
 
     @property
     def left_out(self) -> LeftOut:
-        """The recording as an entry of the unused ones."""
+        """The entry in the list of recordings that were not used."""
         return LeftOut(experiment=self.run, reason=self.reason, is_wrong=self.is_wrong)
 
     def check(self, kind: CheckKind) -> Check:
-        """Return the failed check of a kind that finds it."""
+        """Return the failed check that reports this fault."""
         return Check(
             kind=kind,
             run=self.run,
@@ -65,11 +66,11 @@ class RecordingFault:
 
 
 def say(key: str, **values: str) -> str:
-    """Return a part of such a sentence, or one that contains others."""
+    """Return part of a fault's sentence, or a sentence that contains others."""
     return _WORDS.text(key, **values)
 
 
 def sound_ones(records: Sequence[Record], left_out: Sequence[LeftOut]) -> list[Record]:
-    """Return the records without a serious fault; they may differ from others."""
+    """Return the records that hold what happened, even if they differ from others."""
     wrong = {one.experiment for one in left_out if one.is_wrong}
     return [record for record in records if record.id not in wrong]

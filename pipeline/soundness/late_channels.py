@@ -1,4 +1,4 @@
-"""Channels compared with each other: is one of them logged late?"""
+"""Compare channels with each other to find one that is logged late."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,25 +8,26 @@ from pipeline.estimation.chain.channel_delay import ChannelDelay, find_channel_d
 from pipeline.results import LateChannel, Record
 from pipeline.soundness.fault import RecordingFault
 
-_LATE, _SURE = 2.0, 4.0  # samples, and standard errors, by which a late channel must be late
-# With its delay the residual of the carts' own law must fall by this factor. Friction, stops and
-# stiff springs on benches of every kind look like delays that lower it by 1.7 times at most. 44 ms
-# lower it by 8 times on a bench with much friction, and by thousands on one without.
+_LATE, _SURE = 2.0, 4.0  # samples, and standard errors: a late channel exceeds both
+# Correcting the delay must lower the residual of the carts' own law by this factor. Friction, stops
+# and stiff springs on benches of every kind look like delays, but lower it by 1.7 times at most.
+# Correcting 44 ms lowers it by 8 times with much friction. Without friction it is thousands of
+# times.
 _BETTER = 5.0
 
 
 def find_late_channels(records: Sequence[Record], *, carts: int) -> tuple[LateChannel, ...]:
-    """Find the carts whose channel is read later, or earlier, than that of the first one.
+    """Find the carts whose channel is read later, or earlier, than that of the first cart.
 
-    Each kind of experiment is tested alone, as one may have been logged differently. A delay of the
-    input moves all channels equally and is not found here.
+    Each kind of experiment is tested separately, since one kind may have been logged differently. A
+    delay of the input moves all channels equally and is not found here.
     """
     late: list[LateChannel] = []
     for kind in ("sine", "step", "sweep", "decay", "closed_loop"):
         alike = [record for record in records if record.kind == kind]
         if alike:
             late += _late_in(alike, kind=kind, carts=carts)
-    # Compared with a late channel a right one is early.
+    # A right channel looks early in comparison with a late one, so drop these.
     named = {one.cart for one in late if one.than == 1}
     return tuple(one for one in late if one.than not in named)
 
@@ -37,14 +38,15 @@ def _late_in(records: Sequence[Record], *, kind: str, carts: int) -> list[LateCh
     first, delay, limit = 1, 0.0, 0.0
     found: list[LateChannel] = []
     for cart in range(2, carts + 1):
-        if cart not in links:  # later channels are compared with this one
+        if cart not in links:  # further channels are compared with this one
             first, delay, limit = cart, 0.0, 0.0
             continue
         link = links[cart]
         if _shows(link, sample=sample):
             delay, limit = delay + link.delay, max(limit, _limit(link, sample=sample))
         elif abs(link.delay) + _SURE * link.std > _LATE * sample:
-            # It shows neither a delay nor its absence.
+            # This channel shows neither a delay nor its absence, so the comparison starts again
+            # here.
             first, delay, limit = cart, 0.0, 0.0
         if abs(delay) > max(limit, _LATE * sample):
             found.append(

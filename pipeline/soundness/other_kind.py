@@ -1,4 +1,4 @@
-"""Recordings of another experiment: another kind of input, a truncated file or a copy."""
+"""Find recordings of another experiment: another kind of input, a truncated file or a copy."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -47,10 +47,10 @@ def _is_sine(t: Array, u: Array) -> bool:
 
 
 def _cut(record: Record, records: Sequence[Record]) -> Iterator[RecordingFault]:
-    """Yield files that look truncated: the repeats all have one duration, over twice as long.
+    """Yield files that look truncated: all repeats have the same duration, over twice as long.
 
-    A person who stops by hand stops at any time. A repeat whose clock is in another unit lasts long
-    with no more samples.
+    If a person stops recordings by hand, the durations differ. If the clock is in another unit, the
+    repeat is longer without having more samples.
     """
     if record.kind not in ("decay", "step"):
         return

@@ -1,8 +1,7 @@
-"""Records that follow the carts only if they are read differently, and who made the mistake.
+"""Find records that follow the carts only after a correction, and decide who made the mistake.
 
-A unit, or a clock, applies to everything that one program logged. A single record that moves a
-tenth as far is odd and no more: an amplifier at its limit, a dead zone or friction has that effect
-too.
+A wrong unit or clock applies to everything that one program logged. A single record that moves a
+tenth as far is only odd: an amplifier at its limit, a dead zone or friction can cause that too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,12 +17,12 @@ from pipeline.soundness.fault import SAME, SAME_SIZE, WITNESSES, RecordingFault
 
 @dataclass(frozen=True, kw_only=True)
 class OtherReadings:
-    """The records that follow only if read differently, by id.
+    """The records that follow only after a correction, by id.
 
     Attributes
     ----------
-    mistaken : as they are, they do not hold what happened.
-    odd : … or the bench did something that no chain does.
+    mistaken : records that do not hold what happened.
+    odd : records in which the bench may have done something that no chain does.
     """
 
     mistaken: dict[str, Misread] = field(default_factory=dict)
@@ -33,9 +32,9 @@ class OtherReadings:
 def find_other_readings(
     records: Sequence[Record], *, chain: Chain | None, fits: Mapping[str, Followed]
 ) -> OtherReadings:
-    """Find the records that follow the chain only if they are read differently.
+    """Find the records that follow the chain only after a correction.
 
-    If this holds for most of a kind, it holds for those of the kind that show it less clearly.
+    If most records of a kind need it, those of the kind that show it less clearly count too.
     """
     if chain is None:
         return OtherReadings()
@@ -51,7 +50,7 @@ def find_other_readings(
             }
         found |= sure
     legal = {name for name, misread in found.items() if misread.legal}
-    if 2 * len(legal) > len(fits):  # then the bench counts that way
+    if 2 * len(legal) > len(fits):  # then the bench itself has this sign
         found = {name: misread for name, misread in found.items() if name not in legal}
     agreeing = sum(fit.belongs for name, fit in fits.items() if name not in found) + len(found)
     if agreeing < WITNESSES:
@@ -66,11 +65,12 @@ def find_other_readings(
 def without_lone_factors(
     found: Mapping[str, Misread], records: Sequence[Record], *, fits: Mapping[str, Followed]
 ) -> dict[str, Misread]:
-    """Return the readings without factors that not every record of their kind shares.
+    """Return the corrections, without factors that not every record of their kind needs.
 
     Parameters
     ----------
-    records : all that are compared with the chain; `fits` is how each follows it unchanged.
+    records : all records that are compared with the chain.
+    fits : how each record follows the chain without correction.
     """
     kept = {name: m for name, m in found.items() if m.scale is None and m.clock is None}
     for alike in _by_kind(records):
@@ -102,10 +102,10 @@ def _by_kind(records: Sequence[Record]) -> list[list[Record]]:
 def _may_be_a_limit(
     sharing: Sequence[Record], records: Sequence[Record], fits: Mapping[str, Followed]
 ) -> bool:
-    """Whether no input so large moves the carts as far as it should, and all are of one size.
+    """Whether these records may be due to an amplifier at its limit.
 
-    Then an amplifier at its limit gives one factor for all. For inputs of several sizes it gives
-    several.
+    Their inputs must have one size, because a limit gives the same factor only then. And no record
+    with such a large input may follow the chain.
     """
     sizes = [_size(record) for record in sharing]
     follows = [_size(r) for r in records if r not in sharing and fits[r.id].belongs]

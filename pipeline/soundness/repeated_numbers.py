@@ -1,8 +1,8 @@
-"""Numbers measured more than once: whether the runs agree, which are odd, and why.
+"""Compare numbers measured more than once: whether the runs agree, which are odd, and why.
 
-If two runs give a frequency or a gain 10 % apart, beyond their errors, that is not a number with a
-wide error: one of the runs is wrong. The fit tells which, else the majority, else nobody. Runs that
-agree may share a mistake: dwells that one chain explains reveal it.
+If two runs give a frequency or a gain 10 % apart, beyond their standard errors, one of the runs is
+wrong. The fit decides which one, else the majority; otherwise it stays undecided. Runs that agree
+may share a mistake. It shows if they contradict dwells that one chain explains.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,20 +16,20 @@ from pipeline.names import gain_name, own_omega, own_zeta, read_name
 from pipeline.results import Check, Estimate, LogDecrement, StepGain
 from pipeline.soundness.fault import SAME_SIZE, SIGMAS, RecordingFault
 
-_LIKE_THE_FIT = 0.15  # relative: the usual distance of initial and final estimates (Throne 2005)
+_LIKE_THE_FIT = 0.15  # relative. Usual difference of initial and final estimates (Throne 2005)
 # Factors by which friction, play or a soft hold may change a gain or a frequency.
 _BY_THE_BENCH = {"K": 1.6, "omega": 1.3}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Repeats:
-    """Repeated measurements compared with each other.
+    """The comparison of repeated measurements.
 
     Attributes
     ----------
     checks : one for each number that was measured more than once.
     odd : the runs that differ, by id, each with its fault.
-    undecided : the numbers whose runs contradict each other without a decision.
+    undecided : the numbers whose runs contradict each other. Nothing shows which runs are right.
     """
 
     checks: tuple[Check, ...] = ()
@@ -39,9 +39,10 @@ class Repeats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Reading:
-    """One run's value, its interval, and the size of the step it was read from.
+    """The value from one run, its interval, and the size of the step that gave it.
 
-    `tolerance` : percent that runs may differ by: repeats differ by some percent with dry friction.
+    `tolerance` is the difference between runs, in percent, that is not a contradiction. With dry
+    friction, repeats differ by some percent.
     """
 
     run: str
@@ -60,15 +61,15 @@ def compare_repeats(
     fitted: Mapping[str, Estimate],
     dwells: Mapping[str, Estimate],
 ) -> Repeats:
-    """Compare the runs that give one frequency, damping or static gain.
+    """Compare the runs that give the same frequency, damping or static gain.
 
     Parameters
     ----------
-    fitted : the parameters of a fit that explains most records; else none.
-    dwells : … of one from dwells alone that explains them; else none.
+    fitted : the parameters of a fit that explains most records. Empty without such a fit.
+    dwells : the parameters of a fit to dwells alone that explains them. Empty without such a fit.
     """
     readings = _readings(decays, steps, carts=carts)
-    # A fit's damping uses the decays if its points do not determine it.
+    # Dampings of a fit are not used, because they may come from the decays.
     told = {name: one for name, one in fitted.items() if not read_name(name).is_ratio}
     right = {name: _right_ones(all_, told.get(name)) for name, all_ in readings.items()}
     usual = {n: float(np.median([r.value for r in ones])) for n, ones in right.items() if ones}
@@ -126,7 +127,8 @@ def _readings(
             )
         )
         slack = SIGMAS * decay.zeta_std
-        # The smaller the swing, the more damping dry friction adds.
+        # With dry friction, damping grows as the swing gets smaller, so the interval covers all
+        # amplitudes.
         sticks = decay.friction is not None and decay.friction.present
         ratios = [decay.zeta, *(decay.zeta_at_amplitude[1].tolist() if sticks else ())]
         found.setdefault(own_zeta(decay.cart, n=carts), []).append(
@@ -135,13 +137,13 @@ def _readings(
                 value=decay.zeta,
                 low=min(ratios) - slack,
                 high=max(ratios) + slack,
-                # A bearing's dirt moves a damping by half.
+                # Dirt in a bearing changes a damping by half.
                 tolerance=50.0,
             )
         )
     for step in steps:
         name, slack = gain_name(step.cart, n=carts), SIGMAS * step.gain_std
-        low, high = step.interval or (step.gain, step.gain)  # if the cart sticks
+        low, high = step.interval or (step.gain, step.gain)  # the cart may stick
         found.setdefault(name, []).append(
             _Reading(
                 run=step.experiment,
@@ -155,7 +157,7 @@ def _readings(
 
 
 def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
-    """Return which readings (n, n) contradict each other."""
+    """Return which pairs of readings (n, n) contradict each other."""
     value, low, high = np.array([(r.value, r.low, r.high) for r in readings]).T
     size = np.maximum(np.abs(value[:, None]), np.abs(value))
     far = np.abs(value[:, None] - value) > readings[0].tolerance / 100 * size
@@ -163,22 +165,22 @@ def _contradictions(readings: Sequence[_Reading]) -> NDArray[np.bool_]:
 
 
 def _only_by_size(readings: Sequence[_Reading]) -> bool:
-    """Whether steps of one size agree, and those of another only among themselves: dry friction."""
+    """Whether steps of the same size agree with each other, as with dry friction."""
     size = np.array([reading.size for reading in readings])
     alike = np.abs(size[:, None] - size) <= SAME_SIZE * np.maximum(size[:, None], size)
     return not np.any(_contradictions(readings) & alike)
 
 
 def _differ_in_size(readings: Sequence[_Reading]) -> bool:
-    """Whether steps have several sizes, for which a limit or friction gives several gains."""
+    """Whether the steps have several sizes, so that a limit or friction gives several gains."""
     size = np.array([reading.size for reading in readings])
     return bool(size.min() < (1 - SAME_SIZE) * size.max())
 
 
 def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_Reading]:
-    """Return the readings that belong together.
+    """Return the readings that belong together; empty if undecided.
 
-    All, those like the fit, or most; none: undecided.
+    These are all readings if they agree, else those that agree with the fit, else the majority.
     """
     apart = _contradictions(readings)
     if not np.any(apart):
@@ -196,7 +198,7 @@ def _right_ones(readings: Sequence[_Reading], fitted: Estimate | None) -> list[_
 
 
 def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
-    """Whether a reading with its errors differs from a well-known number."""
+    """Whether a reading and its interval differ from a number that is known well."""
     if told.std is None or told.value <= 0 or SIGMAS * told.std > _LIKE_THE_FIT * told.value:
         return False
     factor = _BY_THE_BENCH[read_name(name).symbol]
@@ -204,7 +206,7 @@ def _is_far(reading: _Reading, told: Estimate, *, name: str) -> bool:
 
 
 def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str:
-    """Return which clock error would turn a decay's frequencies into the usual ones, or ""."""
+    """Return the clock error that would explain a decay's frequencies, or ""."""
     ratios = [
         usual[name] / value
         for name, value in values.items()
@@ -219,13 +221,13 @@ def _wrong_clock(values: Mapping[str, float], usual: Mapping[str, float]) -> str
 
 
 def _is_reversed(values: Mapping[str, float], usual: Mapping[str, float]) -> bool:
-    """Whether all carts went the other way: a log may rightly count its input so."""
+    """Whether all gains have the opposite sign, which a log's sign of the input may explain."""
     known = [name for name in values if read_name(name).is_gain and usual.get(name)]
     return bool(known) and all(_near(values[name], -usual[name]) for name in known)
 
 
 def _near(value: float, other: float) -> bool:
-    # The difference between two runs that a known mistake leaves.
+    # Two runs may differ by 5 % even when a known mistake is corrected.
     return abs(value - other) <= 0.05 * abs(other)
 
 
@@ -240,7 +242,7 @@ def _check(
     values = [reading.value for reading in readings]
     largest = max(map(abs, values))
     spread = 100 * (max(values) - min(values)) / largest if largest > 0 else 0.0
-    # A run that another number shows to be odd may agree in this one.
+    # A run that is odd in another number may agree in this one.
     off = [reading for reading in readings if reading.run in odd and reading not in right]
     apart = f"from {min(values):.4g} to {max(values):.4g}"
     count = f"{len(readings)} runs"

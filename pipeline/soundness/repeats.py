@@ -1,4 +1,4 @@
-"""Repeats of one experiment, and the one that differs from the others."""
+"""Compare repeats of one experiment, and find the one that differs from the others."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -9,21 +9,23 @@ from pipeline.arrays import Array
 from pipeline.results import Record
 from pipeline.soundness.fault import RecordingFault
 
-_MATERIAL = 0.05  # of the response; a smaller difference has no consequence
-# The number of spreads of the others by which a repeat must differ. If all repeats differ by chance
-# (along one shape, normally distributed) this flags 5 % of the sets, and far fewer if they differ
-# in several ways. Three repeats leave one difference to judge by, hence the caution.
+_MATERIAL = 0.05  # of the response. A smaller difference does not matter
+# A repeat is odd if it differs by this many times the spread of the others; the keys are the number
+# of repeats. If all repeats differ by chance (along one shape, normally distributed), this flags 5
+# % of the sets. It flags far fewer if they differ in several ways. With three repeats the spread
+# comes from a single difference, so the factor is large.
 _SPREADS, _SPREADS_OF_MANY = {3: 30.0, 4: 8.0}, 5.0
-_AMPLIFICATION = 2.0  # of a relative difference of the inputs by a lightly damped chain
-_START_SAMPLES = 3  # their median is the start: too few to move it, enough to outvote a spike
+_AMPLIFICATION = 2.0  # factor by which a lightly damped chain amplifies a difference of the inputs
+_START_SAMPLES = 3  # samples for the start. Their median ignores a spike
 
 
 def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, RecordingFault]:
     """Find the repeats that do not belong with the others, by id.
 
-    Repeats have the same kind, free and measured carts, and nearly the same input (the set point
-    in closed loop). Decays are left alone: a hand never releases twice from the same place. Never
-    flags one of two, nor more than a minority. `unit` is that of the positions.
+    Repeats have the same kind, free and measured carts, and nearly the same input (in closed loop
+    the same set point). Decays are not compared: a hand never releases twice from the same place.
+    One of two repeats is never flagged, nor are half of them or more. `unit` is that of the
+    positions.
     """
     outliers: dict[str, RecordingFault] = {}
     for group in _groups(records):
@@ -43,7 +45,7 @@ def find_outlier_repeats(records: Sequence[Record], *, unit: str) -> dict[str, R
 
 
 def _groups(records: Sequence[Record]) -> list[list[Record]]:
-    """Group the repeats among the records, in the order of the records."""
+    """Return the groups of repeats among the records, in the order of the records."""
     groups: list[list[Record]] = []
     for record in records:
         if record.kind == "decay" or not np.any(_excitation(record)):
@@ -72,18 +74,18 @@ def _is_repeat(first: Record, other: Record) -> bool:
         return False
     t = _common_times(first, other)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in (first, other)])
-    # An edge logged one sample early differs by 8 %, the next usual amplitude by 33 %.
+    # An edge that is one sample early gives 8 %, the next usual amplitude 33 %.
     return bool(_rms(u[0] - u[1]) <= 0.2 * _rms(u))
 
 
 def _common_times(*records: Record) -> Array:
-    """Return the times (from each record's start) of the shortest record."""
+    """Return the times of the shortest record, from its start."""
     shortest = min(records, key=lambda record: np.ptp(record.t))
     return shortest.t - shortest.t[0]
 
 
 def _at(t: Array, record: Record, signal: Array) -> Array:
-    """Return a signal of the record (…, n) at times t from its start."""
+    """Return a signal of the record (…, n) at times t from the record's start."""
     return np.stack([np.interp(t, record.t - record.t[0], row) for row in np.atleast_2d(signal)])
 
 
@@ -92,10 +94,10 @@ def _rms(signal: Array) -> float:
 
 
 def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
-    """Return the difference of the responses pair by pair, (n, n), and the allowed one.
+    """Return the differences (n, n) of the responses of each pair, and the allowed differences.
 
-    Root-mean-squares over carts and time. Positions count from the start of the record, as encoders
-    need not start at zero; the final rest is part of the response.
+    They are root-mean-squares over carts and time. Positions count from the start of the record, as
+    encoders need not start at zero. The final rest is part of the response.
     """
     t = _common_times(*group)
     u = np.concatenate([_at(t, record, _excitation(record)) for record in group])  # (n, n_t)
@@ -109,7 +111,7 @@ def _differences(group: Sequence[Record]) -> tuple[Array, Array]:
 def _farthest(
     differences: Array, left: Sequence[int], *, expected: Array
 ) -> tuple[int, float, float] | None:
-    """Return index, distance and spread of the others of the odd repeat, if any."""
+    """Return the odd repeat, if any: its index, its distance, and the spread of the others."""
     threshold = _SPREADS.get(len(left), _SPREADS_OF_MANY)
     candidates = []
     for index in left:

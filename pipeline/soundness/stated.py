@@ -1,4 +1,4 @@
-"""Recordings that contradict their description: free carts, units, frequencies."""
+"""Find recordings that contradict their description: free carts, units, frequencies."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,18 +10,18 @@ from pipeline.results import Record
 from pipeline.set_up import Bench
 from pipeline.soundness.fault import RecordingFault, say
 
-OTHER_DWELL = 0.1  # relative: a dwell this far off its stated frequency is another one
-LEAST_SHARE = 0.2  # of a held cart's swing: a cart that moves less is not the free one
-_HELD_FIRMLY = 0.05  # of the free carts' swing: the most that a firm hold yields
-_LONGEST = 3.0  # m from end to end: no bench has such a long track
-_LONGEST_WHOLE = 0.5  # … for one that is read to whole numbers alone, as counts are
-_LARGEST = 100.0  # V: no amplifier at a bench gives as much
+OTHER_DWELL = 0.1  # relative. A dwell this far from its stated frequency is another dwell
+LEAST_SHARE = 0.2  # of a held cart's swing. A cart that moves less is not the free one
+_HELD_FIRMLY = 0.05  # of the free carts' swing. A cart that is held firmly moves less
+_LONGEST = 3.0  # m. No bench has a longer track
+_LONGEST_WHOLE = 0.5  # m. The same if all readings are whole numbers, as counts are
+_LARGEST = 100.0  # V. No amplifier at a bench gives as much
 
 
 def swings(record: Record) -> tuple[float, dict[int, float]]:
-    """Return the largest swing of the free carts, and by cart that of the held ones.
+    """Return the largest swing of the free carts, and by cart the swings of the held ones.
 
-    If no free cart was measured, nothing is returned for the held ones.
+    If no free cart was measured, the held ones are left out.
     """
     swing = {cart: float(np.ptp(record.position(cart))) for cart in record.carts}
     free = [swing.pop(cart) for cart in record.carts if cart in record.free]
@@ -29,7 +29,7 @@ def swings(record: Record) -> tuple[float, dict[int, float]]:
 
 
 def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
-    """Find the records in which a cart that should be held moves, and the free ones do not."""
+    """Find the records in which a cart that should be held moves, but the free carts do not."""
     found = []
     for record in records:
         free, held = swings(record)
@@ -48,7 +48,7 @@ def find_wrong_setups(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
-    """Find carts that should be held and move much compared with the free ones."""
+    """Find carts that should be held but move much compared with the free ones."""
     found = []
     for record in records:
         free, held = swings(record)
@@ -68,10 +68,10 @@ def find_loose_holds(records: Sequence[Record]) -> list[RecordingFault]:
 
 
 def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[RecordingFault]:
-    """Find positions or inputs beyond any bench: they are in another unit.
+    """Find positions or inputs larger than on any bench: they must be in another unit.
 
-    Counts for a length, millivolts for volts: the carts from such records explain them as well as
-    the right ones, and only the gains are off.
+    Examples are counts in place of a length, and millivolts in place of volts. A fit to such
+    records looks as good as a fit to right ones; only the gains are wrong.
     """
     found = []
     unit, metres = bench.units.position, conversion(bench.units.position, "m")
@@ -84,7 +84,7 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
             RecordingFault(code="position_scale", run=run, said=said, value=travel, limit=limit)
         )
     unit, volts = bench.units.input, conversion(bench.units.input, "V")
-    # Under feedback a bench may log another signal as its input.
+    # Under feedback, a bench may log another signal as its input.
     driven = [(r, r.u) for r in records if r.u is not None and r.kind != "closed_loop"]
     largest, run = _reached((r, float(np.abs(u).max())) for r, u in driven)
     if volts and largest * volts > _LARGEST:
@@ -97,7 +97,10 @@ def find_other_scales(records: Sequence[Record], *, bench: Bench) -> list[Record
 
 
 def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
-    """Return the range of two kinds of experiments, and its place: one alone may be a slip."""
+    """Return the second largest reach of all kinds of experiment, and its record.
+
+    Two kinds must reach this far, because one may be an accident.
+    """
     by_kind: dict[str, tuple[float, str]] = {}
     for record, reach in reaches:
         by_kind[record.kind] = max(by_kind.get(record.kind, (0.0, "")), (reach, record.id))
@@ -105,7 +108,7 @@ def _reached(reaches: Iterable[tuple[Record, float]]) -> tuple[float, str]:
 
 
 def why_other_frequency(ratio: float) -> str:
-    """Return a likely reason for a dwell stated at this multiple of its frequency, or ""."""
+    """Return a likely reason why a dwell is stated at this multiple of its frequency, or ""."""
     turns = {2 * np.pi: "frequency_in_radians", 1 / (2 * np.pi): "frequency_divided"}
     for factor, key in turns.items():
         if abs(ratio / factor - 1) < OTHER_DWELL:

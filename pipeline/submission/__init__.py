@@ -1,4 +1,4 @@
-"""`submission.toml`: the measurements, the system, and the students' reported numbers."""
+"""Read `submission.toml`: the measurements, the system, and the students' reported numbers."""
 
 from pipeline.submission.load import load_submission
 from pipeline.submission.models import (

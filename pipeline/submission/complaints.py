@@ -1,4 +1,4 @@
-"""Faults of a submission, one line each, on which a student can act."""
+"""Describe faults of a submission, one line each, so that a student can fix them."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,11 +15,11 @@ from pipeline.words.numbers import first_few
 
 Location = Sequence[int | str]
 
-_LONGEST_QUOTE = 60  # characters shown of a found value
-MOST_TOLD = 20  # faults listed for a file; finding the nearest valid key takes a while
-_MOST_KNOWN = 40  # valid values listed
+_LONGEST_QUOTE = 60  # characters to show of a found value
+MOST_TOLD = 20  # faults to list for a file. Finding the nearest valid key takes a while
+_MOST_KNOWN = 40  # valid values to list
 
-# Expected values, by pydantic's name for the error.
+# Descriptions of expected values, by pydantic's name for the error.
 _EXPECTED = {
     "string_type": "text in quotes",
     "int_type": "a whole number",
@@ -59,7 +59,7 @@ def _summary(value: dict | tuple | list) -> str:
 
 
 def nearest(name: object, candidates: Sequence[str]) -> str:
-    """Return "; did you mean …?", or all valid values if they are few and no near one exists."""
+    """Return "; did you mean …?"; if nothing is near, all valid values if they are few."""
     close = get_close_matches(str(name)[:_LONGEST_QUOTE], candidates, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"
@@ -68,7 +68,7 @@ def nearest(name: object, candidates: Sequence[str]) -> str:
 
 @cache
 def list_tables(root: type[BaseModel]) -> Mapping[str, type[BaseModel]]:
-    """Return the tables of a format by their dotted path, including those that select a variant."""
+    """Return the tables of a format by dotted path, including the variants that a key selects."""
     found: dict[str, type[BaseModel]] = {}
     for name, field in root.model_fields.items():
         kinds = [kind for kind in _kinds(field.annotation) if isinstance(kind, type)]
@@ -93,7 +93,7 @@ def list_keys(model: type[BaseModel]) -> tuple[str, ...]:
 
 
 def takes_numbers(key: str, root: type[BaseModel]) -> bool:
-    """Return whether a key of a format holds numbers and no text, in any table."""
+    """Return whether a key holds numbers and never text, in any table of a format."""
     kinds = [
         kind
         for model in list_tables(root).values()
@@ -113,7 +113,10 @@ def _kinds(annotation: object) -> Iterator[object]:
 
 
 def dotted(location: Location, document: object) -> str:
-    """Return `experiments[2].kind (step-a)`: lists count from 1, experiments also have their id."""
+    """Return a place such as `experiments[2].kind (step-a)`.
+
+    Lists count from 1, and experiments also have their id.
+    """
     path, here, name = "", document, ""
     for part in location:
         if isinstance(part, int):
@@ -157,18 +160,18 @@ def explain(error: ErrorDetails, document: dict, *, root: type[BaseModel] = Subm
 
 
 def first_refusal(error: ValidationError) -> str:
-    """Return the first fault of a file written by another program, and its place."""
+    """Return the first fault of a file written by another program, with its place."""
     first = error.errors()[0]
     where = ".".join(map(str, first["loc"]))
     return f"{where}: {refusal(first)}" if where else refusal(first)
 
 
 def refusal(error: ErrorDetails) -> str:
-    """Return what was expected and what was found of one pydantic error."""
+    """Return what was expected and what was found, for one pydantic error."""
     kind, found = error["type"], quote(error["input"])
     if kind == "json_invalid":
         return "not JSON, or truncated"
-    if kind == "value_error":  # its message includes what was found
+    if kind == "value_error":  # its message says what was found
         return error["msg"].removeprefix("Value error, ").rstrip(".")
     if kind not in _EXPECTED:
         return f"{error['msg']}, found {found}"
@@ -176,7 +179,7 @@ def refusal(error: ErrorDetails) -> str:
 
 
 def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
-    """Return errors, unknown keys first, without what is only missing because it is misspelt."""
+    """Return errors, unknown keys first; drop missing keys that are only misspelt."""
     unknown = [error for error in errors if error["type"] == "extra_forbidden"]
 
     def is_misspelt(error: ErrorDetails) -> bool:
@@ -189,16 +192,16 @@ def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
 
 
 def all_told(where: str, problems: Sequence[str], *, more: int = 0) -> str:
-    """Return the faults of a file, one line each, and the number of further ones."""
+    """Return the faults of a file, one line each, and the number of further faults."""
     beyond = max(len(problems) - MOST_TOLD, 0) + more
     lines = [f"{where}: {what}" for what in problems[:MOST_TOLD]]
     return "\n".join([*lines, *([f"{where}: and {beyond} more"] if beyond else [])])
 
 
 def without_tag(location: Location, document: object) -> list[int | str]:
-    """Drop what pydantic adds for the variant that a table's own key selects.
+    """Return a location without the names that pydantic adds for variants of a table.
 
-    It is no key of the file.
+    These names are not keys of the file.
     """
     kept: list[int | str] = []
     here = document

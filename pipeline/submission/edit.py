@@ -1,4 +1,4 @@
-"""Change `submission.toml` in place, keeping all other comments, order and digits."""
+"""Change `submission.toml` in place; all other comments, the order and the digits are kept."""
 
 import hashlib
 import re
@@ -33,7 +33,7 @@ def submission_text(folder: Path) -> str:
 
     Raises
     ------
-    SubmissionError : no readable file.
+    SubmissionError : the file cannot be read.
     """
     where = f"{folder.resolve().name}/{NAME}"
     if (problem := outside(folder, NAME)) is not None:
@@ -42,18 +42,19 @@ def submission_text(folder: Path) -> str:
 
 
 def text_digest(text: str) -> str:
-    """Return a digest that identifies the state of the file."""
+    """Return a digest that identifies the content of the file."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def edit_submission(
     folder: Path, change: Callable[[tomlkit.TOMLDocument], None], *, seen: str = ""
 ) -> Submission:
-    """Change the document of a submission; only a valid result is written, whole.
+    """Change the document of a submission; write it only if the result is valid.
 
     Parameters
     ----------
-    seen : digest of the text for which the change was prepared; "": any text.
+    change : function that changes the document.
+    seen : digest of the text for which the change was prepared. Empty for any text.
 
     Raises
     ------
@@ -66,7 +67,7 @@ def edit_submission(
         if seen and seen != text_digest(text):
             raise Outdated(text)
         where = f"{folder.resolve().name}/{NAME}"
-        if len(text) > 200_000:  # tomlkit takes seconds for the worst of them
+        if len(text) > 200_000:  # tomlkit takes seconds for the worst text of this size
             raise SubmissionError(
                 f"{where}: {len(text):,} characters; cartlab edits files of up to 200,000"
             )
@@ -79,10 +80,10 @@ def edit_submission(
         except (TOMLKitError, RecursionError) as error:
             raise SubmissionError(f"{where}: cannot be edited by cartlab ({error})") from None
         except ValueError:  # an integer of thousands of digits
-            parse_submission(text, folder=folder, where=where)  # in the file as it was?
+            parse_submission(text, folder=folder, where=where)  # raises if invalid before
             raise SubmissionError(f"{where}: a number has too many digits") from None
         except (TypeError, AttributeError, LookupError):
-            parse_submission(text, folder=folder, where=where)  # no table where one was?
+            parse_submission(text, folder=folder, where=where)  # raises if a table is gone
             raise
         if len(new.encode()) > MAX_TOML_BYTES:
             raise SubmissionError(f"{where}: would exceed {MAX_TOML_BYTES:,} bytes")
@@ -94,7 +95,7 @@ def edit_submission(
 def append_experiment(
     document: tomlkit.TOMLDocument, entry: Mapping[str, Value], *, remarks: Sequence[str] = ()
 ) -> None:
-    """Add an `[[experiments]]` table after the others, remarks as comments at its end."""
+    """Add an `[[experiments]]` table after the others; remarks become comments at its end."""
     there: Any = document.get("experiments")
     inline = isinstance(there, Array)
     table: Any = tomlkit.inline_table() if inline else tomlkit.table()
@@ -117,13 +118,13 @@ def append_experiment(
 
 
 def comment_text(remark: str) -> str:
-    """Return a remark that is safe behind a #, whatever a file's name contains."""
+    """Return a remark that is safe after a #, whatever characters a file's name contains."""
     plain = "".join(c if c.isprintable() else " " for c in remark)
     return plain if len(plain) <= 90 else plain[:89] + "…"
 
 
 def toml_item(value: Value) -> Any:
-    """Return a plain value as an item of a document, tables within a line."""
+    """Return a plain value as an item of a document, with tables inline."""
     if isinstance(value, Mapping):
         table = tomlkit.inline_table()
         for key, item in value.items():

@@ -1,4 +1,4 @@
-"""Read `submission.toml` into a validated `Submission`; every fault is one line."""
+"""Read `submission.toml` into a validated `Submission`; every fault gives one line."""
 
 import errno
 import re
@@ -38,21 +38,21 @@ from pipeline.submission.toml_file import (
 )
 
 NAME = "submission.toml"
-MAX_TOML_BYTES = 1_000_000  # a full class section's worth of experiments needs a tenth of it
+MAX_TOML_BYTES = 1_000_000  # a tenth is enough for the experiments of a full class section
 MAX_NOTES_BYTES = 1_000_000
 MAX_DATA_BYTES = 100_000_000  # over half an hour at 1 kHz
-COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # an open one runs to the end
+COMMENT = re.compile(r"<!--.*?(?:-->|\Z)", re.DOTALL)  # an unclosed comment reaches to the end
 
 
 def load_submission(path: Path) -> Submission:
-    """Read and check a submission: the folder, or its `submission.toml`.
+    """Read and check a submission, given as the folder or as its `submission.toml`.
 
-    Missing `carts` of an experiment are filled in with all of them, and `file` is normalised to
-    forward slashes. Numbers under `[reported]` keep their digits as typed.
+    If an experiment has no `carts`, all carts are filled in. `file` is normalised to forward
+    slashes. Numbers under `[reported]` keep their digits as typed.
 
     Raises
     ------
-    SubmissionError : one line with file, key, what was expected, what was found.
+    SubmissionError : each line has file, key, what was expected, what was found.
     """
     path = Path(path)
     toml = path if path.is_file() or path.suffix == ".toml" else path / NAME
@@ -77,7 +77,7 @@ class InvalidSubmission(SubmissionError):
 
     Attributes
     ----------
-    problems : the first ones found, each with its place; the text has a line for each.
+    problems : the first problems found, each with its place. The text has a line for each.
     """
 
     def __init__(
@@ -96,9 +96,10 @@ def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submissio
 
     Raises
     ------
-    SubmissionError : no TOML; InvalidSubmission, with every problem, where it is.
+    SubmissionError : the text is not TOML.
+    InvalidSubmission : its content is invalid; lists every problem.
     """
-    # Decimals are kept, so no typed digit is lost.
+    # Decimals are kept, so that no typed digit is lost.
     document = parse_toml(text, where=where, error=SubmissionError, as_typed=True)
     submission = _validate(document, where=where)
     if found := list(_problems(submission, folder)):
@@ -124,11 +125,11 @@ def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submis
 
     Parameters
     ----------
-    reported : its tables; a text keeps the digits of its number, "0.10".
+    reported : the tables of `[reported]`. A text keeps the digits of its number, "0.10".
 
     Raises
     ------
-    InvalidSubmission : with every problem.
+    InvalidSubmission : lists every problem.
     """
     system = {"carts": submission.system.carts}
     document = {"version": 1, "system": system, "reported": _as_typed(reported)}
@@ -142,7 +143,7 @@ def with_reported(submission: Submission, reported: Mapping[str, Any]) -> Submis
 
 
 def _as_typed(value: object) -> object:
-    """Return numbers and their texts as decimals, arrays as lists."""
+    """Return numbers and number texts as decimals, and arrays as lists."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -186,7 +187,7 @@ def _validate(document: dict, *, where: str) -> Submission:
 
 
 def _plain(value: object, at: tuple[int | str, ...]) -> object:
-    """Return lists as tuples and decimals as floats, but under `reported` all as decimals."""
+    """Return lists as tuples; decimals become floats, except under `reported`."""
     if isinstance(value, dict):
         return {key: _plain(item, (*at, key)) for key, item in value.items()}
     if isinstance(value, list):
@@ -208,7 +209,7 @@ def _notes(folder: Path) -> str | None:
         raise SubmissionError(f"{where}: {problem}")
     typed = read_text(path, where=where, limit=MAX_NOTES_BYTES, error=SubmissionError)
     text = COMMENT.sub("", typed)
-    most = 30_000  # characters: fifteen pages
+    most = 30_000  # characters, fifteen pages
     if len(text) > most:
         shown = text[: text.rfind("\n", 0, most) + 1] or text[:most]
         length = f"{len(shown):,} of {len(text):,} characters"
@@ -220,7 +221,7 @@ def _notes(folder: Path) -> str | None:
 
 
 def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, str]]:
-    """Yield (location, problem) for problems that no single value shows."""
+    """Yield (location, problem) for problems that involve several values."""
     n, springs = submission.system.carts, submission.system.springs
     yield from _another_count(submission)
     if len(springs) != n + 1:
@@ -244,7 +245,7 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
 
 
 def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
-    """Yield the number of carts that all else is for, where at least two things agree on it."""
+    """Yield a problem if at least two other statements agree on another number of carts."""
     reported = submission.reported or Reported()
     controllers = {e.id: e.controller for e in submission.experiments}
     lengths = {
@@ -263,7 +264,7 @@ def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
 
 
 def spring_names(carts: int) -> list[str]:
-    """Return "wall-1", "1-2", …, the springs from one wall to the other."""
+    """Return "wall-1", "1-2", …: the names of the springs from one wall to the other."""
     return ["wall-1", *(f"{i}-{i + 1}" for i in range(1, carts)), f"{carts}-wall"]
 
 
@@ -339,18 +340,18 @@ def _reported_problems(submission: Submission) -> Iterator[tuple[Location, str]]
 
 
 def posix(name: str) -> str:
-    """Return a file name with forward slashes, as a student on any system may have typed it."""
+    """Return a file name with forward slashes; a student may have typed it on any system."""
     return str(PurePosixPath(name.replace("\\", "/")))
 
 
 def list_experiments(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return the tables of the experiments of a `submission.toml`, valid or not yet."""
+    """Return the `[[experiments]]` tables of a document, which need not be valid."""
     tables = document.get("experiments")
     return [t for t in tables if isinstance(t, dict)] if isinstance(tables, list) else []
 
 
 def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | int]:
-    """Return which column of a file is what by a `submission.toml`, valid or not yet."""
+    """Return the columns that a document, valid or not, states for a file, by role."""
     own = (t for t in list_experiments(document) if posix(str(t.get("file", ""))) == file)
     stated: dict[str, str | int] = {}
     for table in (document.get("system"), *own):
@@ -362,7 +363,7 @@ def stated_columns(document: Mapping[str, Any], file: str) -> dict[str, str | in
 
 
 def leaves(folder: Path, name: str) -> str | None:
-    """Return why `name` stands for no file inside `folder`, or None; it need not be there."""
+    """Return why `name` cannot be a file inside `folder`, or None; the file need not exist."""
     shown = quote(name)
     if not name.strip() or not name.isprintable():
         hidden = "it contains an invisible character: rename the file"
@@ -372,7 +373,7 @@ def leaves(folder: Path, name: str) -> str | None:
     if windows.drive or windows.root or relative.is_absolute() or ".." in windows.parts:
         return f"{shown} is outside the submission folder"
     steps = [folder / part for part in (relative, *relative.parents)[:-1]]
-    with suppress(OSError, RuntimeError):  # `outside` tells what cannot be followed
+    with suppress(OSError, RuntimeError):  # `outside` reports links that cannot be followed
         linked = any(map(_may_be_link, steps))
         if linked and not steps[0].resolve().is_relative_to(folder.resolve()):
             return f"{shown} is outside the submission folder, through a link"
@@ -380,12 +381,12 @@ def leaves(folder: Path, name: str) -> str | None:
 
 
 def _typed(name: str) -> bool:
-    """Whether its characters that do not show may be what a backslash in quotes makes."""
+    """Whether all invisible characters in a name may come from a backslash in quotes."""
     return all(c.isprintable() or unicodedata.category(c) == "Cc" for c in name)
 
 
 def _may_be_link(path: Path) -> bool:
-    """Whether there is something that may lead elsewhere: a link, on Windows a junction."""
+    """Whether a path may lead elsewhere: it is a link or, on Windows, a junction."""
     with suppress(OSError):
         info = path.lstat()
         return stat.S_ISLNK(info.st_mode) or bool(getattr(info, "st_reparse_tag", 0))
@@ -393,9 +394,9 @@ def _may_be_link(path: Path) -> bool:
 
 
 def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | None:
-    """Return why `name` is no readable regular file inside `folder`, or None where it is one.
+    """Return why `name` is not a readable regular file inside `folder`, or None if it is one.
 
-    The files `taken` are known to be others', so that they are not what was meant.
+    The files `taken` belong to other entries, so they are not suggested.
     """
     if (problem := leaves(folder, name)) is not None:
         return problem
@@ -419,9 +420,10 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
 
 
 def _near_file(folder: Path, name: str, taken: Collection[str]) -> str:
-    """Return "; did you mean …?" for a file of this name elsewhere, or a similar one in its place.
+    """Return "; did you mean …?" with a file of the same name, or one with a similar name.
 
-    A similar one elsewhere may be a table that a report wrote.
+    A file with a similar name must be in the same folder; elsewhere it may be a table written by a
+    report.
     """
     try:
         paths = sorted(p for p in islice(folder.rglob("*"), 1_000) if p.is_file())

@@ -1,6 +1,6 @@
 """The tables of `submission.toml`, as validated models.
 
-The title and the description of a key appear in the form of the desk.
+The desk's form shows the title and the description of each key.
 """
 
 from decimal import Decimal
@@ -13,18 +13,18 @@ from pipeline.set_up import Bench, Units
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-# A line on any page; pages and PDF readers fail at texts of a hundred thousand letters.
+# A line that any page can show; pages and PDF readers fail with very long texts.
 Line = Annotated[str, Field(max_length=200)]
-# Units appear in the titles of figures, which scripts read.
+# Units appear in the titles of figures, so they may not contain invisible characters.
 Unit = Annotated[str, Field(max_length=40, pattern=r"^[^\p{C}\p{Zl}\p{Zp}]*$")]
 MOST_CARTS = 4
-MOST_EXPERIMENTS = 1_000  # every stage and every comparison goes through them
-# Keeps the digits as typed: 0.10 has two.
+MOST_EXPERIMENTS = 1_000  # limits the time of stages and comparisons
+# A number with its digits as typed: 0.10 has two.
 TypedNumber = Annotated[Decimal, Field(allow_inf_nan=False)]
 
 
 class TomlTable(BaseModel):
-    """A table of a file that people type: an unknown key is an error."""
+    """A table of a file that people type, so an unknown key is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,7 +37,7 @@ class Author(TomlTable):
 
 
 class InputScale(TomlTable):
-    """The input's unit, sign and scale; `sign` None: found from the data."""
+    """The input's unit, sign and scale; with `sign` None the sign is found from the data."""
 
     unit: Unit = Field(default="V", title="Unit of the input", description="V")
     sign: Literal[1, -1] | None = Field(
@@ -54,7 +54,7 @@ class InputScale(TomlTable):
 
 
 class InputOverride(TomlTable):
-    """Where one record's input differs from the system's."""
+    """How the input of one record differs from the system's."""
 
     sign: Literal[1, -1] | None = None
     per_count: Positive | None = None
@@ -76,9 +76,9 @@ class PositionScale(TomlTable):
 
 
 class System(TomlTable):
-    """The carts and springs on the bench; springs that are not stated all exist.
+    """The carts and springs on the bench; without a statement all springs exist.
 
-    `columns` (role to heading or number) are those of every recording that has them.
+    `columns` (role to heading or number) apply to every recording that has such columns.
     """
 
     carts: int = Field(ge=1, le=MOST_CARTS, title="Carts")
@@ -96,19 +96,19 @@ class System(TomlTable):
 
     @model_validator(mode="after")
     def _all_springs(self) -> "System":
-        """Fill in `springs` where they are left out; it stays known that nobody stated them."""
+        """Fill in `springs` if they are missing, and remember that they were not stated."""
         if not self.states_springs:
             object.__setattr__(self, "springs", (True,) * (self.carts + 1))
         return self
 
     @property
     def states_springs(self) -> bool:
-        """Whether the springs were stated; else all are assumed."""
+        """Whether the springs were stated; otherwise all of them are assumed."""
         return "springs" in self.model_fields_set
 
     @property
     def bench(self) -> Bench:
-        """The stated bench."""
+        """The bench as stated."""
         units = Units(position=self.position.unit, input=self.input.unit)
         return Bench(springs=self.springs, units=units, sign=self.input.sign)
 
@@ -162,12 +162,12 @@ Controller = Annotated[StateFeedbackController | PidController, Field(discrimina
 
 
 class Experiment(TomlTable):
-    """One data file and what was done to record it."""
+    """One data file and how it was recorded."""
 
     id: str
     kind: Literal["decay", "step", "sine", "sweep", "closed_loop", "bode"] = Field(title="Kind")
     file: str
-    # Filled in with all of them on loading.
+    # On loading, a missing value becomes all carts.
     carts: tuple[int, ...] = Field(
         default=(), title="Free carts", description="1, 2; if left out, all"
     )
@@ -205,13 +205,13 @@ class ReportedStateSpace(TomlTable):
         title="A",
         description="one row per line, two for each cart, states x1, v1, x2, v2, …",
     )
-    # Flat; a column [[b1], [b2], …] is accepted.
+    # A flat list; a column [[b1], [b2], …] is accepted too.
     B: tuple[TypedNumber, ...] = Field(default=(), title="B")
 
     @field_validator("B", mode="before")
     @classmethod
     def _flat(cls, value: object) -> object:
-        """Flatten a column."""
+        """Flatten a column to a list."""
         if isinstance(value, list | tuple) and all(
             isinstance(row, list | tuple) and len(row) == 1 for row in value
         ):
@@ -246,13 +246,13 @@ class Reported(TomlTable):
 
 
 class Students(TomlTable):
-    """The results that students see: the report, or only which of their numbers are off."""
+    """The results that students see: the report, or only which of their numbers are wrong."""
 
     see: Literal["report", "check"] = "report"
 
 
 class Submission(TomlTable):
-    """A validated submission; `folder` is its place."""
+    """A validated submission; `folder` is where it is."""
 
     version: Literal[1]
     title: Line = Field(

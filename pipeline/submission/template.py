@@ -1,4 +1,4 @@
-"""A commented submission folder for a student to fill in."""
+"""Make a commented submission folder for a student to fill in."""
 
 from pathlib import Path
 
@@ -40,9 +40,9 @@ def new_submission(folder: Path, *, carts: int) -> None:
 def write_templates(folder: Path, *, carts: int) -> None:
     """Write the files of `new_submission` into a folder that may already hold recordings.
 
-    `submission.toml` and `notes.md` that exist stay as they are.
+    An existing `submission.toml` or `notes.md` stays as it is.
     """
-    import jinja2  # costs 50 ms, and only a new submission needs it
+    import jinja2  # takes 50 ms and is needed only here
 
     source = (TEMPLATES / f"{NAME}.j2").read_text(encoding="utf-8")
     environment = jinja2.Environment(

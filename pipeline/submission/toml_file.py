@@ -1,4 +1,4 @@
-"""Read files that people typed; a mistake in TOML is explained by the content of its line."""
+"""Read TOML files that people typed; explain a mistake from the content of its line."""
 
 import re
 import tomllib
@@ -17,14 +17,14 @@ from pipeline.submission.complaints import Location, dotted, quote, takes_number
 from pipeline.submission.models import Submission
 
 Value: TypeAlias = "str | bool | int | float | Sequence[Value] | Mapping[str, Value]"
-_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line that are checked, and shown
-_LARGEST = 30  # powers of ten: beyond any physical number in any unit, yet safe to multiply
+_LONGEST_LINE, _SHOWN = 300, 60  # characters of a line to check, and to show
+_LARGEST = 30  # exponent. Larger than any physical number in any unit, yet safe to multiply
 _AT = re.compile(r" \(at line (\d+), column (\d+)\)$")
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Slip:
-    """A mistake of typing that TOML refuses; see templates/toml_slips.toml."""
+    """A typing mistake in TOML; see templates/toml_slips.toml."""
 
     words: str
     parser: str = ""
@@ -34,18 +34,18 @@ class _Slip:
 
 
 def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError]) -> str:
-    """Return the text of a small UTF-8 file; a byte-order mark is dropped.
+    """Return the text of a small UTF-8 file without its byte-order mark.
 
     Parameters
     ----------
-    where : what to call the file.
-    limit : bytes.
-    error : whose mistake it is.
+    where : name of the file in messages.
+    limit : largest size in bytes.
+    error : class of error to raise for a fault of the file.
 
     Raises
     ------
-    PipelineError : of the kind `error`, where it is too large or no such text; one line.
-    OSError : this computer cannot read it now, whatever is in it.
+    PipelineError : of class `error`; the file is too large or not UTF-8. One line.
+    OSError : the computer cannot read the file now, whatever its content.
     """
     try:
         if (size := path.stat().st_size) > limit:
@@ -75,13 +75,13 @@ def _too_large(where: str, size: int, limit: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Toml:
-    """The readable part of a text, and its slips.
+    """The readable part of a TOML text, and its mistakes (slips).
 
     Attributes
     ----------
-    document : the content of the lines that can be read.
-    text : those lines, each in its place; the others are empty.
-    slips : (line, what is wrong) of the others, in their order. Line 0 means the whole text.
+    document : the content of the readable lines.
+    text : the readable lines, each in its place. The others are empty.
+    slips : (line, what is wrong) for each other line. Line 0 means the whole text.
     """
 
     document: dict[str, Any]
@@ -101,16 +101,16 @@ def parse_toml(
 
     Parameters
     ----------
-    where : what to call the file; a line's number is added.
-    error : whose mistake it is.
-    as_typed : leave numbers with a point or an exponent as the decimals that were typed, whatever
-        their size: see `check_number`. Else they are floats that can be reckoned with.
+    where : name of the file in messages. A line's number is added.
+    error : class of error to raise for a mistake.
+    as_typed : whether to keep numbers with a point or an exponent as decimals. These have any size,
+        so see `check_number`. Otherwise they become floats.
     root : the model of the format.
 
     Raises
     ------
-    PipelineError : of the kind `error`; for each slip a line with its number, or the key, and what
-        to write.
+    PipelineError : of class `error`. Each mistake has a line with its line number or key, and with
+        what to write instead.
     """
     read = read_toml(text, as_typed=as_typed, root=root)
     if read.slips:
@@ -119,7 +119,7 @@ def parse_toml(
 
 
 def at_line(where: str, line: int, what: str) -> str:
-    """Return the fault of a line of a file, or of the whole file if the line is 0."""
+    """Return a fault with its place in a file: a line, or for line 0 the whole file."""
     return f"{where} line {line}: {what}" if line else f"{where}: {what}"
 
 
@@ -129,14 +129,14 @@ def read_toml(
     as_typed: bool = False,
     root: type[BaseModel] = Submission,
 ) -> Toml:
-    """Read the valid lines of TOML that somebody typed: a slip hides nothing in other lines."""
+    """Read the valid lines of typed TOML; a mistake in one line does not hide the others."""
     for key in re.finditer(r"[\w\"'-]+(?:[ \t]*\.[ \t]*[\w\"'-]+)*", text):
-        if key.group().count(".") > 30:  # tomllib's time grows with the square of a key's depth
+        if key.group().count(".") > 30:  # tomllib takes time with the square of a key's depth
             line = text.count("\n", 0, key.start()) + 1
             return Toml(document={}, text="", slips=((line, "keys nest too deeply"),))
     typed, slips = text.split("\n"), list[tuple[int, str]]()
-    lines, emptied = list(typed), -1  # the last line of the slip before
-    for _ in range(30 if len(text) <= 50_000 else 1):  # a long one is not read again
+    lines, emptied = list(typed), -1  # last line of the mistake before
+    for _ in range(30 if len(text) <= 50_000 else 1):  # a long text is not read again
         try:
             document = tomllib.loads("\n".join(lines), parse_float=_decimal)
             if not as_typed:
@@ -148,7 +148,7 @@ def read_toml(
             line = int(at[1]) if at else len(lines)
             shown = typed[line - 1].strip()
             slip = _find_slip(shown, _AT.sub("", message))
-            # The rest of a list or text whose first line is spoilt is not a second mistake.
+            # The rest of a list or text with a bad first line is not a second mistake.
             begins = re.match(r"\s*(#|\[|[\w\"'.-]+\s*=)", typed[line - 1])
             if line != emptied + 1 or begins:
                 words = _explain_slip(slip, shown, root)
@@ -172,7 +172,7 @@ class UnusableNumber(Exception):
 
     Attributes
     ----------
-    at : its place.
+    at : the place of the number in the file.
     """
 
     def __init__(self, at: Location, why: str) -> None:
@@ -185,12 +185,12 @@ def check_number(value: float | Decimal, at: Location) -> None:
 
     Raises
     ------
-    UnusableNumber : it is one.
+    UnusableNumber : the number is refused.
     """
     number = value if isinstance(value, int) else Decimal(value)
     if isinstance(number, Decimal) and not number.is_finite():
         raise UnusableNumber(at, f"expected a finite number, found {number}")
-    # Nothing is computed before the exponent is known to be small: large ones take for ever.
+    # Check the exponent before any computation, since computing with a huge one never ends.
     sound = (
         number.bit_length() <= 100 and abs(number) < 10**_LARGEST
         if isinstance(number, int)
@@ -205,7 +205,7 @@ def check_number(value: float | Decimal, at: Location) -> None:
 
 
 def _decimal(text: str) -> Decimal:
-    """Return a number as it was typed; for an exponent that no decimal holds, an unusable one."""
+    """Return a number as typed; if its exponent is too large for a decimal, an unusable one."""
     try:
         return Decimal(text)
     except InvalidOperation:
@@ -213,7 +213,7 @@ def _decimal(text: str) -> Decimal:
 
 
 def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, str]]) -> Any:
-    """Return a document with floats for its decimals; one too large is a slip, replaced by 1."""
+    """Return a document with floats for decimals; a number too large is a slip and becomes 1."""
     if isinstance(value, dict):
         return {key: _with_floats(item, (*at, key), slips) for key, item in value.items()}
     if isinstance(value, list):
@@ -229,25 +229,25 @@ def _with_floats(value: Any, at: tuple[int | str, ...], slips: list[tuple[int, s
 
 
 def _long_number(text: str) -> int:
-    """Return the line of the first whole number that is too long to be read, 0 without one."""
-    found = re.search(r"(?<![\w.])[-+]?\d[\d_]{4299,}", text)  # Python reads 4,300 at most
+    """Return the line of the first whole number that is too long to read; 0 without one."""
+    found = re.search(r"(?<![\w.])[-+]?\d[\d_]{4299,}", text)  # Python reads at most 4,300 digits
     return text.count("\n", 0, found.start()) + 1 if found else 0
 
 
 def _find_spoilt(lines: Sequence[str], line: int, slip: _Slip) -> tuple[int, int]:
-    """Return the first and last line spoilt by a slip found at `line`."""
+    """Return the first and last line that a slip at `line` makes unreadable."""
     if slip.code == "unclosed_list":
         for n in range(line - 1, 0, -1):
             if lines[n - 1].count("[") > lines[n - 1].count("]"):
                 return n, line - 1
-    if lines[line - 1].lstrip().startswith("["):  # its keys would go to the table before
+    if lines[line - 1].lstrip().startswith("["):  # else the table before would get its keys
         after = (n for n in range(line, len(lines)) if lines[n].lstrip().startswith("["))
         return line, next(after, len(lines))
     return line, line
 
 
 def _find_slip(line: str, message: str) -> _Slip:
-    """Return the fault of a line, from its form, else from the parser's message."""
+    """Return the mistake in a line, found from its form or from the parser's message."""
     for slip in _slips():
         if slip.parser and re.fullmatch(slip.parser, message):
             return slip

@@ -7,11 +7,11 @@ from pipeline.submission.toml_file import Value
 
 
 class TypedNumber(str):
-    """A number as a person typed it: its digits are kept in the file."""
+    """A number as a person typed it; the file keeps its digits."""
 
 
 def toml_section(heading: str, entries: Mapping[str, Value]) -> str:
-    """Return one table of a TOML file; no heading: the keys at its top."""
+    """Return one table as TOML; without a heading, keys for the top of the file."""
     lines = [f"{key} = {_toml(value)}" for key, value in entries.items()]
     return "\n".join([heading, *lines] if heading else lines) + "\n"
 
@@ -20,7 +20,7 @@ def _toml(value: Value) -> str:
     if isinstance(value, TypedNumber):
         return value
     if isinstance(value, str | bool):
-        return json.dumps(value, ensure_ascii=False)  # TOML's basic strings are JSON's
+        return json.dumps(value, ensure_ascii=False)  # valid in TOML as well
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + " }"
     if isinstance(value, Sequence):

@@ -33,8 +33,7 @@ class ChannelDelay:
     Attributes
     ----------
     delay, std : delay in s and its standard error by jackknife over records. The delay is positive
-        if
-        the channel is read later.
+        if the channel is read later.
     better : factor by which this delay lowers the residual of the carts' law. Friction, play and
         stops look like a small delay, but no delay removes their residual.
     experiments : the records used.

@@ -32,8 +32,7 @@ class Modes:
     ----------
     poles : (n_m,) rad/s.
     shapes : (f, n_m) the positions in each mode. Doubled for a conjugate pair, so that a position
-        is
-        Re(shapes @ z).
+        is Re(shapes @ z).
     entry : (n_m, 2f) with z(0) = entry @ x(0). The state is (x1, v1, x2, v2, …).
     drive : (n_m,) with z' = poles z + drive u.
     d_poles (n_p, n_m), d_shapes (n_p, f, n_m), d_entry (n_p, n_m, 2f), d_drive (n_p, n_m) :

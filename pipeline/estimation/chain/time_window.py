@@ -26,8 +26,7 @@ class FitWindow:
     t : (n,) s, from 0.
     y : (p, n) positions of the free measured carts.
     drive_t, drive_u : (n_d,) the held input, on a grid `stride` times finer than t. Without an
-        input on
-        a free cart, drive_u is None.
+        input on a free cart, drive_u is None.
     carts, free : as in `Record`. The held carts are removed.
     stated_sigma : (p,) standard error of a position, from encoder step and local noise.
     sigma : (p,) standard error for the weights. At least the stated one.

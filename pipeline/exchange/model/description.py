@@ -77,8 +77,7 @@ class Force:
     Attributes
     ----------
     side, depth, rate : expressions of a contact. It acts while `depth` has the sign of `side`.
-        `rate` is
-        the velocity of `depth`.
+        `rate` is the velocity of `depth`.
     pulls : whether a contact may pull too.
     """
 

@@ -31,8 +31,7 @@ def explore_bench(
     Parameters
     ----------
     observers, buttons : see `acquire`. "skip" vetoes the chosen recording, before or during it;
-        "stop"
-        ends the exploration, even during a computation.
+        "stop" ends the exploration, even during a computation.
     goal, seconds, vetoes : see `Exploration`.
 
     Raises

@@ -73,16 +73,13 @@ class Exploration:
     ----------
     folder : the submission's folder.
     record : makes recordings of the plan, given by their ids. The first call also makes submission
-        and
-        plan if they are missing.
+        and plan if they are missing.
     goal : the errors to reach.
     seconds : time at the bench, with rests. No recording begins that would exceed it. An
-        interrupted
-        recording counts each time.
+        interrupted recording counts each time.
     tell : called with a sentence in each turn.
     progress : called often with a few words during computations. An exception that it raises ends
-        the
-        exploration.
+        the exploration.
     vetoes : returns whether a person refuses the chosen recording. If so, another one is chosen.
     turns : the knowledge after each turn.
     made : recordings since the last turn.
@@ -117,8 +114,7 @@ class Exploration:
         ------
         DataError : the first recordings do not identify the carts.
         ConfigError : these carts do not have the goal's parameter, or the first sweep alone takes
-            too
-            long.
+            too long.
         """
         self._begin()
         self._look()

@@ -35,8 +35,7 @@ class GapRun:
     knots, command : the input, held from knot to knot.
     at_rest : whether the carts are at rest at the first sample.
     start_known : whether the first readings determine the start. Otherwise it is fitted, since
-        springs
-        make the carts forget it.
+        springs make the carts forget it.
     start, slope : (n,) first reading and velocity of each cart.
     rest : (n,) rest positions. These are readings.
     zero, zero_std : (n,) expected encoder zero, and its uncertainty. See `with_zeros`.

@@ -49,8 +49,7 @@ class FollowedRun(NamedTuple):
     guided : (samples, n) motion of held carts.
     knots, command : the input, held from knot to knot.
     held : (3, 2, knots) the input after dead zone and limit, and its derivatives by both. Each
-        comes
-        with its integral.
+        comes with its integral.
     zero, factor : (n,) this run's encoder zeros and factors on dry friction.
     gain : share of the error that corrects the state.
     longest : longest step, s.

@@ -69,7 +69,7 @@ class Track:
         )
 
     def prior(self, own: Own, dry: np.ndarray) -> tuple[Array, Array]:
-        """Return (4 n,) weights of the priors on its own parameters, and their residuals."""
+        """Return weights (4 n,) of the priors on the run's own parameters, and residuals."""
         n = self.free.size
         # At a release the first readings may be off by a third of the swing.
         start = np.full(n, _SURE if self.at_rest else 1.0 / max(0.3 * self.swing, 1e-12))

@@ -1,1 +1,1 @@
-"""The forms a data file may have, each read to a table of named columns."""
+"""The formats of data files, each read to a table of named columns."""

@@ -1,10 +1,10 @@
-"""What LabVIEW's two forms of files share: units in words, and a time that is only an interval."""
+"""The common parts of LabVIEW's two formats: units in words, and time as an interval."""
 
 import numpy as np
 
 from pipeline.arrays import Array
 
-# As LabVIEW spells them; what is not here stays as it is.
+# Units as LabVIEW spells them; others stay as they are.
 _UNITS = {
     "volts": "V", "volt": "V", "amps": "A", "amperes": "A", "newtons": "N", "seconds": "s",
     "meters": "m", "metres": "m", "centimeters": "cm", "millimeters": "mm", "inches": "in",
@@ -14,7 +14,7 @@ _LONGEST_UNIT = 12  # characters
 
 
 def with_unit(name: str, unit: str) -> str:
-    """Return a heading with its unit, "x1 [cm]"; unchanged if it has one already."""
+    """Return a heading with its unit, "x1 [cm]"; unchanged if it already has one."""
     unit = unit.strip()
     if not unit or len(unit) > _LONGEST_UNIT or name.rstrip().endswith(("]", ")")):
         return name
@@ -22,5 +22,5 @@ def with_unit(name: str, unit: str) -> str:
 
 
 def even_times(n: int, *, start: float, interval: float) -> Array:
-    """Return n times (s) from the first one and their interval."""
+    """Return n times in s, from the first time and the interval."""
     return start + interval * np.arange(n, dtype=np.float64)

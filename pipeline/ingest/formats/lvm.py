@@ -1,4 +1,4 @@
-"""LabVIEW's measurement file (.lvm): a header, then segments, each of a header and rows of text.
+"""Read LabVIEW's measurement file (.lvm): a header, then segments with their own header and rows.
 
 Layout: "Specification for the LabVIEW Measurement File (.lvm)", National Instruments.
 """
@@ -29,13 +29,13 @@ _MOST_SEGMENTS = 10_000
 
 
 def is_lvm(raw: bytes) -> bool:
-    """Tell LabVIEW's measurement file by its first line."""
+    """Return whether a file is a LabVIEW measurement file, from its first line."""
     return _START.match(raw) is not None
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Segment:
-    """A header by its tags, the names of the columns and their line, rows and theirs."""
+    """The tags of a header, the column names and their line, and the rows with their lines."""
 
     header: dict[str, list[str]]
     names: list[str]
@@ -46,7 +46,7 @@ class _Segment:
 
 @dataclass(frozen=True, kw_only=True)
 class _Dialect:
-    """How a file is written: `x_columns` is "one", "multi" (one a channel) or "no"."""
+    """How a file is written; `x_columns` is "one", "multi" (one per channel) or "no"."""
 
     source: str
     separator: str
@@ -54,16 +54,16 @@ class _Dialect:
     x_columns: str
 
     def fields(self, line: str) -> list[str]:
-        """Return what stands between the separators; white space around it means nothing."""
+        """Return the text between the separators, without white space around it."""
         return [part.strip() for part in line.split(self.separator)]
 
 
 def read_lvm(raw: bytes, *, source: str) -> FileTable:
-    """Read the channels of a measurement; segments that go on in time are joined.
+    """Read the channels of a measurement; segments that continue in time are joined.
 
     Raises
     ------
-    SubmissionError : broken, or two measurements in one file; names the line.
+    SubmissionError : the file is broken, or holds two measurements; the message names the line.
     """
     text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
     lines = text.split("\n")
@@ -83,7 +83,7 @@ def read_lvm(raw: bytes, *, source: str) -> FileTable:
 
 
 def _header(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[dict[str, list[str]], int]:
-    """Return the tags of a header with their values, and the line (from 0) behind it."""
+    """Return the tags of a header with their values, and the line (from 0) after it."""
     tags: dict[str, list[str]] = {}
     for i in range(at, len(lines)):
         tag, *values = dialect.fields(lines[i])
@@ -99,7 +99,7 @@ def _header(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[dict[str,
 
 
 def _segments(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[list[_Segment], bool]:
-    """Return the segments with rows, and whether there is a special block beside them."""
+    """Return the segments with rows, and whether the file has a special block."""
     segments: list[_Segment] = []
     special = False
     while at < len(lines):
@@ -116,7 +116,7 @@ def _segments(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[list[_S
         elif not lines[at].strip():
             at += 1
         elif segments and (_is_row(lines[at], dialect) or segments[-1].lines[-1:] == [at]):
-            # A line directly below a row is a row: before a header there is an empty line.
+            # A line directly after a row is a row, because an empty line comes before every header.
             segments[-1].rows.append(lines[at])
             segments[-1].lines.append(at + 1)
             at += 1
@@ -136,19 +136,19 @@ def _segments(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[list[_S
 
 
 def _is_row(line: str, dialect: _Dialect) -> bool:
-    """Tell a row of numbers from the tag that a header begins with."""
+    """Return whether a line is a row of numbers, rather than the first tag of a header."""
     said = [field for field in dialect.fields(line) if field]
     return bool(said) and is_number(said[0].replace(dialect.decimal, "."))
 
 
 def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
-    """Return the table of one segment; its comments are left out, with a note."""
+    """Return the table of one segment; comments are left out and noted."""
     names = segment.names
     has_comments = names[-1].casefold() == "comment"
     while names and not names[-1]:
         names = names[:-1]
     width = len(names) - has_comments
-    skipped = dialect.x_columns == "no" and names[0] == "X_Value"  # with nothing below it
+    skipped = dialect.x_columns == "no" and names[0] == "X_Value"  # this column is empty
     comments: list[str] = []
 
     def split(row: str) -> list[str]:
@@ -169,7 +169,7 @@ def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
     made = make_table(
         replace(rows, names=names),
         form="lvm",
-        typed=[""] * len(names),  # every number has a decimal mark here, whole or not
+        typed=[""] * len(names),  # all numbers have a decimal mark, whole or not
         cut=rows.cut or _missing(segment, len(rows.values)),
         notes=["comments beside the rows are not read"] if comments else [],
     )
@@ -177,13 +177,13 @@ def _read(segment: _Segment, dialect: _Dialect) -> FileTable:
 
 
 def _missing(segment: _Segment, found: int) -> str | None:
-    """Return what shows that a segment was cut short: fewer rows than its header states."""
+    """Return why a segment seems truncated: fewer rows than its header states. Else None."""
     said = max((int(n) for n in segment.header.get("Samples", []) if n.isdecimal()), default=0)
     return f"line {segment.lines[-1]}: {found:,} of {said:,} samples" if found < said else None
 
 
 def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> list[str]:
-    """Return the names of columns with the units that the header states."""
+    """Return the column names with the units that the header states."""
     channels = [name for name in names if name != "X_Value"]
     units = [unit for unit in segment.header.get("Y_Unit_Label", []) if unit]
     if len(units) != len(channels):
@@ -196,7 +196,7 @@ def _headings(segment: _Segment, names: Sequence[str], dialect: _Dialect) -> lis
 
 
 def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
-    """Return the rows with the first of their time columns; all must be equal."""
+    """Return the rows with only the first of their time columns; all of these must be equal."""
     clocks = [i for i in range(len(rows.names)) if names[i] == "X_Value"]
     if any((rows.values[:, i] != rows.values[:, clocks[0]]).any() for i in clocks[1:]):
         raise SubmissionError(
@@ -207,7 +207,7 @@ def _with_one_clock(rows: Rows, names: Sequence[str], *, place: str) -> Rows:
 
 
 def _with_times(table: FileTable, segment: _Segment, dialect: _Dialect) -> FileTable:
-    """Return a table with the times that the header states, if it does."""
+    """Return the table with the times that the header states, if it does."""
     start, interval = (_stated(tag, segment, dialect) for tag in ("X0", "Delta_X"))
     if not interval:
         return table
@@ -221,11 +221,11 @@ def _with_times(table: FileTable, segment: _Segment, dialect: _Dialect) -> FileT
 
 
 def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
-    """Return the number that a header states for all channels, None where it does not.
+    """Return the number that a header states for all channels, or None.
 
     Raises
     ------
-    SubmissionError : no number, or not the same for all.
+    SubmissionError : the entry is not a number, or differs between channels.
     """
     place = f"{dialect.source} line {segment.line}: the header above states {tag}"
     said = [value for value in segment.header.get(tag, []) if value]
@@ -239,7 +239,7 @@ def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
 
 
 def _join(tables: Sequence[FileTable], *, notes: Sequence[str]) -> FileTable:
-    """Return segments as one table, each of which goes on in time where the last one ended."""
+    """Join segments to one table; each must continue in time where the one before ended."""
     first, *others = tables
     for before, after in pairwise(tables):
         assert before.lines is not None

@@ -1,4 +1,4 @@
-"""The recording in a `.mat` file: which variables form it, and their columns."""
+"""Find the recording in a `.mat` file: which variables form it, and their columns."""
 
 from collections.abc import Sequence
 
@@ -15,11 +15,11 @@ _BENCH = ({"enc1", "duty", "time"}, {"cart1pos", "duty_cycle", "t_received"})
 
 
 def read_mat(raw: bytes, *, source: str) -> FileTable:
-    """Read the vectors, or the one matrix, of a `.mat` file.
+    """Read the vectors, or the only matrix, of a `.mat` file.
 
     Raises
     ------
-    SubmissionError : a broken file, or no usable numbers in it.
+    SubmissionError : the file is broken, or contains no usable numbers.
     """
     variables = read_variables(raw, source=source)
     record = _record(variables, source=source)
@@ -84,11 +84,11 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
         raise SubmissionError(f"{source}: holds no vector or matrix of numbers, but {found}{first}")
     signals = [v for v in signals if min(v.size) <= _MAX_COLUMNS] or signals
     longest = max(v.samples for v in signals)
-    # Of the longest: a shorter variable holds gains or poles, not a truncated signal.
+    # Shorter than a tenth of the longest, a variable holds gains or poles, not a truncated signal.
     signals = [v for v in signals if v.samples > 0.1 * longest]
     sizes = first_few([str(v) for v in signals], _MOST_NAMED)
     vectors = [v for v in signals if v.is_vector]
-    if all(v.samples < longest for v in vectors):  # a matrix has more
+    if all(v.samples < longest for v in vectors):  # a matrix is longer
         vectors, signals = [], [v for v in signals if v.samples == longest]
     if len({v.samples for v in vectors}) > 1:
         raise SubmissionError(f"{source}: the vectors differ in length: {sizes}")
@@ -102,7 +102,7 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
             raise SubmissionError(f"{source}: {matrices[0]} has more than {_MAX_COLUMNS} columns")
         return matrices
     if any(bench <= {v.name for v in vectors} for bench in _BENCH):
-        return vectors  # a bench log is complete; other variables were derived from it
+        return vectors  # a bench log is complete; other variables are derived
     matrices = [matrix for matrix in matrices if matrix.samples == vectors[0].samples]
     columns = len(vectors) + sum(min(matrix.size) for matrix in matrices)
     return [*vectors, *matrices] if columns <= _MAX_COLUMNS else vectors
@@ -111,14 +111,14 @@ def _record(variables: Sequence[MatVariable], *, source: str) -> list[MatVariabl
 def _advice(variable: MatVariable, *, longest: int) -> str:
     """Return advice for a variable that may hold a recording; "" for others.
 
-    `longest` is the number of samples of the recording found beside it.
+    `longest` is the number of samples of the recording found in the file.
     """
     name = variable.name
     if variable.values is not None:
         if variable.samples <= _MAX_COLUMNS:
             return ""
         return f"if it is a recording, save it in a separate file: save('new.mat', '{name}')"
-    if variable.bytes < 8 * longest:  # too few to hold even the times
+    if variable.bytes < 8 * longest:  # too small to hold even the times
         return ""
     match variable.kind:
         case "struct":

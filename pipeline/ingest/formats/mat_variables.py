@@ -1,8 +1,8 @@
-"""The variables of a `.mat` file: versions 4 to 7 are read here, version 7.3 by h5py.
+"""Read the variables of a `.mat` file: versions 4 to 7 here, version 7.3 with h5py.
 
-A hostile file can ask for gigabytes, for a walk that never ends or for a file elsewhere on the
-disk; in scipy's reader a few flipped bytes end the whole process. So only real matrices are read,
-inflated no further than a recording is long. Layout: "MAT-File Format", The MathWorks, R2023b.
+A hostile file can demand gigabytes, an endless loop or another file on the disk. In scipy's reader,
+a few changed bytes end the whole process. So only real matrices are read, and they are decompressed
+only to the size that a recording can have. Layout: "MAT-File Format", The MathWorks, R2023b.
 """
 
 import math
@@ -19,12 +19,12 @@ import numpy as np
 from pipeline.errors import SubmissionError
 from pipeline.ingest.formats.table import Variable
 
-_MOST_BYTES = 200_000_000  # of all variables, inflated
+_MOST_BYTES = 200_000_000  # of all variables, decompressed
 _MOST_VARIABLES, _LONGEST_NAME = 1000, 64  # no workspace has more
 _MOST_DIMENSIONS = 32
-_MOST_PACKED = 1_100  # times its own size a deflated part can become
-_MOST_ABSENT = 1_000_000  # bytes of zeros that MATLAB may leave unwritten
-# Codes of version 5: elements, a flag, the classes of variables, and how their numbers are stored.
+_MOST_PACKED = 1_100  # largest ratio of decompressed to compressed size
+_MOST_ABSENT = 1_000_000  # bytes of zeros that MATLAB may leave out
+# Codes of version 5: types of elements, a flag, classes of variables, and storage types.
 _MATRIX, _COMPRESSED, _OPAQUE, _COMPLEX = 14, 15, 17, 0x800
 _CLASSES = {
     6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8",
@@ -44,7 +44,7 @@ _NUMBERS = frozenset(
 class MatVariable:
     """A variable: its numbers (rows, columns), or None and a description.
 
-    `bytes` is its size in the file, if it has no numbers that are read.
+    `bytes` is its size in the file, if its numbers are not read.
     """
 
     name: str
@@ -55,22 +55,22 @@ class MatVariable:
 
     @property
     def numbers(self) -> np.ndarray:
-        """Its numbers, if there are any."""
+        """The numbers of a variable that has some."""
         assert self.values is not None
         return self.values
 
     @property
     def samples(self) -> int:
-        """Its number of samples, if it is a signal or a matrix of signals."""
+        """The number of samples, if it is a signal or a matrix of signals."""
         return max(self.numbers.shape)
 
     @property
     def is_vector(self) -> bool:
-        """Whether it is one signal."""
+        """Whether it is a single signal."""
         return self.numbers.size > 1 and min(self.numbers.shape) == 1
 
     def told(self, *, read: bool, advice: str = "") -> Variable:
-        """Return its entry in an inspection."""
+        """Return the variable's entry in an inspection."""
         return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
 
     def __str__(self) -> str:
@@ -78,16 +78,16 @@ class MatVariable:
 
 
 def is_mat(raw: bytes) -> bool:
-    """Tell a `.mat` file by its first bytes."""
+    """Return whether a file is a `.mat` file, from its first bytes."""
     return raw.startswith(b"MATLAB") or _v4_heading(raw, 0) is not None
 
 
 def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
-    """Return the variables of a `.mat` file, in its order.
+    """Return the variables of a `.mat` file, in the order of the file.
 
     Raises
     ------
-    SubmissionError : it is broken, or has more variables than any bench's workspace.
+    SubmissionError : the file is broken, or has more variables than any bench's workspace.
     """
     if raw[:10] == b"MATLAB 7.3" or raw[512:516] == b"\x89HDF":
         read = _version_7_3
@@ -95,7 +95,7 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
         read = _version_5 if raw.startswith(b"MATLAB") else _version_4
     try:
         variables = list(islice(read(raw), _MOST_VARIABLES + 1))
-    # h5py raises many kinds of error.
+    # h5py raises many kinds of errors.
     except (ArithmeticError, LookupError, NotImplementedError, OSError, RuntimeError, TypeError,
             ValueError, struct.error, zlib.error):  # fmt: skip
         raise SubmissionError(f"{source}: the .mat file is damaged or truncated") from None
@@ -107,8 +107,8 @@ def read_variables(raw: bytes, *, source: str) -> list[MatVariable]:
 
 
 def _matrix(name: str, values: np.ndarray, *, bytes: int) -> MatVariable:
-    """Return the description of a variable of MATLAB's numbers."""
-    if np.iscomplexobj(values):  # in version 7.3
+    """Return a MATLAB variable with its numbers, or with a description if it is not a matrix."""
+    if np.iscomplexobj(values):  # possible in version 7.3
         return _nothing(name, "complex", size=values.shape, bytes=bytes)
     dtype = np.dtype("u1") if values.dtype == bool else values.dtype.newbyteorder("=")
     return MatVariable(name=name, values=values.astype(dtype), kind=str(dtype), size=values.shape)
@@ -119,7 +119,7 @@ def _nothing(name: str, kind: str, *, size: tuple[int, ...] = (), bytes: int) ->
 
 
 def _no_matrix(size: tuple[int, ...]) -> str:
-    """Return why numbers of this size are not a matrix; "" if they are."""
+    """Return why numbers of this size are not a matrix; "" if they are one."""
     if len(size) != 2 or min(size) < 0:
         return "array of more than two dimensions"
     return "empty" if 0 in size else ""
@@ -142,7 +142,7 @@ def _version_5(raw: bytes) -> Iterator[MatVariable]:
             kind, content = _content(inflated, 0, order)
         if kind == _MATRIX and content:
             one = _read_matrix(content, order)
-            if one.name:  # MATLAB stores data shared by its objects without a name
+            if one.name:  # data that MATLAB's objects share have no name
                 yield one
     if raw[at:].strip(b"\0"):
         raise ValueError(at)
@@ -158,12 +158,12 @@ def _content(raw: bytes, at: int, order: str) -> tuple[int, bytes]:
 
 
 def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
-    """Return (type, bytes, where the next element starts) of the element at `at`."""
+    """Return (type, bytes, start of the next element) of the element at `at`."""
     (word,) = struct.unpack_from(order + "I", content, at)
     if not word >> 16:
         kind, data = _content(content, at, order)
         return kind, data, at + 8 + (len(data) + 7) // 8 * 8
-    # The short form: type, size and up to four bytes in eight.
+    # In the short form, eight bytes hold type, size and up to four bytes of data.
     size = word >> 16
     data = content[at + 4 : at + 4 + size]
     if size > 4 or len(data) < size:
@@ -189,7 +189,7 @@ def _read_matrix(content: bytes, order: str) -> MatVariable:
         return _nothing(label, kind, size=shape, bytes=0 if kind == "empty" else len(content))
     stored_as, data, _ = _element(content, at, order)
     values = np.frombuffer(data, dtype=order + _STORED[stored_as])
-    # MATLAB stores whole doubles as short integers.
+    # MATLAB stores doubles that are whole numbers as short integers.
     return _matrix(label, values.astype(_CLASSES[code]).reshape(shape, order="F"), bytes=0)
 
 
@@ -224,7 +224,7 @@ def _version_4(raw: bytes) -> Iterator[MatVariable]:
 
 
 def _v4_heading(raw: bytes, at: int) -> tuple[np.dtype, tuple[int, int], int, bool] | None:
-    """Return (type, size, length of the name, whether real), None if no variable begins here."""
+    """Return (type, size, length of the name, whether real); None if no variable begins here."""
     for order in "<>" if len(raw) >= at + 20 else "":
         code, rows, columns, imaginary, length = struct.unpack_from(order + "5i", raw, at)
         machine, zero, precision, kind = (code // 10**power % 10 for power in (3, 2, 1, 0))
@@ -245,13 +245,13 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
     left = _MOST_BYTES
     with h5py.File(BytesIO(raw), "r") as file:
         for name in map(str, file):
-            if name.startswith("#"):  # targets of references in MATLAB's cells and objects
+            if name.startswith("#"):  # parts of MATLAB's cells and objects
                 continue
             is_link = not isinstance(file.get(name, getlink=True), h5py.HardLink)
             if is_link or not name.isprintable() or len(name) > _LONGEST_NAME:
                 raise ValueError(name)
             item: Any = file[name]
-            if isinstance(item, h5py.Datatype):  # a named type: no numbers
+            if isinstance(item, h5py.Datatype):  # a named type has no numbers
                 continue
             if isinstance(item, h5py.Group):
                 kind = "sparse" if "MATLAB_sparse" in item.attrs else "struct"
@@ -266,10 +266,10 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
                 continue
             size = tuple(reversed(item.shape)) if len(item.shape) > 1 else (item.size, 1)
             kind = _class_of(item)
-            if kind in _NUMBERS:  # so its attribute says
+            if kind in _NUMBERS:  # according to its attribute
                 kind = _no_matrix(size) if _holds_numbers(item.dtype) else "unknown"
             left -= _bytes_to_read(item) if not kind else 0
-            if left < 0 or item.is_virtual or item.external:  # the numbers of another file
+            if left < 0 or item.is_virtual or item.external:  # the numbers are in another file
                 raise ValueError(name)
             if kind:
                 yield _nothing(name, kind, size=size, bytes=item.nbytes)
@@ -281,9 +281,9 @@ def _version_7_3(raw: bytes) -> Iterator[MatVariable]:
 
 
 def _bytes_to_read(item: Any) -> int:
-    """Return the memory that reading a data set takes.
+    """Return the memory in bytes that reading a data set takes.
 
-    A part that is packed is inflated as a whole, however little of it is in the data set.
+    A compressed chunk is decompressed as a whole, however little of it belongs to the data set.
 
     Raises
     ------
@@ -296,14 +296,14 @@ def _bytes_to_read(item: Any) -> int:
 
 
 def _holds_numbers(dtype: np.dtype) -> bool:
-    """Tell numbers, or the pairs of a complex matrix, from texts, references and other records."""
+    """Return whether a type is a number or a complex pair, not a text or reference."""
     if dtype.names == ("real", "imag"):
         return all(dtype[name].kind in "iuf" for name in ("real", "imag"))
     return dtype.kind in "biuf" and dtype.shape == ()
 
 
 def _class_of(item: Any) -> str:
-    """Return MATLAB's class of a data set; for one from another program, by its numbers."""
+    """Return MATLAB's class of a data set; without one, the class of its numbers."""
     if "MATLAB_empty" in item.attrs:
         return "empty"
     of = item.attrs.get("MATLAB_class", b"double" if item.dtype.kind in "fiu" else b"unknown")

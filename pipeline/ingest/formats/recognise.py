@@ -1,4 +1,4 @@
-"""The forms of data files: recognise one by its content and read its columns."""
+"""Recognise the format of a data file by its content and read its columns."""
 
 import hashlib
 from collections.abc import Collection
@@ -14,7 +14,7 @@ from pipeline.ingest.formats.text import read_text
 from pipeline.ingest.formats.workbook import is_workbook, read_workbook
 from pipeline.submission.load import outside
 
-# Of data files.
+# Endings of data files.
 ENDINGS = (
     ".txt", ".csv", ".xlsx", ".mat", ".m", ".tdms", ".lvm", ".log", ".dat", ".tsv", ".asc",
 )  # fmt: skip
@@ -29,7 +29,7 @@ FORM_TITLES = {
     "tdms": "National Instruments .tdms",
     "lvm": "LabVIEW measurement file (.lvm)",
 }
-# Function that recognises a form, and one that reads it; all others are text.
+# For each format, a function that recognises it and one that reads it; all other files are text.
 _READERS = (
     (is_mat, read_mat),
     (is_workbook, read_workbook),
@@ -37,7 +37,7 @@ _READERS = (
     (is_tdms, read_tdms),
 )
 
-# Files that end up in a submission by mistake, by their first bytes, and the advice.
+# First bytes of files that are submitted by mistake, and the advice to give.
 _STRANGERS = (
     (b"PK\x03\x04", "a zip archive, or a document of LibreOffice: save the sheet as .xlsx or CSV"),
     (b"\xd0\xcf\x11\xe0", "an old Excel workbook, or a locked one; save it as .xlsx, unlocked"),
@@ -54,13 +54,14 @@ def read_table(
 ) -> tuple[FileTable, str]:
     """Return the columns of a data file and the SHA-256 of its bytes.
 
-    Messages call the file `shown`, by default its name; if it is missing, the files `taken` are not
-    proposed.
+    Messages call the file `shown`, by default its name. If it is missing, the files in `taken` are
+    not suggested.
 
     Raises
     ------
-    SubmissionError : outside the folder, missing, of no known form or broken; names the line.
-    OSError : this computer cannot read it now, whatever its content.
+    SubmissionError : the file is outside the folder, missing, of unknown format or broken; the
+        message names the line.
+    OSError : the computer cannot read the file now, whatever its content.
     """
     if (problem := outside(folder, name, taken=taken)) is not None:
         raise SubmissionError(problem if shown is None else f"{shown}: {problem}")
@@ -75,12 +76,12 @@ def read_table(
 
 
 def is_recording(head: bytes) -> bool:
-    """Tell by its first bytes a file that is no text and may hold a recording."""
+    """Return whether a file that is not text may hold a recording, from its first bytes."""
     return any(is_theirs(head) for is_theirs, _ in _READERS)
 
 
 def parse_table(raw: bytes, *, source: str) -> FileTable:
-    """Read the columns from the bytes of a data file."""
+    """Return the columns of a data file from its bytes."""
     if not raw.strip():
         raise SubmissionError(f"{source}: the file is empty")
     for is_theirs, read in _READERS:

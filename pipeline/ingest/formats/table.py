@@ -13,8 +13,8 @@ from pipeline.errors import SubmissionError
 from pipeline.words.numbers import first_few
 
 _MOST_NAMED = 8
-# The range of values a bench can measure, in any unit: times, positions, inputs, ratios. Powers and
-# products of some of them, as in the stages, neither overflow nor vanish.
+# Range of values that a bench can measure, in any unit: times, positions, inputs, ratios. Powers
+# and products of several such values, as in the stages, neither overflow nor underflow.
 _SMALLEST_MEASURED, _LARGEST_MEASURED = 1e-12, 1e12
 
 
@@ -24,10 +24,10 @@ class Variable:
 
     Attributes
     ----------
-    size : rows and columns, if they could be read; else ().
+    size : rows and columns. Empty if they could not be read.
     kind : the type of its numbers, or its description.
-    read : its numbers are among the columns.
-    advice : how to get it read, if it may hold a recording; else "".
+    read : whether its numbers are among the columns.
+    advice : how to make it readable. Empty if it cannot hold a recording.
     """
 
     name: str
@@ -37,7 +37,7 @@ class Variable:
     advice: str = ""
 
     def __str__(self) -> str:
-        """Return "data (20000 × 7, float64)"."""
+        """Return a short text such as "data (20000 × 7, float64)"."""
         size = " × ".join(map(str, self.size))
         return f"{self.name} ({', '.join(filter(None, (size, self.kind)))})"
 
@@ -49,15 +49,15 @@ class FileTable:
     Attributes
     ----------
     source : the file's name, for messages.
-    form : how the file is laid out, a key of `FORM_TITLES`.
-    names : (n_columns,) headings as written; numbers "1", "2", … without headings.
+    form : the format of the file, a key of `FORM_TITLES`.
+    names : (n_columns,) headings as written. Without headings, the numbers "1", "2", ….
     values : (n_columns, n), all finite.
-    whole : (n_columns,) the column holds only whole numbers, written as such.
-    lines : (n,) line of the file for each row; None for a binary file.
-    lines_are : what `lines` counts: "line", or "row" of a sheet.
-    cut : the broken last line of a file that was cut short, or None.
-    notes : repairs and omissions of reading.
-    variables : of a binary file, in its order.
+    whole : (n_columns,) whether all numbers of a column were written as whole numbers.
+    lines : (n,) line of the file for each row. None for a binary file.
+    lines_are : the unit of `lines`. It is "line", or "row" for a sheet.
+    cut : the broken last line of a truncated file. None if the file is complete.
+    notes : repairs and omissions while reading.
+    variables : the variables of a binary file, in the order of the file.
     """
 
     source: str
@@ -73,7 +73,7 @@ class FileTable:
 
     @property
     def cut_short(self) -> str:
-        """The fault of a truncated file, and what to do; "" for a complete one."""
+        """The fault of a truncated file with what to do; "" for a complete file."""
         if self.cut is None:
             return ""
         return f"{self.cut}; the file is truncated: export it again, or delete its last line"
@@ -83,7 +83,7 @@ class FileTable:
         return f"sample {row + 1}" if self.lines is None else f"{self.lines_are} {self.lines[row]}"
 
     def index(self, column: str | int) -> int:
-        """Return the position, from 0, of a column given by heading or by number from 1.
+        """Return the position (from 0) of a column given by heading or by number (from 1).
 
         Raises
         ------
@@ -110,7 +110,7 @@ class FileTable:
         return _loosely(column) in map(_loosely, self.names)
 
     def headings(self) -> str:
-        """Return the headings as one short line."""
+        """Return the headings as one short line of text."""
         shown = ", ".join(self.names[:12])
         return shown + (", …" if len(self.names) > 12 else "")
 
@@ -128,13 +128,13 @@ def not_read(variables: Sequence[Variable]) -> list[str]:
 
 
 def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int], str]) -> None:
-    """Refuse NaN, infinity and numbers beyond any measurement; values are (n_columns, n).
+    """Refuse NaN, infinity and numbers beyond any measurement; `values` is (n_columns, n).
 
     Raises
     ------
-    SubmissionError : names the column and, by `place`, the row.
+    SubmissionError : the message names the column and, by `place`, the row.
     """
-    # Of anything in a file, also times and unused columns.
+    # This limit applies to everything in a file, also to times and unused columns.
     usable = np.abs(values) < 1e50  # NaN compares as false
     if not usable.all():
         column, row = np.argwhere(~usable)[0]
@@ -143,11 +143,11 @@ def refuse_unusable(values: Array, *, names: Sequence[str], place: Callable[[int
 
 
 def refuse_extreme(values: Array, *, what: str) -> None:
-    """Refuse numbers, except zeros, whose largest exceeds everything a bench measures.
+    """Refuse numbers if the largest or smallest, except zeros, is impossible on a bench.
 
     Raises
     ------
-    SubmissionError : with `what` and its file.
+    SubmissionError : the message gives `what` and its file.
     """
     largest = float(np.abs(values).max(initial=0.0))
     if largest != 0 and not _SMALLEST_MEASURED <= largest <= _LARGEST_MEASURED:

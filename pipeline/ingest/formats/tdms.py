@@ -1,8 +1,8 @@
-"""National Instruments' binary form (.tdms): the group of channels that is the recording.
+"""Read National Instruments' binary format (.tdms): find the group of channels with the recording.
 
-npTDMS reads it. A hostile file could keep it busy for hours. So the lengths before each segment are
-added up first: objects times segments, and bytes of metadata. Layout:
-"TDMS File Format Internal Structure", National Instruments.
+The file is read by npTDMS, which a hostile file could keep busy for hours. So the lengths in front
+of the segments are added up first: objects times segments, and bytes of metadata. Layout: "TDMS
+File Format Internal Structure", National Instruments.
 """
 
 import logging
@@ -32,24 +32,24 @@ _LEAD_IN = 28  # bytes
 _METADATA, _NEW_LIST, _BIG_ENDIAN = 0x2, 0x4, 0x40  # flags of a segment
 _MOST_METADATA = 10_000_000  # bytes
 _MOST_OBJECTS = 1_000
-_MOST_VISITS = 2_000_000  # each segment looks at each object
+_MOST_VISITS = 2_000_000  # limit; npTDMS visits each object in each segment
 _MOST_VALUES, _MOST_CHUNKS = 5_000_000, 200_000
-_SETTING = 0.1  # of the longest channel, as in a .mat file
+_SETTING = 0.1  # of the longest channel. Shorter channels are settings, as in a .mat file
 _MOST_NAMED = 8
 _TIME = re.compile(r"\s*(elapsed[ _])?(t|times?|time[ _]?stamps?)\s*([\[(].*)?", re.IGNORECASE)
 
 
 def is_tdms(raw: bytes) -> bool:
-    """Tell a .tdms file by the tag of its first segment."""
+    """Return whether a file is a .tdms file, from the tag of its first segment."""
     return raw.startswith(b"TDSm")
 
 
 def read_tdms(raw: bytes, *, source: str) -> FileTable:
-    """Read the channels of the one group that holds a recording.
+    """Read the channels of the only group that holds a recording.
 
     Raises
     ------
-    SubmissionError : broken, cut short, or no recording in it, or several.
+    SubmissionError : the file is broken or truncated, or holds no recording or several.
     """
     _refuse_endless(raw, source=source)
     channels = _read_channels(raw, source=source)
@@ -89,7 +89,7 @@ def read_tdms(raw: bytes, *, source: str) -> FileTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Channel:
-    """A channel: its numbers, or None and what it holds instead; its unit and clock, if stated."""
+    """A channel: its numbers (or None and a description), and its unit and clock if stated."""
 
     group: str
     name: str
@@ -102,25 +102,25 @@ class _Channel:
 
     @property
     def numbers(self) -> Array:
-        """Its numbers, where it has any."""
+        """The numbers of a channel that has some."""
         assert self.values is not None
         return self.values
 
     @property
     def heading(self) -> str:
-        """Its name and unit."""
+        """The channel's name and unit."""
         return with_unit(self.name, self.unit)
 
 
-# -------------------------------------------------------------------- what npTDMS may be asked
+# ------------------------------------------------------------------- checks before npTDMS reads
 
 
 def _refuse_endless(raw: bytes, *, source: str) -> None:
-    """Refuse a file that is cut short, or takes npTDMS longer than any recording.
+    """Refuse a file that is truncated, or takes npTDMS longer than any recording.
 
     Raises
     ------
-    SubmissionError : so it is.
+    SubmissionError : the file is refused.
     """
     at = named = objects = visits = metadata = 0
     while at < len(raw):
@@ -130,7 +130,7 @@ def _refuse_endless(raw: bytes, *, source: str) -> None:
         order = ">" if flags & _BIG_ENDIAN else "<"
         length, data = struct.unpack_from(f"{order}QQ", raw, at + 12)
         end = at + _LEAD_IN + length
-        if end > len(raw):  # also where LabVIEW never wrote the length
+        if end > len(raw):  # also true if LabVIEW never wrote the length
             raise SubmissionError(
                 f"{source}: the segment at byte {at:,} is not whole: the file was cut short, or "
                 "copied while LabVIEW was writing it"
@@ -154,7 +154,7 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
 
     Raises
     ------
-    SubmissionError : npTDMS fails, or complains of what it read.
+    SubmissionError : npTDMS fails, or reports a problem.
     """
     from nptdms import TdmsFile
 
@@ -168,7 +168,7 @@ def _read_channels(raw: bytes, *, source: str) -> list[_Channel]:
             if not large:
                 file = TdmsFile.read(BytesIO(raw))
                 channels = [_channel(one) for group in file.groups() for one in group.channels()]
-        except Exception:  # whatever it stumbles on
+        except Exception:  # npTDMS raises many kinds of errors
             raise SubmissionError(f"{source}: the .tdms file is broken or cut short") from None
     if large:
         raise SubmissionError(
@@ -205,14 +205,14 @@ def _printable(text: str) -> str:
 
 
 def _number(said: object) -> float:
-    """Return a property that is a finite number; 0 for any other."""
+    """Return a property if it is a finite number; 0 otherwise."""
     known = isinstance(said, float | int | np.number) and bool(np.isfinite(said))
     return float(said) if known else 0.0  # type: ignore[arg-type]
 
 
 @contextmanager
 def _complaints() -> Iterator[list[str]]:
-    """Collect what npTDMS would only log: that it reads less than the file should hold."""
+    """Collect the messages that npTDMS only logs, such as that it reads less than expected."""
     from nptdms.log import log_manager
 
     log_manager.console_handler.setLevel(logging.CRITICAL)
@@ -226,7 +226,7 @@ def _complaints() -> Iterator[list[str]]:
 
 
 class _Listener(logging.Handler):
-    """What is logged in this thread, from warnings on."""
+    """Collects the log messages of this thread, from warnings on."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -238,15 +238,15 @@ class _Listener(logging.Handler):
             self.said.append(record.getMessage())
 
 
-# ----------------------------------------------------------------------- what the recording is
+# --------------------------------------------------------------------- choice of the recording
 
 
 def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[_Channel]]:
-    """Return the group that is the recording, and its channels; short ones are settings.
+    """Return the group that is the recording, with its channels; short ones are settings.
 
     Raises
     ------
-    SubmissionError : no recording, several, or channels of different lengths.
+    SubmissionError : there is no recording, there are several, or channel lengths differ.
     """
     signals = [one for one in channels if one.values is not None and one.samples > 1]
     if not signals:
@@ -265,18 +265,18 @@ def _recording(channels: Sequence[_Channel], *, source: str) -> tuple[str, list[
 
 
 def _advice(channel: _Channel, *, longest: int) -> str:
-    """Return what to do for a channel that may belong to the recording and is not read."""
+    """Return advice for a channel that is not read but may belong to the recording."""
     if channel.values is not None or channel.samples < longest:
         return ""
     return "if it is a signal, write it as numbers"
 
 
 def _clock(channels: Sequence[_Channel], *, source: str) -> tuple[float, float]:
-    """Return the interval and the first time (s) that channels state; 0 without any.
+    """Return the interval and the first time (s) that channels state; 0 if they state nothing.
 
     Raises
     ------
-    SubmissionError : not the same for all.
+    SubmissionError : the channels state different ones.
     """
     stated = {(one.interval, one.start) for one in channels if one.interval > 0}
     if len(stated) > 1:

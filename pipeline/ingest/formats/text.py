@@ -1,4 +1,4 @@
-"""Data files of text: ECP exports, bench logs and CSV of any delimiter and decimal mark."""
+"""Read data files of text: ECP exports, bench logs, and CSV with any delimiter and decimal mark."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -14,7 +14,7 @@ from pipeline.ingest.formats.table import FileTable, refuse_unusable
 
 MOST_COLUMNS = 64
 _SNIFFED_ROWS = 40
-# An ECP heading has names of two words with single spaces in them.
+# The names in an ECP heading consist of words with single spaces between them.
 _HEADING_WORDS = re.compile(
     r"encoder\s*\d+\s+(?:pos|vel|acc)\w*|commanded\s+\w+|control\s+effort|[^\s,;]+", re.IGNORECASE
 )
@@ -30,7 +30,7 @@ def read_text(raw: bytes, *, source: str) -> FileTable:
 
     Raises
     ------
-    SubmissionError : not text, not a table, or a row that does not fit; names the line.
+    SubmissionError : this is not text or not a table, or a row does not fit; names the line.
     """
     text = decode(raw, source=source).replace("\r\n", "\n").replace("\r", "\n")
     opening = _OPENING.search(text) if "[" in text else None
@@ -38,11 +38,11 @@ def read_text(raw: bytes, *, source: str) -> FileTable:
 
 
 def decode(raw: bytes, *, source: str) -> str:
-    """Return the text of a file in UTF-8, UTF-16 or the letters of old Windows programs.
+    """Return the text of a file in UTF-8, UTF-16 or an old Windows encoding.
 
     Raises
     ------
-    SubmissionError : no text.
+    SubmissionError : the file is not text.
     """
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):  # Excel's "Unicode text"
         try:
@@ -55,7 +55,7 @@ def decode(raw: bytes, *, source: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError:
-        return raw.decode("latin-1")  # a micro sign from an old Windows program
+        return raw.decode("latin-1")  # such as a micro sign from an old Windows program
 
 
 # ------------------------------------------------------------------------- rows of numbers
@@ -63,7 +63,7 @@ def decode(raw: bytes, *, source: str) -> str:
 
 @dataclass(frozen=True)
 class Rows:
-    """Parsed rows of a file: (n, width) numbers, their lines, and signs of truncation."""
+    """Parsed rows of a file: numbers (n, width), their lines, and signs of truncation."""
 
     source: str
     names: Sequence[str]
@@ -84,7 +84,7 @@ def parse_rows(
 
     Parameters
     ----------
-    lines : of the file, for the rows.
+    lines : line number in the file, for each row.
     split : function that returns the fields of a row.
     """
     values, cut = _numbers(map(split, rows), width=len(names)), None
@@ -102,9 +102,9 @@ def parse_rows(
 
 
 def _numbers(rows: Iterable[Sequence[str]], *, width: int) -> Array | None:
-    """Return rows of numbers (n, width), or None if any is not a number.
+    """Return the rows as numbers (n, width), or None if any field is not a number.
 
-    Rows are not checked singly.
+    The rows are not checked one by one, which saves time.
     """
     fields = chain.from_iterable(row if len(row) == width else ("",) for row in rows)
     try:
@@ -132,7 +132,7 @@ def _what_is_wrong(fields: Sequence[str], names: Sequence[str]) -> str:
 
 
 def is_number(field: str) -> bool:
-    """Tell whether a field holds a number."""
+    """Return whether a field holds a number."""
     try:
         float(field)
     except ValueError:
@@ -171,7 +171,8 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
 
     Raises
     ------
-    SubmissionError : too many, too long, or duplicates; begins with `place`.
+    SubmissionError : there are too many, too long or repeated ones; the message begins with
+        `place`.
     """
     if len(names) > MOST_COLUMNS:
         raise SubmissionError(f"{place}: more than {MOST_COLUMNS} columns")
@@ -193,7 +194,7 @@ def checked_names(names: Sequence[str], *, place: str) -> list[str]:
 
 
 def _ecp(text: str, opening: re.Match[str], source: str) -> FileTable:
-    """Read `heading [ row; row; … ]`, as written by the ECP program and MATLAB scripts."""
+    """Read `heading [ row; row; … ]`, as written by the ECP program and by MATLAB scripts."""
     first_line = text.count("\n", 0, opening.end()) + 1
     end = text.find("]", opening.end())
     body = text[opening.end() : end if end >= 0 else len(text)]
@@ -252,12 +253,12 @@ def _ecp_heading(head: str) -> tuple[list[str], int]:
 
 @dataclass(frozen=True)
 class _Layout:
-    """How the lines of a table are split: `delimiter` None is any run of white space."""
+    """How the lines of a table are split; `delimiter` None means any white space."""
 
     delimiter: str | None
     decimal_comma: bool
     has_heading: bool
-    trailing: bool  # a delimiter ends each row
+    trailing: bool  # whether a delimiter ends each row
 
     def fields(self, line: str) -> list[str]:
         """Return the fields of one line."""
@@ -269,7 +270,7 @@ class _Layout:
 
     @property
     def split(self) -> Callable[[str], list[str]]:
-        """The function that returns the fields of a row of numbers, with a decimal point."""
+        """The function that splits a row of numbers and writes decimal points."""
         if self.decimal_comma:
             return lambda row: [field.replace(",", ".") for field in self.fields(row)]
         if self.delimiter is None or self.trailing:
@@ -278,8 +279,8 @@ class _Layout:
 
 
 def _delimited(text: str, source: str) -> FileTable:
-    """Read a heading and rows; the delimiter and the decimal mark are found."""
-    # A spreadsheet writes rows of empty cells after its last.
+    """Read a heading and rows; delimiter and decimal mark are found from the text."""
+    # A spreadsheet may write rows of empty cells after its last row.
     numbered = enumerate(text.split("\n"), start=1)
     lines = [(i, line) for i, line in numbered if line.strip().strip(' \t;,"')]
     start = 0
@@ -324,8 +325,8 @@ def _heading(
 ) -> tuple[list[str] | None, int]:
     """Return the headings, or None, and the index of the first row of numbers.
 
-    The last comment before a bare table may be its heading; a row of units below the heading
-    ("ms", "V") goes into the names, "time [ms]".
+    The last comment before a table without headings may be its heading. A row of units below the
+    heading ("ms", "V") is added to the names, "time [ms]".
     """
     if not layout.has_heading:
         width = len(layout.fields(lines[start][1]))
@@ -341,7 +342,7 @@ def _heading(
 
 
 def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
-    """Return headings with the units below them, "time [ms]"; None where those are no units."""
+    """Return headings with the units below them, "time [ms]"; None if these are not units."""
     bare = [unit.strip(' ()[]"') for unit in units]
     words = all(re.fullmatch(rf"[^\d]{{1,{_LONGEST_UNIT}}}", unit) for unit in bare)
     if not words or len(bare) != len(names) or bare == list(names):
@@ -350,9 +351,9 @@ def with_units(names: Sequence[str], units: Sequence[str]) -> list[str] | None:
 
 
 def is_bench_log(names: Sequence[str]) -> bool:
-    """Return whether it is the bench's own log.
+    """Return whether the headings are those of the bench's own log.
 
-    ECP headings, but no commanded position and no brackets.
+    These are ECP headings without a commanded position. The file has no brackets either.
     """
     words = {name.casefold() for name in names}
     return (
@@ -363,10 +364,10 @@ def is_bench_log(names: Sequence[str]) -> bool:
 
 
 def _sniff(sample: Sequence[str]) -> _Layout | None:
-    """Return the layout that makes most lines into rows of numbers of one width, or None.
+    """Return the layout in which most lines are rows of numbers of one width, or None.
 
-    Of equal layouts the first wins, so that "0,5;1,2" is two numbers with decimal commas and "0,5"
-    two integers.
+    Of equally good layouts the first one is used. So "0,5;1,2" is two numbers with decimal commas,
+    and "0,5" is two integers.
     """
     best, best_score = None, 0.0
     for delimiter in ("\t", ";", ",", None):
@@ -379,11 +380,11 @@ def _sniff(sample: Sequence[str]) -> _Layout | None:
             has_heading = not all(map(is_number, split[0]))
             width = len(split[0])
             numeric = [len(row) for row in split[has_heading:] if all(map(is_number, row))]
-            # One column only if nothing else fits; numbers under a heading of another width only to
-            # report it.
+            # A single column counts only if nothing else fits. Numbers under a heading of another
+            # width count only so that the error can be reported.
             score = numeric.count(width) * (2 if width > 1 else 1) + 0.01 * len(numeric)
             if score > best_score:
                 best, best_score = replace(layout, has_heading=has_heading), score
             if width > 1 and numeric.count(width) == len(split) - has_heading > 0:
-                return best  # every line contains the delimiter, which is in no number
+                return best  # every line contains the delimiter, and no number does
     return best

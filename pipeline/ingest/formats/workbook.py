@@ -1,4 +1,4 @@
-"""A recording out of an Excel workbook: the first sheet with headings above columns of numbers."""
+"""Read a recording from an Excel workbook: the first sheet with headings above numbers."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -15,17 +15,17 @@ from pipeline.ingest.formats.text import checked_names, is_bench_log, with_units
 from pipeline.ingest.formats.workbook_cells import Book, Cells
 from pipeline.words.numbers import first_few
 
-# Of the longest: shorter columns and tables are settings, as are shorter vectors of a .mat file.
+# Of the longest. Shorter columns and tables are settings, like shorter vectors of a .mat file.
 _SETTING = 0.1
 _MOST_NAMED = 8
-_PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of them stands early in the archive
+_PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
 _DAY = 86_400.0  # s
 _NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eE][-+]?\d+)?")
 _UNIT_OF_HEADING = re.compile(r"\s*[\[(][^\])]*[\])]\s*$")
 
 
 def is_workbook(raw: bytes) -> bool:
-    """Tell an Office document, perhaps cut short, from other archives."""
+    """Return whether an archive is an Office document, even if it is truncated."""
     return raw.startswith(b"PK\x03\x04") and any(part in raw for part in _PARTS)
 
 
@@ -34,7 +34,8 @@ def read_workbook(raw: bytes, *, source: str) -> FileTable:
 
     Raises
     ------
-    SubmissionError : broken, without headings, or a cell that is no number; names the cell.
+    SubmissionError : the file is broken or has no headings, or a cell is not a number; names the
+        cell.
     """
     book = Book(raw, source=source)
     for name in book.sheets:
@@ -58,12 +59,14 @@ def _not_read(sheets: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Block:
-    """A table in a sheet, by its rows.
+    """A table in a sheet, given by its rows.
 
     Attributes
     ----------
-    units : the row below the headings that holds units; 0 without one.
-    rows : those of numbers, from the headings to the next ones (`end`, not included).
+    heading : the row of the headings.
+    units : the row below the headings that holds units. Zero without one.
+    rows : the rows of numbers, from the headings to `end`.
+    end : the row of the next headings. It is not included.
     """
 
     heading: int
@@ -73,7 +76,7 @@ class _Block:
 
 
 class _Sheet:
-    """The cells of a sheet, told apart: numbers, also those typed as text, texts, and others."""
+    """The cells of a sheet, sorted into numbers (also those typed as text), texts, and others."""
 
     def __init__(self, cells: Cells, looks: Sequence[str], *, source: str, name: str) -> None:
         self._source, self._where = source, f"{source} sheet {name!r}"
@@ -85,7 +88,7 @@ class _Sheet:
         self._rows = np.r_[np.array(cells.rows, dtype=np.int64), places[:, 0]]
         self._columns = np.r_[np.array(cells.columns, dtype=np.int64), places[:, 1]]
         self._values = np.r_[np.array(cells.values), numbers]
-        known = np.array([*looks, ""])  # the last for a format that is not listed
+        known = np.array([*looks, ""])  # the last entry is for a format that is not listed
         numbered = np.array(cells.looks, dtype=np.int64)
         numbered[(numbered < 0) | (numbered >= len(looks))] = len(looks)
         self._looks = np.r_[known[numbered], np.full(len(numbers), "")]
@@ -95,14 +98,14 @@ class _Sheet:
         self._values, self._looks = self._values[order], self._looks[order]
         self._is_typed = self._is_typed[order]
 
-    # ------------------------------------------------------------------- where the table is
+    # ---------------------------------------------------------------- finding the table
 
     def longest_block(self) -> _Block | None:
-        """Return the longest table below a row of headings, None without any.
+        """Return the longest table below a row of headings; None if there is no table.
 
         Raises
         ------
-        SubmissionError : there are two about as long.
+        SubmissionError : there are two of about the same length.
         """
         blocks = self._blocks()
         if not blocks:
@@ -117,7 +120,7 @@ class _Sheet:
         return longest
 
     def _blocks(self) -> list[_Block]:
-        """Return the tables: rows of texts alone, perhaps units below, then a row of numbers."""
+        """Return the tables: a row of texts only, perhaps a row of units, a row of numbers."""
         texts: dict[int, set[int]] = {}
         for row, column in self._texts:
             texts.setdefault(row, set()).add(column)
@@ -147,13 +150,13 @@ class _Sheet:
         ]
 
     def _names_half(self, row: int, numbers: int) -> bool:
-        """Tell a row of headings from a remark above or between rows of numbers."""
+        """Return whether a row names at least half of the columns; a remark does not."""
         columns = self._columns[slice(*np.searchsorted(self._rows, [numbers, numbers + 1]))]
         named = sum(bool(self._text(row, column)) for column in columns.tolist())
         return 2 * named >= columns.size
 
     def _text(self, row: int, column: int) -> str:
-        """Return the text of a cell, or of the merged one that it is part of."""
+        """Return the text of a cell, or of the merged cell that it belongs to."""
         at = row, column
         return self._texts.get(at) or self._texts.get(self._merged.get(at, at), "")
 
@@ -163,10 +166,10 @@ class _Sheet:
         units = [self._texts[row, column] for column in columns]
         return bool(columns) and all(names) and with_units(names, units) is not None
 
-    # ----------------------------------------------------------------------- what it holds
+    # ------------------------------------------------------------------ reading the table
 
     def read(self, block: _Block, *, notes: list[str]) -> FileTable:
-        """Return the columns of a table; one much shorter than the longest is not read."""
+        """Return the columns of a table; a column much shorter than the longest is not read."""
         inside = (self._rows > block.heading) & (self._rows < block.end)
         wrong = [at for at in self._wrong if block.heading < at[0] < block.end]
         held = np.r_[self._columns[inside], np.array([c for _, c in wrong], dtype=np.int64)]
@@ -178,7 +181,7 @@ class _Sheet:
         )
         inside &= np.isin(self._columns, used)
         first, last = block.rows[0], block.rows[-1]
-        texts = [at for at in self._texts if first < at[0] < last]  # which _refuse_gaps refuses
+        texts = [at for at in self._texts if first < at[0] < last]  # _refuse_gaps refuses these
         stray = [row for row, column in (*wrong, *texts) if column in used]
         rows = np.unique(np.r_[self._rows[inside], np.array(stray, dtype=np.int64)])
         notes = [*self._left_out(block, used), *self._typed_numbers(inside), *notes]
@@ -208,7 +211,7 @@ class _Sheet:
         )
 
     def _heading(self, block: _Block, column: int) -> str:
-        """Return the text above a column, perhaps in a merged cell, with the unit below it."""
+        """Return the text above a column, perhaps from a merged cell, with the unit below it."""
         name = self._text(block.heading, column)
         unit = self._texts.get((block.units, column), "")
         united = with_units([name], [unit]) if unit else None
@@ -217,7 +220,7 @@ class _Sheet:
     def _refuse_gaps(
         self, rows: NDArray[np.int64], own: NDArray[np.int64], *, column: int, name: str
     ) -> None:
-        """Refuse a column with a cell that holds no number, and one cell given twice."""
+        """Refuse a column if a cell holds no number, or if a cell occurs twice."""
         if (doubled := np.flatnonzero(np.diff(own) == 0)).size:
             cell = _cell(int(own[doubled[0]]), column)
             raise SubmissionError(f"{self._where} cell {cell}: the file has it twice")
@@ -231,9 +234,10 @@ class _Sheet:
     def _times(
         self, cells: NDArray[np.int64], *, column: int, name: str
     ) -> tuple[Array | None, str]:
-        """Return dates or times of day in seconds, and a note; None for other numbers.
+        """Return dates or times of day in seconds, with a note; None for other numbers.
 
-        A spreadsheet keeps them as days. Among numbers a date is one that it made of "1.5".
+        A spreadsheet stores them in days. A single date among numbers is an error: the spreadsheet
+        has turned "1.5" into it.
         """
         looks, values = self._looks[cells], self._values[cells]
         is_time = (looks == "date") | (looks == "time")
@@ -249,14 +253,14 @@ class _Sheet:
             )
         start = values[0] if (looks == "date").any() else 0.0
         what = "dates" if start else "times of day"
-        # Doubles and files keep a date to 1e-11 days.
+        # Rounded to 1e-5 s, because doubles and files keep a date to 1e-11 days.
         times = np.round(_DAY * (values - start), 5)
         return times, f"{name!r}: {what} were converted to seconds"
 
     # -------------------------------------------------------------------------------- notes
 
     def _typed_numbers(self, inside: NDArray[np.bool_]) -> list[str]:
-        """Return a note on numbers typed as texts."""
+        """Return a note on numbers that were typed as text."""
         typed = np.flatnonzero(inside & self._is_typed)
         places = zip(self._rows[typed].tolist(), self._columns[typed].tolist(), strict=True)
         read = [self._typed[place] for place in places]
@@ -267,7 +271,7 @@ class _Sheet:
         return [f"{len(read)} numbers that are kept as text were read{mark}"]
 
     def _left_out(self, block: _Block, used: Sequence[int]) -> list[str]:
-        """Return a note on the rows and columns of the sheet that hold more than the table."""
+        """Return a note on rows and columns of the sheet that the table does not contain."""
         texts = np.array([*self._texts, *self._wrong], dtype=np.int64).reshape(-1, 2)
         rows, columns = np.r_[self._rows, texts[:, 0]], np.r_[self._columns, texts[:, 1]]
         inside = (rows >= block.heading) & (rows < block.end)
@@ -287,7 +291,7 @@ def _cell(row: int, column: int) -> str:
 
 
 def _letters(column: int) -> str:
-    """Return "AB" of column 28."""
+    """Return a column's letters, such as "AB" for 28."""
     letters = ""
     while column:
         column, rest = divmod(column - 1, 26)

@@ -1,8 +1,9 @@
-"""The cells of an Excel workbook (.xlsx), with the standard library alone.
+"""Read the cells of an Excel workbook (.xlsx), using only the standard library.
 
-A workbook of 2 kB may name two cells a million rows apart, or a billion texts; readers that reserve
-room for what is declared end the whole process. Here nothing declared is believed: parts are
-inflated and parsed piece by piece, and what comes out is counted. Layout: ECMA-376-1, chapter 18.
+A workbook of 2 kB may name two cells a million rows apart, or declare a billion texts. Readers that
+reserve memory for what is declared then end the whole process. Here no declaration is trusted:
+parts are decompressed and parsed piece by piece, and the results are counted. Layout: ECMA-376-1,
+chapter 18.
 """
 
 import posixpath
@@ -19,20 +20,20 @@ from xml.parsers import expat
 
 from pipeline.errors import SubmissionError
 
-_MOST_BYTES = 200_000_000  # of all parts, inflated
-_MOST_ELEMENTS = 6_000_000  # two a cell
+_MOST_BYTES = 200_000_000  # of all parts, decompressed
+_MOST_ELEMENTS = 6_000_000  # two per cell
 _MOST_CELLS, _MOST_TEXTS = 2_000_000, 500_000
 _MOST_DIRECTORY = 1_000_000  # bytes of the archive's table of contents
 _MOST_SHEETS = 250
-_MOST_ROWS, _MOST_COLUMNS = 1_048_576, 16_384  # of any sheet
+_MOST_ROWS, _MOST_COLUMNS = 1_048_576, 16_384  # limits of any sheet
 _CHUNK = 1 << 18
-_LONGEST_TOKEN = 1_000_000  # bytes; expat starts again at a tag's beginning until it is whole
-_DEEPEST = 60  # elements in elements
-_LONGEST_TEXT = 200  # characters kept of a cell
+_LONGEST_TOKEN = 1_000_000  # bytes. The parser expat reads a tag again until it is complete
+_DEEPEST = 60  # levels of nested elements
+_LONGEST_TEXT = 200  # characters to keep of a cell
 _REFERENCE = re.compile(r"([A-Z]{1,3})([1-9]\d{0,6})")
 _NO_VALUE = "a formula without its value: open the file in a spreadsheet program and save it again"
 
-# Formats of numbers (18.8.30): those with a number of their own, then what a code says.
+# Number formats (18.8.30): the predefined ones, then patterns for those with a code.
 _PERCENTS = {9, 10}
 _DATES = {14, 15, 16, 17, 22, *range(27, 37), *range(50, 59)}
 _TIMES = {18, 19, 20, 21, 45, 46, 47}
@@ -40,19 +41,20 @@ _NO_CODE = re.compile(r'"[^"]*"|\\.|_.|\*.|\[(?![hms]+\])[^\]]*\]', re.IGNORECAS
 
 
 class _Broken(Exception):
-    """What no spreadsheet program writes."""
+    """Content that no spreadsheet program writes."""
 
 
 @dataclass(kw_only=True)
 class Cells:
-    """The cells of a sheet that hold something, in the order of the file.
+    """The filled cells of a sheet, in the order of the file.
 
     Attributes
     ----------
-    rows, columns : from 1, of the numbers in `values`; `looks`: their formats, see `Book.looks`.
-    texts : by (row, column).
-    wrong : by (row, column): contents that cannot be a measurement.
-    merged : for the cells of a merged range: its first cell, by (row, column).
+    rows, columns : row and column (from 1) of each number in `values`.
+    looks : the number format of each. See `Book.looks`.
+    texts : texts, by (row, column).
+    wrong : contents that cannot be a measurement, by (row, column).
+    merged : for each cell of a merged range, the first cell of the range.
     """
 
     rows: array = field(default_factory=lambda: array("l"))
@@ -69,12 +71,12 @@ class Book:
 
     Attributes
     ----------
-    sheets : the part of each worksheet, by name, in their order.
+    sheets : the file part of each worksheet, by name, in order.
     looks : "", "percent", "time" or "date", by the number of a format.
 
     Raises
     ------
-    SubmissionError : no workbook, broken, locked or too large.
+    SubmissionError : this is not a workbook, or it is broken, locked or too large.
     """
 
     def __init__(self, raw: bytes, *, source: str) -> None:
@@ -113,7 +115,7 @@ class Book:
         self.looks = self._read_looks(one_of["styles"]) if "styles" in one_of else [""]
 
     def _related(self, part: str) -> dict[str, tuple[str, str]]:
-        """Return (kind, part) of what a part refers to in this archive, by its id there."""
+        """Return (kind, part) of each part that a part refers to, by the reference's id."""
         folder, name = posixpath.split(part)
         listed = posixpath.join(folder, "_rels", f"{name}.rels")
         found: dict[str, tuple[str, str]] = {}
@@ -146,7 +148,7 @@ class Book:
         return looks or [""]
 
     def _shared_texts(self) -> list[str]:
-        """Return the texts that cells refer to by number; read when the first one does."""
+        """Return the texts that cells refer to by number; they are read on first use."""
         if self._texts is None:
             reading = _Texts()
             if self._shared:
@@ -155,7 +157,7 @@ class Book:
         return self._texts
 
     def has_cells(self, sheet: str) -> bool:
-        """Return whether a sheet has any filled cell."""
+        """Return whether a sheet has a filled cell."""
         reading = _Sheet(list, most=0)
         try:
             self._read_sheet(sheet, reading)
@@ -168,7 +170,7 @@ class Book:
 
         Raises
         ------
-        SubmissionError : broken, or more than any recording has.
+        SubmissionError : the sheet is broken, or has more cells than any recording.
         """
         reading = _Sheet(self._shared_texts, most=_MOST_CELLS)
         try:
@@ -192,7 +194,7 @@ class Book:
         end: Callable[[str], object] = lambda _: None,
         said: Callable[[str], object] | None = None,
     ) -> None:
-        """Parse a part; handlers get names without prefixes."""
+        """Parse a part; the handlers get names without namespace prefixes."""
         if part not in self._members:
             raise _Broken(f"the part {part} is missing")
         depth = 0
@@ -242,7 +244,7 @@ class Book:
 
 @contextmanager
 def _reported(source: str) -> Iterator[None]:
-    """Turn whatever a broken workbook raises into one line."""
+    """Turn every error that a broken workbook causes into one of one line."""
     try:
         yield
     except (_Broken, zipfile.BadZipFile, zlib.error, struct.error, expat.ExpatError, EOFError,
@@ -252,7 +254,7 @@ def _reported(source: str) -> Iterator[None]:
 
 
 class _Bounded(BytesIO):
-    """Bytes of which `zipfile` may read only so many at once: the table of contents."""
+    """Bytes of which `zipfile` may read only a limited amount at once (the table of contents)."""
 
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > max(_MOST_DIRECTORY, _CHUNK):
@@ -265,7 +267,7 @@ class _Full(Exception):
 
 
 class _Texts:
-    """The list of texts, each perhaps in pieces; how a Japanese word sounds is no part of it."""
+    """The list of texts, each perhaps in pieces; Japanese pronunciation hints are ignored."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
@@ -294,14 +296,14 @@ class _Texts:
 
 
 class _Sheet:
-    """The cells of a sheet, as its elements come."""
+    """The cells of a sheet, built while its elements are read."""
 
     def __init__(self, shared: Callable[[], list[str]], *, most: int) -> None:
         self.cells = Cells()
         self._shared, self._left = shared, most
         self._row = self._column = 0
         self._kind, self._look, self._formula = "n", 0, False
-        self._pieces: list[str] | None = None  # None where no value is being read
+        self._pieces: list[str] | None = None  # None while no value is being read
         self._value: str | None = None
         self._in_sound = False
         self._numbers: dict[str, int] = {}
@@ -346,7 +348,7 @@ class _Sheet:
             raise _Broken("a cell that no sheet has")
 
     def _read(self, reference: str) -> tuple[int, int]:
-        """Return (row, column) of "B12"."""
+        """Return (row, column) of a reference such as "B12"."""
         match = _REFERENCE.fullmatch(reference)
         if match is None:
             raise _Broken("a cell without a place")
@@ -379,14 +381,14 @@ class _Sheet:
         elif self._kind in ("str", "inlineStr"):
             if text := value.strip():
                 self.cells.texts[at] = text
-        else:  # "e" an error, "b" true or false, "d" a date in words
+        else:  # "e" an error, "b" a truth value, "d" a date as text
             words = {"b": {"0": "FALSE", "1": "TRUE"}.get(value, value)}.get(self._kind, value)
             self.cells.wrong[at] = f"no number: {words[:30]!r}"
 
     def _merge(self, reference: str) -> None:
         first, _, last = reference.partition(":")
         (top, left), (bottom, right) = self._read(first), self._read(last or first)
-        if bottom - top < 10 and right - left < 10:  # a heading's
+        if bottom - top < 10 and right - left < 10:  # only small ranges, as in a heading
             for row in range(top, bottom + 1):
                 for column in range(left, right + 1):
                     self.cells.merged[row, column] = top, left
@@ -395,7 +397,7 @@ class _Sheet:
 
 
 def _look(number: int, code: str) -> str:
-    """Return what a format makes of a number: "percent", "time", "date" or ""."""
+    """Return what a number format stands for: "percent", "time", "date" or ""."""
     bare = _NO_CODE.sub("", code).casefold()
     if number in _PERCENTS or "%" in bare:
         return "percent"
