@@ -4,8 +4,9 @@ Content is decided once (`content.py`), so the two renderings cannot disagree, a
 data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 from pipeline import __version__
@@ -111,15 +112,26 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A numbered figure, drawn as SVG; `name` is its file in `figures/`."""
+    """A numbered figure; `name` is its file in `figures/`.
+
+    Attributes
+    ----------
+    draw : returns it as SVG; called once, when `svg` is first used.
+    blank : an empty SVG of its size, from which pages are laid out before it is drawn.
+    """
 
     number: int
     name: str
     caption: Spans
     alt: str
-    svg: str
-    width: float  # inches, as drawn
+    draw: Callable[[], str] = field(repr=False)
+    blank: str = field(default="", repr=False)
     kind: str = field(default="picture", init=False)
+
+    @cached_property
+    def svg(self) -> str:
+        """The drawing."""
+        return self.draw()
 
 
 @dataclass(frozen=True)
@@ -277,7 +289,7 @@ def make_table(
 def as_json(value: Any) -> Any:
     """Return dataclasses and tuples as what `json` can write."""
     if is_dataclass(value):
-        return {f.name: as_json(getattr(value, f.name)) for f in fields(value)}
+        return {f.name: as_json(getattr(value, f.name)) for f in fields(value) if f.repr}
     if isinstance(value, tuple):
         return [as_json(item) for item in value]
     return value

@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pypdf
@@ -14,11 +15,11 @@ import pytest
 
 from pipeline.checks.recordings import check_files, check_left_out
 from pipeline.plant.linear.chain import Chain
-from pipeline.report.document import Document, Paragraph, Picture, Section, Table, cell
+from pipeline.report.document import Block, Document, Paragraph, Picture, Section, Table, cell
 from pipeline.report.draft.content import build_document
 from pipeline.report.draft.write import Files, render_report
 from pipeline.report.render.html import render_html
-from pipeline.report.render.pdf import missing_characters, render_pdf
+from pipeline.report.render.pdf import lay_out, missing_characters, render_pdf
 from pipeline.report.sections.housekeeping import file_table, provenance_blocks
 from pipeline.report.sections.measurements import decay_blocks
 from pipeline.report.sections.page import Page as Shown
@@ -150,12 +151,43 @@ def test_figures_in_a_row_fill_pages(number, tall, pages):
     """Of 58 or 40 % of a page's height: a little smaller, one more fits; a few stay as drawn."""
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
     row = tuple(
-        Picture(
-            number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", svg=svg, width=5.2
-        )
+        Picture(number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", draw=lambda: svg)
         for n in range(number)
     )
     assert len(printed(Section("f", "Figures", row))) == pages
+
+
+def test_pages_are_laid_out_before_the_figures_are_drawn():
+    """Blank figures have the size of the drawn ones, so the pages come out the same."""
+    document = build_document(make_analysis(2))
+    pictures = document.pictures()
+
+    layout = lay_out(document)
+
+    assert not any("svg" in vars(picture) for picture in pictures)  # nothing is drawn
+    for picture in pictures:
+        blank, drawn = map(ElementTree.fromstring, (picture.blank, picture.svg))
+        for size in ("width", "height", "viewBox"):
+            assert numbers(blank.attrib[size]) == numbers(drawn.attrib[size])
+    assert len(pictures) > 5
+    assert lay_out(without_blanks(document)) == layout
+
+
+def numbers(text: str) -> list[float]:
+    """Return the numbers of an attribute."""
+    return [float(number) for number in text.removesuffix("pt").split()]
+
+
+def without_blanks(document: Document) -> Document:
+    """Return the document with figures that must be drawn to be laid out."""
+
+    def drawn(block: Block) -> Block:
+        return replace(block, blank="") if isinstance(block, Picture) else block
+
+    sections = tuple(
+        replace(section, blocks=tuple(map(drawn, section.blocks))) for section in document.sections
+    )
+    return replace(document, sections=sections)
 
 
 def printed(*sections: Section) -> list[str]:

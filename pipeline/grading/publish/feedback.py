@@ -29,7 +29,6 @@ from pipeline.report.document import (
     make_table,
     paragraph,
 )
-from pipeline.report.figures.style import WIDTH
 from pipeline.report.render.html import render_html
 from pipeline.set_up import Units
 from pipeline.words.numbers import NOTHING, percent, significant, typeset, unit_text
@@ -323,8 +322,7 @@ def _picture(number: int, file: str, svg: str) -> Picture:
         name=file.removesuffix(".svg"),
         caption=rich(alt),
         alt=alt,
-        svg=svg,
-        width=WIDTH,
+        draw=lambda: svg,
     )
 
 

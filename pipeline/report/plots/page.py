@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlencode
 
@@ -154,14 +155,7 @@ def _draw_still(page: Page, runs: Sequence[ComparedRun], *, added: str) -> Pictu
     with drawing():
         figure = _still_figure(chosen[0], position_unit=page.position, added=added)
         picture = page.picture("compare", figure, _WORDS, "still", run=chosen[0].id)
-    return Picture(
-        number=picture.number,
-        name=picture.name,
-        caption=picture.caption,
-        alt=picture.alt,
-        svg=plain_svg(picture.svg),
-        width=picture.width,
-    )
+    return replace(picture, draw=lambda: plain_svg(picture.svg))
 
 
 def _still_figure(run: ComparedRun, *, position_unit: str, added: str) -> Figure:

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from typing import Any
 
 from matplotlib.figure import Figure
 
 from pipeline.report.document import Block, Cell, Picture, Section, Table, make_table
-from pipeline.report.figures.style import WIDTH, drawing
-from pipeline.report.figures.svg import to_svg
+from pipeline.report.figures.style import drawing
+from pipeline.report.figures.svg import blank_svg, to_svg
 from pipeline.words.phrases import Phrases
 from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import Spans
@@ -74,7 +75,7 @@ class PageBuilder:
         alt: str = "",
         **said: object,
     ) -> Picture:
-        """Return a figure as SVG, under the next number.
+        """Return a figure, to be drawn later, under the next number.
 
         The sentence `key` is its caption; `alt`, by default `key_alt`, reads it to who sees none.
         """
@@ -84,6 +85,11 @@ class PageBuilder:
             name=name,
             caption=rich(clean(words.text(key, **said))),
             alt=alt,
-            svg=to_svg(figure, name=name, alt=alt),
-            width=WIDTH,
+            draw=partial(_draw, figure, name=name, alt=alt),
+            blank=blank_svg(figure),
         )
+
+
+def _draw(figure: Figure, *, name: str, alt: str) -> str:
+    with drawing():
+        return to_svg(figure, name=name, alt=alt)

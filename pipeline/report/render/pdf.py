@@ -1,7 +1,7 @@
 """A document as PDF, by typst: everything goes in as JSON, so no text is ever markup."""
 
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ import typst
 from matplotlib import get_data_path
 from matplotlib.ft2font import FT2Font
 
-from pipeline.report.document import Document, as_json
+from pipeline.report.document import Document, Picture, as_json
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.render.room import Choices, End, Pages, fill_pages
 from pipeline.resources import TEMPLATES
@@ -22,13 +22,33 @@ _MISSING = "□"  # stands for a character that no font has
 _SHOWN_IN_WARNING = 20
 
 
+@dataclass(frozen=True, kw_only=True)
+class Layout:
+    """How a document is laid out: its content as JSON, and what is set otherwise than usual."""
+
+    text: str
+    choices: Choices
+
+
 def render_pdf(document: Document) -> bytes:
     """Return the PDF (archival A-2a, accessible UA-1), with its own fonts only."""
-    data = _printable(as_json(document))
-    text = json.dumps(data, ensure_ascii=False, allow_nan=False)
-    choices = fill_pages(lambda choices: _lay_out(text, choices))
+    return print_pages(document, lay_out(document))
+
+
+def lay_out(document: Document) -> Layout:
+    """Lay out the pages, which takes most of the time of a PDF; no figure needs to be drawn yet."""
+    text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
+    blanks = {_file(one): (one.blank or one.svg).encode() for one in document.pictures()}
+    choices = fill_pages(lambda choices: _try(_parts(text, choices, blanks)))
+    return Layout(text=text, choices=choices)
+
+
+def print_pages(document: Document, layout: Layout) -> bytes:
+    """Return the PDF of a document that is laid out; typst remembers what has not changed since."""
+    drawn = {_file(one): _printable(plain_svg(one.svg)).encode() for one in document.pictures()}
     pdf = typst.compile(
-        **_source(text, choices),
+        _parts(layout.text, layout.choices, drawn),
+        font_paths=_fonts(),
         pdf_standards=["a-2a", "ua-1"],
         timestamp=_TIMESTAMP,
         format="pdf",
@@ -37,19 +57,28 @@ def render_pdf(document: Document) -> bytes:
     return pdf
 
 
-def _source(text: str, choices: Choices) -> dict[str, Any]:
+def _parts(text: str, choices: Choices, figures: dict[str, bytes]) -> Any:
     """Return what is compiled, a part a file: typst remembers what follows from each alone."""
-    parts = {
+    return {
         "main.typ": (TEMPLATES / "report.typ").read_bytes(),
         "document.json": text.encode(),
         "choices.json": json.dumps(asdict(choices)).encode(),
+        **figures,
     }
-    # Without fonts of the system, as another machine must give the same pages.
-    return {"input": parts, "font_paths": [_font_folder()], "ignore_system_fonts": True}
 
 
-def _lay_out(text: str, choices: Choices) -> Pages:
-    found = typst.query(**_source(text, choices), selector="<pages>", field="value")
+def _file(picture: Picture) -> str:
+    return f"{picture.number}.svg"
+
+
+@cache
+def _fonts() -> typst.Fonts:
+    """Leave out fonts of the system, as another machine must give the same pages."""
+    return typst.Fonts(include_system_fonts=False, font_paths=[_font_folder()])
+
+
+def _try(parts: Any) -> Pages:
+    found = typst.query(parts, font_paths=_fonts(), selector="<pages>", field="value")
     (pages,) = json.loads(found)
     return Pages(**pages | {"ends": [End(**end) for end in pages["ends"]]})
 
@@ -62,7 +91,7 @@ def missing_characters(text: str) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """Return JSON with the characters that no font has replaced, and drawings without data.
+    """Return JSON with the characters that no font has replaced.
 
     Numbers keep to their units, but in what is quoted as it is typed.
 
@@ -74,10 +103,7 @@ def _printable(value: Any) -> Any:
     if isinstance(value, dict):
         if value.get("style", "code") != "code":
             value = value | {"text": unbroken(value["text"])}
-        return {
-            key: _printable(plain_svg(item) if key == "svg" else item)
-            for key, item in value.items()
-        }
+        return {key: _printable(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_printable(item) for item in value]
     return value
