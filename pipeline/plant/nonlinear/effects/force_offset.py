@@ -23,7 +23,7 @@ EFFECT = Effect(
     fingerprint="In every run the cart rests off zero, as if pushed by the same force.",
     deciding_run="Runs with different carts held: against stiffer springs a force displaces the "
     "cart less, but a wrong encoder zero stays the same.",
-    reference="statics of the chain",
+    reference="the balance of forces in the chain at rest",
     axis="position",
     only_rest=True,
     equivalent="A wrong encoder zero, if the same carts are held in all runs.",

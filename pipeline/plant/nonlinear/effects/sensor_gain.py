@@ -14,7 +14,7 @@ EFFECT = Effect(
     parameters=(EffectParameter("gain", "g", "", scale="1", typical=0.97, neutral=1.0),),
     fingerprint="No chain of springs gives the measured ratio between the carts' amplitudes.",
     deciding_run="Move each cart along a ruler and compare with its encoder.",
-    reference="statics of the chain",
+    reference="the balance of forces in the chain at rest",
     axis="position",
     fewest_carts=2,
     same_as="sensor_gain",
