@@ -24,7 +24,7 @@ def test_it_has_every_documented_key(results):
     """All top-level keys are there, in their order, under the schema's name."""
     assert results["schema"] == "cartlab-results/1"
     page = (ROOT / "docs" / "results.md").read_text(encoding="utf-8").split("\n## ")[0]
-    assert list(results) == re.findall(r"^\| `(\w+)` \|", page, re.MULTILINE)
+    assert list(results) == re.findall(r"^- \*\*`(\w+)`\*\*:", page, re.MULTILINE)
 
 
 def test_parameters_follow_the_papers_table(results):
