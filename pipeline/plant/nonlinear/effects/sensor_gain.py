@@ -18,6 +18,6 @@ EFFECT = Effect(
     axis="position",
     fewest_carts=2,
     same_as="sensor_gain",
-    equivalent="The gain of another cart: the data show only ratios, and without springs to both "
-    "walls not even these.",
+    equivalent="The gain of another cart, as the data show only ratios of gains. Without springs "
+    "to both walls they show no gain at all.",
 )
