@@ -1,7 +1,7 @@
-"""A report as plain data: sections of blocks, which HTML and PDF both render.
+"""A report as plain data: sections of blocks, which are rendered as HTML and as PDF.
 
-Content is decided once (`content.py`), so the two renderings cannot disagree, and every text is
-data: neither renderer ever takes a string for markup. `as_json` is what the PDF template reads.
+The content is decided once (`content.py`), so both renderings agree. Every text is data: neither
+renderer ever reads a string as markup. `as_json` makes the input of the PDF template.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,9 +14,9 @@ from pipeline.words.math import Math
 from pipeline.words.numbers import at_decimal
 from pipeline.words.spans import Span, Spans, plain, spans
 
-_MUCH = 24  # letters of a cell that takes most of the width of a phone
-_LONG = 16  # letters of a value for which a tile is wide
-_WIDE_TILES, _MOST_TILES = 3, 5  # side by side
+_MUCH = 24  # characters of a cell that takes most of the width of a phone
+_LONG = 16  # characters of a value that makes its tile wide
+_WIDE_TILES, _MOST_TILES = 3, 5  # side by side in one row
 
 Tone = Literal["", "good", "bad", "quiet"]
 
@@ -65,7 +65,13 @@ class Code:
 
 @dataclass(frozen=True)
 class Formula:
-    """A displayed equation; `alt` reads it in words, `copy` can be pasted elsewhere."""
+    """A displayed equation.
+
+    Attributes
+    ----------
+    alt : the equation in words.
+    copy : text that a reader can paste into a program.
+    """
 
     math: Math
     alt: str
@@ -75,9 +81,13 @@ class Formula:
 
 @dataclass(frozen=True)
 class Cell:
-    """A table cell; `tone` colours what its text already says.
+    """A table cell.
 
-    In a column aligned on the decimal mark `parts` is the text before it, and from it on.
+    Attributes
+    ----------
+    tone : colour, in addition to what the text says.
+    parts : in a column aligned on the decimal mark: the text before the mark, and the text from it
+        on.
     """
 
     text: Spans
@@ -87,10 +97,13 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A numbered table; `align` has one of l, c, r or d (on the decimal mark) for each column.
+    """A numbered table.
 
-    A page lets its reader search and sort it where it is a `finder`; small print is for what is
-    there to be looked up.
+    Attributes
+    ----------
+    align : one letter for each column: l, c, r or d (on the decimal mark).
+    finder : readers of the page can search and sort the table.
+    small : set in small print, for readers who look something up.
     """
 
     number: int
@@ -104,7 +117,10 @@ class Table:
 
     @property
     def told(self) -> bool:
-        """Return whether its cells say much: a phone then shows a row as lines, not as columns."""
+        """Return whether cells contain long text.
+
+        A phone then shows each row as lines, not columns.
+        """
         if self.finder or self.small:
             return False
         return any(len(plain(cell.text)) > _MUCH for row in self.rows for cell in row)
@@ -136,7 +152,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Tile:
-    """One fact on a board: what it is, its value, and what it means; `url` leads to its section."""
+    """One fact on a board: its label, value and meaning.
+
+    Attributes
+    ----------
+    url : address of the section about it.
+    """
 
     label: Spans
     value: Spans
@@ -147,7 +168,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class Tiles:
-    """A board of facts, seen at a glance."""
+    """A board of facts to take in at a glance."""
 
     tiles: tuple[Tile, ...]
     across: int = field(init=False)
@@ -156,17 +177,18 @@ class Tiles:
     def __post_init__(self) -> None:
         most = _WIDE_TILES if self.longest > _LONG else _MOST_TILES
         rows = -(-len(self.tiles) // most)
-        object.__setattr__(self, "across", -(-len(self.tiles) // rows))  # rows of one length
+        # Rows of equal length.
+        object.__setattr__(self, "across", -(-len(self.tiles) // rows))
 
     @property
     def longest(self) -> int:
-        """Return the letters of the longest value."""
+        """The number of characters of the longest value."""
         return max(len(plain(tile.value)) for tile in self.tiles)
 
 
 @dataclass(frozen=True)
 class Details:
-    """Blocks that a page hides until they are asked for; print shows them all."""
+    """Blocks that a page shows only when a reader opens them; in print they are always shown."""
 
     title: Spans
     blocks: tuple["Block", ...]
@@ -175,7 +197,7 @@ class Details:
 
 @dataclass(frozen=True)
 class Question:
-    """A question to the students and their answer; without one, a place is marked for it."""
+    """A question to the students, with their answer or a mark where the answer is missing."""
 
     id: str
     text: Spans
@@ -200,7 +222,12 @@ Block = (
 
 @dataclass(frozen=True)
 class Section:
-    """A section; `id` is its anchor."""
+    """A section of a report.
+
+    Attributes
+    ----------
+    id : its anchor.
+    """
 
     id: str
     title: str
@@ -209,7 +236,12 @@ class Section:
 
 @dataclass(frozen=True)
 class Document:
-    """A whole report; `plots` is a page of plots next to it, or ""."""
+    """A whole report.
+
+    Attributes
+    ----------
+    plots : address of the page with plots of all recordings; "" without one.
+    """
 
     title: str
     subtitle: str
@@ -219,7 +251,7 @@ class Document:
     footer: str = f"cartlab {__version__}"
 
     def pictures(self) -> tuple[Picture, ...]:
-        """Return the figures, in order."""
+        """The figures in order."""
         return tuple(
             block
             for section in self.sections
@@ -229,7 +261,7 @@ class Document:
 
 
 def flat(blocks: Iterable[Block]) -> Iterator[Block]:
-    """Yield blocks in order, those inside `Details` too."""
+    """Yield all blocks in order, including those inside `Details`."""
     for block in blocks:
         if isinstance(block, Details):
             yield from flat(block.blocks)
@@ -238,12 +270,12 @@ def flat(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def paragraph(*parts: str | Span | Spans) -> Paragraph:
-    """Return a paragraph of the joined parts."""
+    """Return a paragraph made of several parts."""
     return Paragraph(spans(*parts))
 
 
 def bullet_list(items: Iterable[Spans]) -> Items:
-    """Return a list of one-paragraph items."""
+    """Return a list in which each item is one paragraph."""
     return Items(tuple((Paragraph(item),) for item in items))
 
 
@@ -271,7 +303,12 @@ def make_table(
     rows: Iterable[Sequence[Cell | str | Spans]],
     align: str,
 ) -> Table:
-    """Return a table; cells may be given by their texts, `align` is one letter a column."""
+    """Return a table; cells may be given as plain text.
+
+    Parameters
+    ----------
+    align : one letter for each column; see `Table`.
+    """
 
     def cut(content: Cell | str | Spans, how: str) -> Cell:
         made = content if isinstance(content, Cell) else cell(content)
@@ -287,7 +324,7 @@ def make_table(
 
 
 def as_json(value: Any) -> Any:
-    """Return dataclasses and tuples as what `json` can write."""
+    """Return dataclasses and tuples in a form that `json` can write."""
     if is_dataclass(value):
         return {f.name: as_json(getattr(value, f.name)) for f in fields(value) if f.repr}
     if isinstance(value, tuple):

@@ -1,1 +1,1 @@
-"""The report of a submission as a whole, and what changed since an earlier one."""
+"""The complete report of a submission, and what has changed since an earlier report."""

@@ -1,6 +1,6 @@
-"""What changed between two drafts: an earlier `results.json` and the analysis of now.
+"""Compare an earlier `results.json` with the current analysis.
 
-Told are the numbers that moved and the checks that fail now: what people look at.
+Only numbers that changed and checks that now fail are listed, because people look at these.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,13 +23,13 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import capital, clean, name_span, rich
 
 _WORDS = phrases("report")
-_MOST_BYTES = 20_000_000  # of a results.json; real ones have a few ten thousand
-Draft = Mapping[str, Any]  # a whole results.json
+_MOST_BYTES = 20_000_000  # bytes of a results.json; real files have some ten thousand
+Draft = Mapping[str, Any]  # the content of a results.json
 
 
 @dataclass(frozen=True, kw_only=True)
 class DraftNumber:
-    """A number of one draft, with its standard error where it has one."""
+    """A number of one draft, with its standard error if it has one."""
 
     value: float
     std: float | None = None
@@ -38,7 +38,13 @@ class DraftNumber:
 
 @dataclass(frozen=True, kw_only=True)
 class Change:
-    """A number before and now; None where it is not there."""
+    """A number in both drafts.
+
+    Attributes
+    ----------
+    what : what the number is about.
+    before, after : None if that draft lacks the number.
+    """
 
     what: str
     name: str
@@ -47,7 +53,7 @@ class Change:
 
     @property
     def percent(self) -> float | None:
-        """The change in percent of the value before."""
+        """The change in percent of the earlier value."""
         if self.before is None or self.after is None or self.before.value == 0:
             return None
         return 100 * (self.after.value - self.before.value) / abs(self.before.value)
@@ -63,17 +69,23 @@ class Change:
 
     @property
     def differs(self) -> bool:
-        """Whether it is another number, or one of the two is not there."""
+        """Whether the numbers differ, or one draft lacks the number."""
         if self.before is None or self.after is None:
             return self.before is not self.after
         old, new = self.before.value, self.after.value
-        # Two processors agree to this on the ten digits of the file.
+        # The file has ten digits, and two processors agree to this share of a number.
         return abs(new - old) > 1e-8 * max(abs(old), abs(new))
 
 
 @dataclass(frozen=True, kw_only=True)
 class DraftChanges:
-    """The numbers that moved, and the messages of the checks that fail now and did not, by id."""
+    """The differences between two drafts.
+
+    Attributes
+    ----------
+    numbers : those that changed.
+    failed : messages of the checks that fail now but did not before, by id.
+    """
 
     numbers: tuple[Change, ...]
     failed: dict[str, str]
@@ -83,11 +95,11 @@ class DraftChanges:
 
 
 def read_results(path: Path) -> Draft:
-    """Return what an earlier `results.json` holds.
+    """Return the content of an earlier `results.json`.
 
     Raises
     ------
-    ConfigError : it is no file, or none that cartlab wrote.
+    ConfigError : the file cannot be read, or cartlab did not write it.
     """
     try:
         if path.stat().st_size > _MOST_BYTES:
@@ -102,7 +114,7 @@ def read_results(path: Path) -> Draft:
 
 
 def check_comparable(before: Draft, *, bench: Bench) -> None:
-    """Refuse what has no number in common with an earlier draft.
+    """Refuse an earlier draft that has no number in common with this bench.
 
     Raises
     ------
@@ -118,7 +130,7 @@ def check_comparable(before: Draft, *, bench: Bench) -> None:
 
 
 def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
-    """Return what changed from an earlier draft to an analysis.
+    """Return what changed between an earlier draft and an analysis.
 
     Raises
     ------
@@ -143,7 +155,7 @@ def compare_drafts(before: Draft, analysis: Analysis) -> DraftChanges:
 
 
 def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
-    """Yield what a number is about, its name and the number: estimates, feedback, hardware."""
+    """Yield the numbers of a draft: subject, name and value of estimates, feedback and hardware."""
     for which in ("final", "initial"):
         for row in draft["parameters"]:
             value, std = row.get(which), row.get(f"{which}_std")
@@ -171,7 +183,7 @@ def _numbers(draft: Draft) -> Iterator[tuple[str, str, DraftNumber]]:
 
 
 def changes_line(changes: DraftChanges) -> str:
-    """Return what changed in one line, for the terminal."""
+    """Return the changes in one line for the terminal."""
     parts = []
     for which in ("final", "initial"):
         moved = [c for c in changes.numbers if c.what == which and c.percent is not None]
@@ -187,7 +199,7 @@ def changes_line(changes: DraftChanges) -> str:
 
 
 def change_blocks(page: Page, changes: DraftChanges | None) -> list[Block]:
-    """Return what changed since the earlier draft."""
+    """Return the section on changes since the earlier draft."""
     if changes is None:
         return []
     blocks: list[Block] = [paragraph(rich(capital(changes_line(changes)) + "."))]
@@ -209,13 +221,13 @@ def _number_row(change: Change) -> list[Cell]:
         cell(change.what, "quiet"),
         cell(unit_text(clean(known.unit if known else "")) or "1"),
         *(cell(with_error(n.value, n.std) if n else NOTHING) for n in drafts),
-        # A number that moved by less than one standard error did not move.
+        # A change of less than one standard error is shown as no change.
         cell(_moved(change), "quiet" if sigmas is not None and abs(sigmas) < 1.0 else ""),
     ]
 
 
 def _moved(change: Change, *, between: str = " (") -> str:
-    """Return "+2.0 % (1.4 σ)", or without brackets."""
+    """Return a change as text: "+2.0 % (1.4 σ)", or with other text than " (" between the two."""
     text = percent(change.percent, signed=True)
     if change.sigmas is None:
         return text

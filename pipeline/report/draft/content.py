@@ -1,4 +1,4 @@
-"""What a report says, in order: an `Analysis` as a `Document`."""
+"""The content of a report in order: turn an `Analysis` into a `Document`."""
 
 from collections.abc import Callable, Sequence
 
@@ -51,11 +51,14 @@ def build_document(
     changes: DraftChanges | None = None,
     progress: Progress = silent,
 ) -> Document:
-    """Return the report of an analysis; sections that have nothing to show are left out.
+    """Return the report of an analysis; sections with nothing to show are left out.
 
-    `gap` is the gap analysis of the same data, if there is one. `worked` sections replace the
-    section on the model. `changes` are the differences from an earlier draft. `answer` gives the
-    model answer to a question; the students' notes are then left out.
+    Parameters
+    ----------
+    gap : the gap analysis of the same data, if there is one.
+    worked : sections with derivations, in place of the section on the model.
+    answer : returns the model answer to a question; the students' notes are then left out.
+    changes : differences from an earlier draft.
     """
     page = Page(analysis)
     asked = ask(analysis)

@@ -1,4 +1,4 @@
-"""From a submission to its report in a folder: what `cartlab report` and the desk do."""
+"""Write the report of a submission into a folder, for `cartlab report` and for the desk."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from pipeline.workflow import analyse
 
 @dataclass(frozen=True, kw_only=True)
 class Files:
-    """What is written beside `report.html` and `figures/`.
+    """Which files are written in addition to `report.html` and `figures/`.
 
     Attributes
     ----------
-    tables : `tables/*.csv` and `results.mat`.
-    plots : the page of plots to look through, to which the report then leads.
+    tables : write `tables/*.csv` and `results.mat`.
+    plots : write the page with plots of all recordings, and link it in the report.
     """
 
     pdf: bool = True
@@ -42,20 +42,20 @@ def make_report(
     files: Files = Files(),
     progress: Progress,
 ) -> tuple[Analysis, DraftChanges | None]:
-    """Analyse a submission, write its report, and return both and what changed.
+    """Analyse a submission and write its report; return the analysis and the changes.
 
     Parameters
     ----------
-    compared : what an earlier draft had otherwise; asked before that is written over.
+    compared : returns the differences from an earlier draft; called before that is overwritten.
     """
     analysis, gap = with_gap(analyse(submission, progress=progress), submission.folder)
     changes = compared(analysis)
     out.mkdir(parents=True, exist_ok=True)
     write_file(out / "results.json", json_text(analysis))
-    clear_files(out, "results.mat")  # of an earlier report
+    clear_files(out, "results.mat")  # left by an earlier report
     clear_files(own_folder(out, "tables"), "*.csv")
     if files.tables:
-        from pipeline.exchange.saved import save_tables  # loads pandas
+        from pipeline.exchange.saved import save_tables  # imported late, because it loads pandas
 
         save_tables(analysis, out)
     render_report(analysis, out, gap=gap, changes=changes, files=files, progress=progress)
@@ -73,15 +73,15 @@ def render_report(
 ) -> None:
     """Write `report.html`, `figures/*.svg` and the other requested files into the folder `out`.
 
-    The same analysis gives the same bytes. The report and `progress` warn of characters that the
-    PDF's fonts lack; `progress` also gets the name of each section.
+    The same analysis gives the same bytes. Both the report and `progress` warn of characters that
+    the PDF's fonts lack. `progress` is also called with the name of each section.
     """
     if files.pdf and (lost := missing_characters(_students_text(analysis))):
         warning = f"report.pdf: its fonts lack {lost}; report.html shows them"
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)
-    clear_files(out, plots.NAME)  # of an earlier report
+    clear_files(out, plots.NAME)  # left by an earlier report
     if files.plots:
         document = replace(document, plots=plots.NAME)
     write_document(document, out, name="report", pdf=files.pdf)
@@ -90,7 +90,7 @@ def render_report(
 
 
 def _students_text(analysis: Analysis) -> str:
-    """Return all that students wrote and the report shows."""
+    """Return all text in the report that students wrote."""
     authors = (part for author in analysis.authors for part in author)
     records = (record.id for record in analysis.records)
     units = vars(analysis.bench.units).values()

@@ -1,4 +1,4 @@
-"""The catalogue of effects as text for a terminal, and as plain data."""
+"""The catalogue of effects, as text for a terminal and as data for JSON."""
 
 import textwrap
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from pipeline.plant.nonlinear.effects import Effect, EffectParameter
 from pipeline.words.math import to_tex, to_text
 from pipeline.words.numbers import unit_text
 
-POSITION, INPUT = "cm", "V"  # a bench reads other units as well: these are the presets'
+POSITION, INPUT = "cm", "V"  # units of the presets; benches may have others
 
 _WIDTH = 100
 _WHERE = {
@@ -24,7 +24,10 @@ def catalogue_text(effects: Sequence[Effect]) -> str:
 
 
 def catalogue_data(effects: Sequence[Effect]) -> list[dict[str, Any]]:
-    """Return the entries as plain data for JSON; parameters left to defaults have `detail` true."""
+    """Return the entries as data for JSON.
+
+    A parameter that is usually left at its default has `detail` true.
+    """
     return [
         {
             "effect": effect.key,
@@ -52,7 +55,7 @@ def catalogue_data(effects: Sequence[Effect]) -> list[dict[str, Any]]:
 
 
 def parameter_text(parameter: EffectParameter) -> str:
-    """Return "force F [V]"; no unit for a pure number."""
+    """Return a parameter as text: "force F [V]"; a pure number has no unit."""
     unit = unit_text(parameter.unit_text(position=POSITION, input=INPUT))
     name = f"{parameter.name} {parameter.symbol}"
     return f"{name} [{unit}]" if unit else name

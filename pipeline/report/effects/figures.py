@@ -1,4 +1,4 @@
-"""Pictures of the effects: the fingerprint of each, and one run with and without it."""
+"""Pictures of the effects: the fingerprint of each, and one run with and without the effect."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,14 +23,20 @@ from pipeline.report.figures.style import (
 )
 from pipeline.words.numbers import subscript
 
-_RATE = 1000.0  # Hz: differences of the positions are then velocities and accelerations
+# Hz; fast enough to compute velocities and accelerations as differences of positions.
+_RATE = 1000.0
 _DURATION = 4.0  # s
-_STEP = (0.1, 2.1)  # s, on and off
+_STEP = (0.1, 2.1)  # s; the input is switched on and off at these times
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Run:
-    """One run: readings (n_carts, n) of the bench without and with the effect."""
+    """One run of the bench, simulated twice.
+
+    Attributes
+    ----------
+    without, with_it : readings (n_carts, n) without and with the effect.
+    """
 
     name: str
     t: Array
@@ -40,11 +46,11 @@ class _Run:
     with_it: Array
 
     def rate(self) -> Array:
-        """Velocities (n_carts, n) with the effect."""
+        """Return the velocities (n_carts, n) with the effect."""
         return np.gradient(self.with_it, self.t, axis=1)
 
     def residual_force(self, chain: Chain) -> Array:
-        """Forces (n_carts, n) that masses, dampings and springs leave, with the effect."""
+        """Return the forces (n_carts, n) that masses, dampings and springs do not explain."""
         v = self.rate()
         a = np.gradient(v, self.t, axis=1)
         force = chain.m[:, None] * a + chain.c[:, None] * v + chain.stiffness @ self.with_it
@@ -53,7 +59,7 @@ class _Run:
 
 
 def effect_figure(term: EffectTerm, chain: Chain) -> Figure:
-    """Return the fingerprint of an effect on a bench, and the run that shows it best in time."""
+    """Return a figure with the fingerprint of an effect, and the run in which it shows best."""
     cart = _cart(term, chain)
     runs = _runs(term, chain, cart=cart)
     shown = max(runs, key=lambda run: _difference(run, cart))
@@ -71,12 +77,12 @@ def effect_figure(term: EffectTerm, chain: Chain) -> Figure:
 
 
 def scales_readings(effect: Effect) -> bool:
-    """Tell whether an effect changes what the sensor reads, not how the cart moves."""
+    """Return whether an effect changes the sensor's readings, not the motion."""
     return any(p.neutral == 1.0 for p in effect.parameters)
 
 
 def _window(run: _Run, cart: int) -> slice:
-    """Return the samples to show: all, or half a second about the largest of small differences."""
+    """Return the samples to show: all; or a second around the largest difference if it is small."""
     if _difference(run, cart) > 0.1:
         return slice(None)
     largest = int(np.argmax(np.abs(run.with_it[cart - 1] - run.without[cart - 1])))
@@ -86,7 +92,7 @@ def _window(run: _Run, cart: int) -> slice:
 
 
 def _cart(term: EffectTerm, chain: Chain) -> int:
-    """Return the cart to look at: that of the effect, the right one of a spring, the driven one."""
+    """Return the cart to show: that of the effect, the right one of a spring, or the driven one."""
     return min(max(term.place, 1), chain.n)
 
 
@@ -96,12 +102,15 @@ def _difference(run: _Run, cart: int) -> float:
 
 
 def _runs(term: EffectTerm, chain: Chain, *, cart: int) -> list[_Run]:
-    """Return a step on and off and, for what is not in the drive, a decay of that cart alone."""
+    """Return a step on and off.
+
+    If the effect is not in the drive, also a decay of the cart alone.
+    """
     t = np.arange(0.0, _DURATION, 1 / _RATE)
-    # Just less than the input that holds a cart at its travel.
+    # Slightly less than the input that holds a cart at the end of its travel.
     size = 0.95 / float(np.max(np.abs(chain.static_gains())))
     everyone = tuple(range(1, chain.n + 1))
-    # To the side on which the effect acts, where it has one.
+    # If the effect acts only to one side, the step goes to that side.
     side = next(
         (np.sign(v) for p, v in zip(term.effect.parameters, term.values, strict=True) if p.side),
         1.0,
@@ -111,7 +120,7 @@ def _runs(term: EffectTerm, chain: Chain, *, cart: int) -> list[_Run]:
     runs = [_run("step", model, t, np.where(on, side * size, 0.0), free=everyone)]
     if term.effect.place != "input":
         start = np.zeros(chain.n)
-        start[cart - 1] = 1.4  # times the travel
+        start[cart - 1] = 1.4  # multiple of the travel
         runs.append(_run("decay", model, t, np.zeros_like(t), free=(cart,), x0=start))
     return runs
 
@@ -155,13 +164,13 @@ def _fingerprint(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: i
 
 
 def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force that the linear chain leaves against what it depends on."""
+    """Plot the force that the linear chain leaves over the quantity on which it depends."""
     motion = run.rate() if term.effect.axis == "velocity" else run.with_it
     force, seen, word = run.residual_force(chain)[cart - 1], motion[cart - 1], f"of cart {cart}"
     if term.effect.place == "spring":
         walls = np.zeros((1, run.t.size))
         stretch = np.diff(np.concatenate([walls, motion, walls]), axis=0)
-        # A stretched spring pulls its right cart back and its left cart on.
+        # A stretched spring pulls its right cart back and its left cart forward.
         force = -force if cart == term.place else force
         seen, word = stretch[term.place - 1], f"of spring {term.place}"
     inside = slice(3, -3)  # differences at the ends are one-sided
@@ -177,7 +186,7 @@ def _against_motion(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart
 
 
 def _against_input(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force that arrives on cart 1 against the input, slow enough to see the law."""
+    """Plot the force on cart 1 over the input; the input is slow enough to show the law."""
     size = float(np.max(np.abs(run.u)))
     u = size * np.sin(2 * np.pi * run.t / _DURATION)
     slow = _run("ramp", AugmentedChain(chain=chain, terms=(term,)), run.t, u, free=run.free)
@@ -188,7 +197,7 @@ def _against_input(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart:
 
 
 def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot the force that arrives on cart 1 about an edge of the input."""
+    """Plot the force on cart 1 around an edge of the input."""
     near = (run.t > _STEP[1] - 0.02) & (run.t < _STEP[1] + 0.08)
     milliseconds = 1e3 * (run.t[near] - _STEP[1])
     arriving = run.residual_force(chain)[0] + run.u
@@ -199,11 +208,11 @@ def _about_an_edge(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart:
 
 
 def _over_frequency(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart: int) -> None:
-    """Plot how much the cart moves per input over frequency, from its answer to a short pulse."""
-    t = np.arange(0.0, 12.0, 1 / _RATE)  # until nothing is left of the pulse
+    """Plot the cart's response over frequency, computed from its response to a short pulse."""
+    t = np.arange(0.0, 12.0, 1 / _RATE)  # s; until the response to the pulse has ended
     padded = 2 * t.size
     u = np.zeros(t.size)
-    u[20:40] = 1.0  # short against every period
+    u[20:40] = 1.0  # short compared with every period
     model = AugmentedChain(chain=chain, terms=(term,))
     pulse = _run("pulse", model, t, u, free=tuple(range(1, chain.n + 1)))
     hertz, omega = np.fft.rfftfreq(padded, 1 / _RATE), np.abs(chain.poles) / (2 * np.pi)
@@ -218,7 +227,7 @@ def _over_frequency(ax: Axes, term: EffectTerm, chain: Chain, run: _Run, *, cart
 
 
 def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
-    """Plot what the sensor reads against where the cart is."""
+    """Plot the sensor's reading over the true position."""
     reach = np.array([run.without[cart - 1].min(), run.without[cart - 1].max()])
     ax.plot(reach, reach, **SECOND_LINE)
     _cloud(ax, run.without[cart - 1], run.with_it[cart - 1])
@@ -227,7 +236,7 @@ def _against_truth(ax: Axes, run: _Run, *, cart: int) -> None:
 
 
 def _cloud(ax: Axes, x: Array, y: Array) -> None:
-    """Plot points; the limits leave out the spikes that differences make at a jump."""
+    """Plot points; the axes leave out the spikes that differences cause at a jump."""
     shown = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.plot(x[shown], y[shown], ".", color=MODEL, ms=2.6, mew=0)
     low, high = np.quantile(y, [0.002, 0.998])

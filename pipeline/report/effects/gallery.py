@@ -1,4 +1,4 @@
-"""The catalogue of effects as a page: what each is, how it looks in data, what decides."""
+"""The catalogue of effects as a page: law, picture and deciding run of each."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,11 +19,11 @@ from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import Span, spans
 
 _WORDS = phrases("effects")
-BENCH = "throne-2dof"  # the smallest with a spring between two carts
+BENCH = "throne-2dof"  # the smallest preset with a spring between two carts
 
 
 def render_effects(effects: Sequence[Effect], out: Path, *, progress: Progress = silent) -> None:
-    """Write `effects.html` and `figures/*.svg` into the folder `out`; same bytes each time."""
+    """Write `effects.html` and `figures/*.svg` into the folder `out`; the same bytes each time."""
     write_document(build_gallery(effects, progress=progress), out, name="effects", pdf=False)
 
 
@@ -71,7 +71,7 @@ def _entry(page: PageBuilder, effect: Effect) -> list[Block]:
 
 
 def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: str) -> Picture:
-    """Return an effect's fingerprint on a bench, and a run with and without it."""
+    """Return a picture of an effect: its fingerprint, and a run with and without it."""
     effect = term.effect
     sizes = (
         f"{p.symbol} = {significant(value, digits=3)} "
@@ -92,7 +92,7 @@ def effect_picture(page: PageBuilder, term: EffectTerm, chain: Chain, *, bench: 
 
 
 def hiding_command(term: EffectTerm) -> str:
-    """Return the command that hides this effect, as in the picture."""
+    """Return the command that simulates a bench with this effect, as in the picture."""
     return f"cartlab simulate --preset {BENCH} {hiding_option(term)} --out bench"
 
 

@@ -1,9 +1,9 @@
-"""Arithmetic as text, read once: shown as mathematics, worked out with numbers, or checked.
+"""Equations as text: shown as mathematics, worked out with numbers, and checked by tests.
 
-A derivation is a list of `Equation`s. Each side is a line of Python arithmetic ("K_2/K_1*w_2"), so
-what a reader sees, what is computed and what the tests hand to a computer algebra system is the
-same text. Names are shown as they are written by hand: `w_2` is the square of omega_2, `left_2`
-the ratio k_2/m_2.
+A derivation is a list of `Equation`s. Each side is a line of Python arithmetic ("K_2/K_1*w_2"). So
+the same text is shown to readers, computed with numbers, and given to a computer algebra system in
+the tests. Names are shown in usual notation: `w_2` is the square of omega_2, `left_2` is the ratio
+k_2/m_2.
 """
 
 import ast
@@ -26,20 +26,20 @@ from pipeline.words.math import (
 )
 from pipeline.words.numbers import significant
 
-DIGITS = 5  # shown; all are carried
-_IN_S = ("Delta", "N", "R", "P", "X", "U")  # names that stand for functions of s
+DIGITS = 5  # digits shown; calculations use all
+_IN_S = ("Delta", "N", "R", "P", "X", "U")  # names of functions of s
 
 
 @dataclass(frozen=True)
 class Equation:
-    """`left` equals `right`; where `left` is a single name, the equation defines it."""
+    """An equation `left` = `right`; if `left` is a single name, the equation defines it."""
 
     left: str
     right: str
 
 
 def work_out(equations: Iterable[Equation], values: Mapping[str, float]) -> dict[str, float]:
-    """Return `values` and what the equations define from them, one after the other."""
+    """Return `values` together with the names that the equations define, computed in order."""
     known = dict(values)
     for equation in equations:
         known[equation.left] = evaluate(equation.right, known)
@@ -47,7 +47,7 @@ def work_out(equations: Iterable[Equation], values: Mapping[str, float]) -> dict
 
 
 def evaluate(text: str, values: Mapping[str, float]) -> float:
-    """Return the number an expression stands for."""
+    """Return the value of an expression."""
     return _value(_parse(text), values)
 
 
@@ -92,12 +92,12 @@ def addends(text: str) -> list[str]:
 
 
 def shown(text: str) -> Term:
-    """Return an expression as mathematics, with names."""
+    """Return an expression as mathematics with symbols."""
     return _term(_parse(text), name_term)
 
 
 def shown_with(text: str, values: Mapping[str, float]) -> Term:
-    """Return an expression as mathematics with the numbers put in for the names."""
+    """Return an expression as mathematics with numbers in place of the names."""
     return _term(_parse(text), lambda name: value_term(values[name]), numeric=True)
 
 
@@ -107,7 +107,7 @@ def value_term(value: float) -> Term:
 
 
 def name_term(name: str) -> Term:
-    """Return a name as it is written by hand."""
+    """Return a name in usual notation."""
     read = read_name(name)
     base, index = read.symbol, read.suffix
     match base:
@@ -119,7 +119,7 @@ def name_term(name: str) -> Term:
             return fraction(sub("k", str(int(index) + 1)), sub("m", index))
         case "ddx" | "dx":
             return sub(dot("x", order=base.count("d")), index)
-        case "inverse":  # inverse_m_1
+        case "inverse":  # for example inverse_m_1
             return fraction("1", name_term(index))
     letter = _GREEK.get(base, base)
     term = sub(letter, index) if index else letter
@@ -128,7 +128,7 @@ def name_term(name: str) -> Term:
 
 _GREEK = {**GREEK, "kappa": "κ", "Delta": "Δ"}
 
-_SUM, _PRODUCT, _POWER = 1, 2, 3  # how tightly an operation binds
+_SUM, _PRODUCT, _POWER = 1, 2, 3  # precedence of an operation
 
 
 def _binding(node: ast.expr) -> int:
@@ -137,7 +137,7 @@ def _binding(node: ast.expr) -> int:
             return _SUM
         case ast.BinOp(op=ast.Mult()):
             return _PRODUCT
-        case _:  # a name, a number, a power, or a fraction, whose bar holds it together
+        case _:  # a name, number, power or fraction needs no brackets
             return _POWER
 
 

@@ -1,12 +1,12 @@
-"""From free bodies to transfer functions to the state model, for any number of carts.
+"""Derive transfer functions and state model from free bodies, for any number of carts.
 
-All equations are text that `algebra` shows and works out; the tests check each of them
-against the impedance matrix with a computer algebra system.
+All equations are text that `algebra` shows and computes. The tests check each of them against the
+impedance matrix with a computer algebra system.
 
-Delta(s) is the monic characteristic polynomial of the whole chain, N(s) of carts 2 to n, R(s) of
-carts 3 to n, each with the carts before it held; P_i(s) belongs to cart i alone. The paper's common
-denominator is Delta(s) over its constant term, and with three carts N(s) over its own is the
-paper's numerator of cart 1. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
+Delta(s) is the monic characteristic polynomial of the whole chain. N(s) is that of carts 2 to n,
+and R(s) that of carts 3 to n, with the carts before them held. P_i(s) is that of cart i alone. The
+paper's common denominator is Delta(s) divided by its constant term. With three carts, the paper's
+numerator of cart 1 is N(s) divided by its own. Coefficients are d_0, d_1, …; n_0, …; r_0, ….
 """
 
 from collections.abc import Sequence
@@ -15,8 +15,8 @@ from itertools import product
 from pipeline.plant.linear.chain import Chain
 from pipeline.report.equations.algebra import Equation, work_out
 
-MOST_CARTS = 4  # letters for the polynomials of more are not made
-_LETTERS = "dnr"  # of the coefficients
+MOST_CARTS = 4  # there are no letters for the polynomials of more carts
+_LETTERS = "dnr"  # letters of the coefficients
 _POLYNOMIALS = ("Delta", "N", "R")
 _MODES = "abcd"
 _NULLS = "xy"
@@ -26,7 +26,7 @@ _NULLS = "xy"
 
 
 def newton(springs: Sequence[bool]) -> list[Equation]:
-    """Return Newton's law of every cart, each force written as it acts on the free body."""
+    """Return Newton's law of every cart, with each force as it acts on the free body."""
     n = len(springs) - 1
     return [
         Equation(f"{of_cart('m', i, n)}*ddx_{i}", "+".join(_forces(i, springs)).replace("+-", "-"))
@@ -48,7 +48,7 @@ def _forces(i: int, springs: Sequence[bool]) -> list[str]:
 
 
 def laplace(springs: Sequence[bool]) -> list[Equation]:
-    """Return the same at zero initial conditions, transformed and sorted by position."""
+    """Return the Laplace transforms of Newton's laws at rest, sorted by position."""
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
@@ -60,20 +60,20 @@ def laplace(springs: Sequence[bool]) -> list[Equation]:
 
 
 def neighbours(i: int, springs: Sequence[bool]) -> list[tuple[int, str]]:
-    """Return the carts that a spring ties to cart i, each with the name of the spring."""
+    """Return the carts that a spring connects to cart i, each with the name of the spring."""
     inside = ((j, max(i, j)) for j in (i - 1, i + 1) if 1 <= j < len(springs))
     return [(j, f"k_{spring}") for j, spring in inside if springs[spring - 1]]
 
 
 def springs_at(i: int, springs: Sequence[bool]) -> list[str]:
-    """Return the names of the springs that end at a cart."""
+    """Return the names of the springs at a cart."""
     if len(springs) == 2:
         return ["k"] if any(springs) else []
     return [f"k_{j}" for j in (i, i + 1) if springs[j - 1]]
 
 
 def of_cart(letter: str, i: int, n: int) -> str:
-    """Return m_i; a lone cart needs no index."""
+    """Return a name such as m_i; a single cart has no index."""
     return letter if n == 1 else f"{letter}_{i}"
 
 
@@ -81,7 +81,7 @@ def of_cart(letter: str, i: int, n: int) -> str:
 
 
 def single_carts(springs: Sequence[bool]) -> list[Equation]:
-    """Return what each cart alone is: its frequency and its damping."""
+    """Return the equations for frequency and damping of each cart alone."""
     n = len(springs) - 1
     equations = []
     for i in range(1, n + 1):
@@ -94,7 +94,7 @@ def single_carts(springs: Sequence[bool]) -> list[Equation]:
 
 
 def per_mass(n: int) -> list[Equation]:
-    """Return the transformed equations divided by the masses."""
+    """Return the transformed equations, divided by the masses."""
     equations = []
     for i in range(1, n + 1):
         others = [f"left_{i}*X_{i - 1}"] if i > 1 else []
@@ -105,14 +105,17 @@ def per_mass(n: int) -> list[Equation]:
 
 
 def tail(i: int, n: int) -> str:
-    """Return the polynomial of carts i to n alone: Delta, N, R, P_n, and 1 beyond the last."""
+    """Return the name of the polynomial of carts i to n: Delta, N, R or P_n; "1" for i > n."""
     if i > n:
         return "1"
     return f"P_{n}" if i == n else _POLYNOMIALS[i - 1]
 
 
 def elimination(n: int) -> list[Equation]:
-    """Return the steps from the last cart to the first, each cart in terms of the one before."""
+    """Return the steps that eliminate carts from the last to the first.
+
+    Each step expresses a cart by the one before it.
+    """
     equations = []
     for i in range(n, 1, -1):
         if i < n:
@@ -131,7 +134,7 @@ def _tail_equations(i: int, n: int) -> list[Equation]:
 
 
 def transfer(n: int) -> list[Equation]:
-    """Return X_i/U for every cart, over the common denominator."""
+    """Return X_i/U of every cart over the common denominator."""
     equations, chain = [], "inverse_m_1"
     for i in range(1, n + 1):
         chain += f"*left_{i}" if i > 1 else ""
@@ -140,7 +143,7 @@ def transfer(n: int) -> list[Equation]:
 
 
 def static_gains(n: int) -> list[Equation]:
-    """Return the gains at s = 0, one after the other."""
+    """Return the gains at s = 0, each computed from the one before."""
     first = Equation("K_1", f"inverse_m_1*({_constant(2, n)}/d_0)")
     return [first] + [
         Equation(
@@ -180,7 +183,7 @@ def coefficients(n: int) -> list[Equation]:
 
 
 def _coefficient(modes: str, order: int) -> str:
-    """Return the coefficient of s^(degree - order) in the product of s² + g s + omega²."""
+    """Return the coefficient of s^(degree - order) in the product of factors s² + g s + omega²."""
     terms = []
     for powers in product((0, 1, 2), repeat=len(modes)):
         if sum(powers) == order:
@@ -194,7 +197,7 @@ def _coefficient(modes: str, order: int) -> str:
 
 
 def carts_alone(n: int) -> list[Equation]:
-    """Return each cart's own damping and frequency, from the last to the first, and kappa."""
+    """Return each cart's own damping and frequency, from the last cart to the first, and kappa."""
     equations = [Equation(f"g_{n}", f"2*zeta_{n}*omega_{n}"), Equation(f"w_{n}", f"omega_{n}**2")]
     for i in range(n - 1, 0, -1):
         whole, rest = _named(i, n), _named(i + 1, n)
@@ -209,7 +212,7 @@ def carts_alone(n: int) -> list[Equation]:
 
 
 def _named(i: int, n: int) -> list[str]:
-    """Return the names of the coefficients of carts i to n, in falling powers."""
+    """Return the coefficient names of the polynomial of carts i to n, in falling powers."""
     if i == n:
         return ["1", f"g_{n}", f"w_{n}"]
     degree = 2 * (n - i + 1)
@@ -217,7 +220,7 @@ def _named(i: int, n: int) -> list[str]:
 
 
 def couplings(n: int) -> list[Equation]:
-    """Return the springs over the masses, and the input's entry 1/m_1."""
+    """Return the ratios of springs to masses, and the input's entry 1/m_1."""
     if n == 1:
         return [Equation("inverse_m", "K*omega_n**2")]
     first = Equation("inverse_m_1", f"K_1*d_0/{_constant(2, n)}")
@@ -230,12 +233,12 @@ def couplings(n: int) -> list[Equation]:
 
 
 def given(chain: Chain) -> dict[str, float]:
-    """Return what the steps start from: the named parameters of a chain that a wall holds."""
+    """Return the values from which the steps start: the parameters of a chain tied to a wall."""
     return chain.parameters() | unnamed(chain)
 
 
 def unnamed(chain: Chain) -> dict[str, float]:
-    """Return coefficients in the place of names, which the inner carts of four do not have."""
+    """Return coefficients in place of parameters, because the inner carts of four have no names."""
     found = {}
     for i in range(2, chain.n) if chain.n > 3 else ():
         falling = chain.tails()[i - 1]
@@ -247,7 +250,7 @@ def unnamed(chain: Chain) -> dict[str, float]:
 
 
 def work_state_model(chain: Chain) -> dict[str, float]:
-    """Return every quantity on the way from the named parameters to the entries of A and B."""
+    """Return all quantities between the named parameters and the entries of A and B."""
     return work_out(state_steps(chain.n), given(chain))
 
 
@@ -280,10 +283,10 @@ def physical(springs: Sequence[bool]) -> list[Equation]:
 
 
 def redundancies(n: int) -> list[Equation]:
-    """Return the laws that the table must obey, as R1, R2, … of the consistency checks.
+    """Return the laws that a table must satisfy; the consistency checks call them R1, R2, …
 
-    There are more transfer-function parameters than physical ones; what no step above has used
-    is a check on the table.
+    There are more transfer-function parameters than physical ones. Each relation that the steps
+    above did not use is a check on the table.
     """
     laws = []
     for i in range(n - 1, 0, -1):
@@ -311,7 +314,7 @@ def redundancies(n: int) -> list[Equation]:
 
 
 def state_entries(n: int) -> tuple[list[list[str]], list[str]]:
-    """Return A (2n rows of 2n) and B (2n) of the state (x1, v1, x2, v2, …), as expressions."""
+    """Return A (2n rows of 2n) and B (2n) for the state (x1, v1, x2, v2, …), as expressions."""
     A = [["0"] * (2 * n) for _ in range(2 * n)]
     B = ["0"] * (2 * n)
     for i in range(1, n + 1):

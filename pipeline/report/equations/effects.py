@@ -1,4 +1,4 @@
-"""The equations of motion with the effects in them."""
+"""The equations of motion with effects included."""
 
 from collections.abc import Sequence
 
@@ -7,12 +7,15 @@ from pipeline.report.document import Formula
 from pipeline.report.equations.model import equations_of_motion, formula
 from pipeline.words.math import Term, row, sub
 
-_LINEAR_PART = ("k", "d", "+")  # of the springs' laws; the chain has it already
+_LINEAR_PART = ("k", "d", "+")  # part of a spring's law that the linear chain already has
 _ACTS = ("f", "=")
 
 
 def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) -> Formula:
-    """Return Newton's law for every cart; effect number i adds a force with the letter i."""
+    """Return Newton's law of every cart, in which each effect adds a force.
+
+    The forces have the letters a, b, … in the order of the effects.
+    """
     n = len(springs) - 1
     forces: list[list[Term]] = [[] for _ in range(n)]
     forces[0] = [_input(terms)]
@@ -32,7 +35,7 @@ def augmented_equations(springs: Sequence[bool], terms: Sequence[EffectTerm]) ->
 
 
 def law(terms: Sequence[EffectTerm], index: int) -> Formula:
-    """Return the law of one effect, under the letter it has in the equations of motion."""
+    """Return the law of one effect, with its letter in the equations of motion."""
     effect, letter = terms[index].effect, _letters(terms)[index]
     parts = effect.formula.parts
     if parts[:2] == _ACTS:
@@ -51,7 +54,7 @@ def _letters(terms: Sequence[EffectTerm]) -> str:
 
 
 def _input(terms: Sequence[EffectTerm]) -> Term:
-    """Return the symbol of what drives cart 1: u, or what the drive makes of it."""
+    """Return the symbol of cart 1's input: u, or u with the letter of an effect in the drive."""
     for letter, term in reversed(list(zip(_letters(terms), terms, strict=True))):
         if "→" in term.effect.formula.parts:
             return sub("u", letter)

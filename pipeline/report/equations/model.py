@@ -1,6 +1,6 @@
 """The model as mathematics: equations of motion, matrices, transfer functions.
 
-Symbolic terms follow the paper's notation; numbers are written with four digits.
+Symbols follow the paper's notation; numbers have four digits.
 """
 
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ _ALL_DIGITS = 10  # as in results.json
 
 
 def formula(math: Math, *, copy: str = "") -> Formula:
-    """Return a displayed equation with its reading in plain text."""
+    """Return a displayed equation with its text alternative."""
     return Formula(math=math, alt=to_text(math), copy=copy)
 
 
@@ -45,9 +45,11 @@ def formula(math: Math, *, copy: str = "") -> Formula:
 def equations_of_motion(
     springs: Sequence[bool], *, forces: Sequence[Term] | None = None
 ) -> Formula:
-    """Return Newton's law for every cart, with the existing springs.
+    """Return Newton's law of every cart, with the springs that exist.
 
-    `forces` are the right-hand sides, one for each cart; default: the input on the first.
+    Parameters
+    ----------
+    forces : the right-hand side for each cart; default: the input on the first cart.
     """
     n = len(springs) - 1
     equations = []
@@ -62,7 +64,7 @@ def equations_of_motion(
 
 
 def symbolic_state_space(springs: Sequence[bool]) -> Formula:
-    """Return q' = A q + B u with the entries of A and B as fractions of m, c and k."""
+    """Return q' = A q + B u, with the entries of A and B as fractions of m, c and k."""
     n = len(springs) - 1
     A = [["0"] * (2 * n) for _ in range(2 * n)]
     B = [["0"] for _ in range(2 * n)]
@@ -87,7 +89,7 @@ def _position(i: int, *, derivative: int = 0) -> Math:
 
 
 def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
-    """Return A, B, C and D with numbers, in s, position and input units."""
+    """Return A, B, C and D with numbers, in s and in the units of position and input."""
     A, B, C, D = chain.state_space()
     small = [
         row("B", "=", number_matrix(B)),
@@ -104,7 +106,7 @@ def numeric_state_space(chain: Chain) -> tuple[Formula, ...]:
 
 
 def matlab_matrix(name: str, values: Array) -> str:
-    """Return "A = [0 1; −2 −3];" with all digits: MATLAB, Octave and Julia read it."""
+    """Return "A = [0 1; −2 −3];" with all digits, as MATLAB, Octave and Julia read it."""
     rows = "; ".join(
         " ".join(f"{value + 0.0:.{_ALL_DIGITS}g}" for value in line) for line in values
     )
@@ -127,9 +129,9 @@ def _side_by_side(terms: Sequence[Math]) -> Math:
 
 
 def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
-    """Return X_i/U as the paper writes them; None where they have no such names.
+    """Return X_i/U as in the paper; None if the parameters have no names.
 
-    Named are one to three carts that some spring ties to a wall.
+    They have names for one to three carts of which a spring ties at least one to a wall.
     """
     n = len(springs) - 1
     if n > 3 or not all(springs[1:-1]) or not (springs[0] or springs[-1]):
@@ -142,9 +144,9 @@ def symbolic_transfer_functions(springs: Sequence[bool]) -> Formula | None:
 
 
 def numeric_transfer_functions(chain: Chain) -> Formula:
-    """Return X_i/U with numbers: static gain and quadratic factors, or polynomials.
+    """Return X_i/U with numbers: as static gain and quadratic factors, or as polynomials.
 
-    A chain that no wall holds has no static gain, so its polynomials are shown.
+    A chain that is tied to no wall has no static gain, so its polynomials are shown.
     """
     if not chain.is_tied:
         return formula(lines(_polynomial_ratio(chain, i) for i in range(chain.n, 0, -1)))
@@ -157,7 +159,7 @@ def numeric_transfer_functions(chain: Chain) -> Formula:
 def _over_common_denominator(
     gains: Sequence[Term], above: Sequence[Sequence[Math]], below: Sequence[Math]
 ) -> Formula:
-    """Return every X_i/U over D(s), last cart first, and D(s): that they share it is the point."""
+    """Return every X_i/U over D(s), the last cart first, and then D(s), which all share."""
     D = row("D", parens("s"))
     equations = [
         row(_ratio(i), "=", fraction(gains[i - 1], D), *map(parens, above[i - 1]))
@@ -173,7 +175,8 @@ def _ratio(i: int) -> Math:
 
 def _symbolic_factor(index: str) -> Math:
     omega = symbol(f"omega_{index}")
-    zeta = "ζ" if index == "n" else symbol(f"zeta_{index}")  # a lone cart's, as in Table 1
+    # A single cart has no index, as in Table 1.
+    zeta = "ζ" if index == "n" else symbol(f"zeta_{index}")
     return _factor(
         row(fraction("1", power(omega, "2")), power("s", "2")),
         row(fraction(row("2", zeta), omega), "s"),
@@ -191,7 +194,7 @@ def _numeric_factors(roots: ComplexArray) -> list[Math]:
 
 
 def _factor(*terms: Term) -> Math:
-    """Return the terms plus one: a quadratic factor in the paper's form."""
+    """Return a quadratic factor in the paper's form: the terms plus one."""
     return row(total([*terms, "1"]))
 
 
@@ -209,7 +212,7 @@ def _polynomial(coefficients: Array) -> Term:
     degree = coefficients.size - 1
     terms: list[Term] = []
     for exponent, value in zip(range(degree, -1, -1), coefficients, strict=True):
-        # Below this share the coefficient is the rounding of an exact zero.
+        # A smaller coefficient is a rounding error of zero.
         if abs(value) <= 1e-12 * np.abs(coefficients).max() and degree > 0:
             continue
         s: list[Term] = (

@@ -1,4 +1,4 @@
-"""`exploration.html`: what is known, then how it came to be known, turn by turn."""
+"""`exploration.html`: first what is known, then how it was found, turn by turn."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _WORDS = phrases("exploration")
 
 @dataclass(frozen=True, kw_only=True)
 class WeighedExplanation:
-    """One explanation of the gap: its effects in words, and its weight among those in dispute."""
+    """One explanation of the gap: its effects in words, and its weight among the competing ones."""
 
     name: str
     weight: float
@@ -37,20 +37,21 @@ class WeighedExplanation:
 
 @dataclass(frozen=True, kw_only=True)
 class Turn:
-    """The state of knowledge at one turn.
+    """What was known after one turn of an exploration.
 
     Attributes
     ----------
-    seconds : at the bench so far, rests included.
+    seconds : time at the bench so far, including rests.
     recorded : ids of the recordings made in this turn.
-    errors : relative standard error of each parameter, by name, or None.
+    errors : relative standard error of each parameter, by name; None if unknown.
     verdict : of the gap analysis; "" if it was not possible.
-    explanations : the competing ones, that of the model first, or the named one; empty if the
-        linear chain is enough.
-    left, floor : error of the model as a share of the motion, and the noise floor.
+    explanations : the competing ones, first the one in the model; only the named one if there is no
+        competition; empty if the linear chain is enough.
+    left : error of the model as a share of the motion; None if unknown.
+    floor : the noise floor as a share of the motion; None if unknown.
     reached : all requested parameters are known, and the gap is named or absent.
-    said : known results, doubts and the reason for the next recording, in one sentence.
-    gap : the gap analysis of that turn, or None; an earlier turn has only the trace that the
+    said : results, doubts and the reason for the next recording, in one sentence.
+    gap : the gap analysis of this turn, or None; for an earlier turn only with the trace that the
         diary shows.
     """
 
@@ -66,10 +67,10 @@ class Turn:
     gap: Gap | None = None
 
     def without_other_traces(self) -> "Turn":
-        """Return the turn with no more traces than its part of the diary shows.
+        """Return the turn with only the trace that its part of the diary shows.
 
-        Each turn's gap has the traces of all runs so far: kept, they would grow with the square of
-        the number of turns.
+        Each gap analysis has the traces of all runs so far. If all were kept, memory use would grow
+        with the square of the number of turns.
         """
         if self.gap is None:
             return self
@@ -79,7 +80,12 @@ class Turn:
 
 
 def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, wanted: float) -> Path:
-    """Write the diary into a submission's folder; `wanted`: the relative error asked for."""
+    """Write the diary into a submission's folder; return its path.
+
+    Parameters
+    ----------
+    wanted : the requested relative error.
+    """
     page = Page(analysis)
     sections = page.sections(
         [
@@ -96,7 +102,7 @@ def write_diary(turns: Sequence[Turn], analysis: Analysis, folder: Path, *, want
 
 
 def _answer(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
-    """Return what is known at the end: parameters with errors, effects with sizes, what is left."""
+    """Return what is known at the end: verdict, parameters with errors, and what is unexplained."""
     last = turns[-1]
     blocks: list[Block] = [_board(turns, wanted)]
     if last.gap:
@@ -140,7 +146,7 @@ def _tone(gap: Gap | None) -> Tone:
 
 
 def _story(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Show each turn: time, recordings, decision, and the run behind it."""
+    """Return each turn: time, recordings, decision, and the run that led to it."""
     blocks: list[Block] = []
     for number, turn in enumerate(turns, start=1):
         recorded = listing(turn.recorded) or _WORDS.text("nothing_new")
@@ -160,7 +166,7 @@ def _errors(page: Page, turns: Sequence[Turn], wanted: float) -> list[Block]:
     rows = [[name_span(name), *(_known(turn.errors.get(name)) for turn in turns)] for name in names]
     head = ["", *(f"{turn.seconds:.0f} s" for turn in turns)]
     table = page.headed_table(_WORDS.text("errors_table"), head, rows, "l" + "r" * len(turns))
-    if len(turns) < 2:  # nothing has fallen yet
+    if len(turns) < 2:  # there is no progress to draw yet
         return [table]
     figure = _shrinking(turns, names, wanted)
     return [page.picture("shrinking", figure, _WORDS, "shrinking", wanted=_known(wanted)), table]
@@ -171,7 +177,7 @@ def _known(error: float | None) -> str:
 
 
 def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Figure:
-    """Draw each parameter's standard error against time at the bench."""
+    """Draw each parameter's standard error over time at the bench."""
     figure, (ax,) = panels(2.2)
     seconds = [turn.seconds for turn in turns]
     for name in names:
@@ -180,9 +186,10 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
         ax.plot(seconds, shown, "o-", ms=3, lw=0.9, label=symbol_text(name))
     ax.axhline(100 * wanted, color=QUIET, lw=0.8, ls="--")
     every = [100 * e for turn in turns for e in turn.errors.values() if e]
-    _whole_axes(ax, turns, [100 * wanted, *(min(e, 100.0) for e in every)])  # above: not known
+    # Errors above 100 % count as unknown and may leave the axis.
+    _whole_axes(ax, turns, [100 * wanted, *(min(e, 100.0) for e in every)])
     ax.set_ylabel("standard error [%]")
-    # Beside the axes: three carts have a dozen.
+    # The legend is next to the axes, because three carts have a dozen lines.
     box = ax.get_position()
     ax.set_position((box.x0, box.y0, box.width - 0.09, box.height))
     ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderpad=0.0, handlelength=1.6)
@@ -190,7 +197,7 @@ def _shrinking(turns: Sequence[Turn], names: Sequence[str], wanted: float) -> Fi
 
 
 def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> None:
-    """Let time begin at zero, and a logarithmic axis go from one power of ten to another."""
+    """Start time at zero, and let a logarithmic axis extend to whole powers of ten."""
     ax.set_xlim(0.0, 1.04 * turns[-1].seconds)
     ax.set_xlabel("time at the bench [s]")
     exponents = np.log10([value for value in values if value > 0])
@@ -200,7 +207,7 @@ def _whole_axes(ax: Axes, turns: Sequence[Turn], values: Sequence[float]) -> Non
 
 
 def _explained(turn: Turn) -> list[str]:
-    """Return the competing explanations with their weights; a single one has no weight."""
+    """Return the competing explanations with their weights; without competition, no weight."""
     if len(turn.explanations) < 2:
         return [one.name for one in turn.explanations]
     weights = [
@@ -214,7 +221,7 @@ def _explained(turn: Turn) -> list[str]:
 
 
 def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
-    """Show what the model leaves, and between which explanations the data were undecided."""
+    """Return what the model left unexplained over time, and the explanations still possible."""
     looked = [turn for turn in turns if turn.left is not None and turn.floor is not None]
     if not looked:
         return []
@@ -229,7 +236,7 @@ def _gap(page: Page, turns: Sequence[Turn]) -> list[Block]:
 
 
 def _left_figure(turns: Sequence[Turn], looked: Sequence[Turn]) -> Figure:
-    """Draw the unexplained share of the motion and the noise floor over time."""
+    """Draw the unexplained share of the motion, and the noise floor, over time."""
     figure, (ax,) = panels(1.5)
     seconds = [turn.seconds for turn in looked]
     left, floor = ([100 * (getattr(t, name) or 0.0) for t in looked] for name in ("left", "floor"))

@@ -1,1 +1,1 @@
-"""Figures, one style for all, and their way to SVG."""
+"""Figures in one style, and their conversion to SVG."""

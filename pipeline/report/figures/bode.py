@@ -1,4 +1,4 @@
-"""Frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
+"""The frequency response of one cart, measured and fitted (the paper's Figures 4, 6, 7, 9-11)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -30,9 +30,9 @@ _DB_PER_NEPER = 20 / np.log(10)
 
 
 def bode_figure(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
-    """Return magnitude, phase (where measured) and what the fit leaves, one below the other.
+    """Return magnitude, phase (if measured) and residual of the fit, one below the other.
 
-    Zero magnitudes, which a logarithm cannot show, are left out.
+    Zero magnitudes are left out, because a logarithm cannot show them.
     """
     figure = bode_panels(response, chain=chain, units=units)
     legend_above(figure.axes[0])
@@ -40,7 +40,7 @@ def bode_figure(response: FrequencyResponse, *, chain: Chain | None, units: Unit
 
 
 def bode_panels(response: FrequencyResponse, *, chain: Chain | None, units: Units) -> Figure:
-    """Return the figure without its legend, for who draws more into it."""
+    """Return the figure without a legend, for callers that draw more into it."""
     response = _positive(response)
     has_phase = response.phase is not None
     heights = [1.3, *([0.8] if has_phase else []), *([0.5] if chain else [])]
@@ -61,7 +61,7 @@ def overview_figure(
     chain: Chain | None,
     units: Units,
 ) -> Figure:
-    """Return the magnitudes of all carts in one panel: measured as points, the fit as lines."""
+    """Return one panel with the magnitudes of all carts: points are measured, lines are the fit."""
     responses = [_positive(response) for response in responses]
     figure, (ax,) = panels(1.75)
     every = np.concatenate([response.omega for response in responses])
@@ -92,8 +92,8 @@ def plot_magnitude(
     chain: Chain | None,
     units: Units,
 ) -> None:
-    """Plot the magnitude in dB: diamonds with error bars, the fit as a line."""
-    # An error bar in decibels cannot reach down to zero.
+    """Plot the magnitude in dB: diamonds with error bars, and the fit as a line."""
+    # An error bar in decibels cannot extend down to zero.
     relative = np.clip(response.magnitude_std / response.magnitude, 0.0, 0.9)
     _points(
         ax,
@@ -109,7 +109,7 @@ def plot_magnitude(
 
 
 def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) -> None:
-    """Plot the phase in degrees, measured values on the branch nearest the fit."""
+    """Plot the phase in degrees; measured values are on the branch nearest to the fit."""
     assert response.phase is not None
     phase = np.unwrap(response.phase)
     if chain:
@@ -127,7 +127,7 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
     low, high = ax.dataLim.intervaly
     margin = 0.08 * max(high - low, 90.0)
     bottom, top = ax.set_ylim(low - margin, high + margin)
-    # Phases are read against right angles; labels of more than five would touch.
+    # Ticks are at multiples of 90°; with more than five, the labels would touch.
     labels = top // 90.0 + -bottom // 90.0 + 1
     ax.yaxis.set_major_locator(
         MultipleLocator(45.0 if high - low <= 90.0 else 90.0 if labels <= 5 else 180.0)
@@ -136,7 +136,7 @@ def plot_phase(ax: Axes, response: FrequencyResponse, *, chain: Chain | None) ->
 
 
 def plot_residual(ax: Axes, response: FrequencyResponse, *, chain: Chain) -> None:
-    """Plot measured over fitted magnitude, as a difference in percent."""
+    """Plot the difference of measured and fitted magnitude in percent."""
     fitted = np.abs(chain.frequency_response(response.omega)[response.cart - 1])
     ax.axhline(0.0, color=MODEL)
     _points(
@@ -161,7 +161,12 @@ def _positive(response: FrequencyResponse) -> FrequencyResponse:
 
 
 def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "") -> None:
-    """Plot diamonds with error bars (n,) or, below and above, (2, n): all bars are one path."""
+    """Plot diamonds with error bars; all bars are one path.
+
+    Parameters
+    ----------
+    error : (n,), or (2, n) for below and above; None: no bars.
+    """
     (drawn,) = ax.plot(
         x, y, "D", ms=3.2, mew=0.8, mfc="white", color=MEASURED, label=label or None, zorder=3
     )
@@ -173,15 +178,15 @@ def _points(ax: Axes, x: Array, y: Array, error: Array | None, *, label: str = "
 
 
 def _fitted(response: FrequencyResponse, chain: Chain) -> tuple[Array, Array]:
-    """Return frequencies and the chain's magnitudes there in decibels."""
+    """Return frequencies, and the chain's magnitudes there in decibels."""
     omega = _dense(response.omega, chain)
     magnitude = np.abs(chain.frequency_response(omega)[response.cart - 1])
-    highest = 100.0 * float(response.magnitude.max())  # without damping a peak has no end
+    highest = 100.0 * float(response.magnitude.max())  # without damping, a peak would have no limit
     return omega, _decibel(np.minimum(magnitude, highest))
 
 
 def _dense(omega: Array, chain: Chain) -> Array:
-    """Return a fine grid that also meets every resonance, so that sharp peaks are not cut."""
+    """Return a fine grid that includes every resonance, so that sharp peaks are drawn fully."""
     low, high = 0.9 * float(omega.min()), 1.1 * float(omega.max())
     modes = np.abs(chain.poles)
     grid = np.geomspace(low, high, 300)

@@ -1,4 +1,4 @@
-"""The carts cut free, with every force that acts on them."""
+"""Free-body diagrams of the carts, with every force on them."""
 
 from collections.abc import Sequence
 
@@ -10,14 +10,14 @@ from pipeline.words.numbers import subscript
 
 # Inches:
 _CART = 0.54  # width and height of a cart
-_GAP = 0.05  # between an arrow and what it is called
-_ROW = 0.9  # height of the figure for a cart
+_GAP = 0.05  # between an arrow and its name
+_ROW = 0.9  # height of the figure for each cart
 
 
 def free_body_figure(springs: Sequence[bool]) -> Figure:
-    """Draw each cart alone: what pushes it, what pulls it back, which way is positive.
+    """Draw each cart alone with the forces on it and the positive direction.
 
-    Drawn on the figure itself, without axes: there is nothing to zoom into.
+    They are drawn on the figure itself, without axes, because there is nothing to zoom into.
     """
     n = len(springs) - 1
     figure = Figure(figsize=(WIDTH, _ROW * n))
@@ -54,7 +54,7 @@ def _draw_cart(figure: Figure, i: int, springs: Sequence[bool], *, y: float) -> 
 
 
 def _left_forces(i: int, springs: Sequence[bool]) -> list[str]:
-    """Return what acts towards negative x when the cart stands right of rest and moves right."""
+    """Return the forces towards negative x when the cart is right of its rest and moves right."""
     n = len(springs) - 1
     index = "" if n == 1 else subscript(i)
     forces = []

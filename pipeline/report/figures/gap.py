@@ -1,4 +1,4 @@
-"""The gap: before and after in time, run by run, and as force against what causes it."""
+"""Figures of the gap: before and after in time, run by run, and as a force over its cause."""
 
 from collections.abc import Sequence
 
@@ -30,7 +30,8 @@ from pipeline.report.figures.style import (
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
-ADDED = "with the effects"  # what the model with more than masses, dampings and springs is called
+# Name of the model that has effects besides masses, dampings and springs.
+ADDED = "with the effects"
 
 
 # ---------------------------------------------------------------------- in time
@@ -44,10 +45,12 @@ def before_after_figure(
     added: str = ADDED,
     touched: Sequence[tuple[Array, Array]] = (),
 ) -> Figure:
-    """Return one cart in one run: measured, both models, and what each leaves below.
+    """Return one cart in one run: measured and both models above, the residuals below.
 
-    `added` names the model with what was added to the linear one; "" where nothing was. `touched`
-    are times and readings of the stretches beside the run in which a hand moved a cart.
+    Parameters
+    ----------
+    added : name of the model with effects; "" if it has no effects.
+    touched : times and readings of stretches next to the run in which a hand moved a cart.
     """
     models = {"linear model": trace.baseline}
     if added:
@@ -73,7 +76,7 @@ def before_after_figure(
 def predicted_figure(
     prediction: Prediction, *, names: tuple[str, str], position_unit: str
 ) -> Figure:
-    """Return what a pair of explanations predicts of a recording, and how far they differ."""
+    """Return the predictions of two explanations for a recording, and their difference."""
     figure, (above, below) = panels(1.5, 1.0)
     first, second = prediction.positions[list(prediction.pair)]
     one, other = names
@@ -91,9 +94,11 @@ def predicted_figure(
 
 
 def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure:
-    """Return the error of every run and cart before and after, with its noise.
+    """Return the error of every run and cart before and after, and its noise.
 
-    `added` as in `before_after_figure`.
+    Parameters
+    ----------
+    added : see `before_after_figure`.
     """
     figure, (ax,) = panels(0.19 * len(rows) + 0.1)
     plot_by_record(ax, rows, added=added)
@@ -103,7 +108,7 @@ def by_record_figure(rows: Sequence[RecordGap], *, added: str = ADDED) -> Figure
 
 
 def plot_by_record(ax: Axes, rows: Sequence[RecordGap], *, added: str = ADDED) -> None:
-    """Plot a bar from before to after for each run and cart; a tick marks the noise."""
+    """Plot, for each run and cart, a bar from the error before to that after, and a noise tick."""
     y = -np.arange(len(rows), dtype=float)
     before, after, noise = (
         100 * np.array([getattr(row, name) for row in rows])
@@ -133,9 +138,10 @@ def force_figure(
     units: tuple[str, str],
     added: str = ADDED,
 ) -> Figure | None:
-    """Return the force that the linear part leaves, against what the effect makes it depend on.
+    """Return the force that the linear part leaves, over the quantity on which the effect depends.
 
-    None where no run shows it: a neighbour was not measured, or the effect is one of timing.
+    Returns None if no run shows it, because a neighbouring cart was not measured or the effect
+    changes only the timing.
     """
     axis = found.effect.axis
     cart, spring = found.where.get("cart", 1), found.where.get("spring")
@@ -147,7 +153,7 @@ def force_figure(
         carts = {f.cart for f in own}
         own = [f for f in own if f.cart == max(carts)]
         for f in own:
-            # Spring j pulls cart j back and cart j - 1 on.
+            # Spring j pulls cart j back and cart j - 1 forward.
             sign, side = (-1.0, 0) if f.cart == spring else (1.0, 1)
             rate = axis == "velocity"
             middle = f.velocity if rate else f.position
@@ -182,19 +188,24 @@ def force_figure(
 def plot_force(
     ax: Axes, shown: Sequence[tuple[Array, Array, Array]], *, added: str = ADDED
 ) -> None:
-    """Plot clouds of (x, measured, model): measured as points, the model's as smaller ones."""
+    """Plot the measured points and, smaller, those of the model.
+
+    Parameters
+    ----------
+    shown : triples of arrays: x, measured, model.
+    """
     x, measured, model = (np.concatenate(parts) for parts in zip(*shown, strict=True))
     order = np.linspace(0, x.size - 1, min(x.size, 500)).astype(int)
     ax.axhline(0.0, color=QUIET, lw=0.6)
     ax.plot(x[order], measured[order], "o", ms=3.4, mfc="none", mec=MEASURED, mew=0.5,
             label="measured")  # fmt: skip
     ax.plot(x[order], model[order], ".", color=MODEL, ms=3.0, mew=0)
-    ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label=added)  # for the legend
+    ax.plot([], [], ".", color=MODEL, ms=6.0, mew=0, label=added)  # only for the legend
     ax.set_xlim(*(1.06 * np.array([x.min(), x.max()]) if x.min() < 0 < x.max() else (None, None)))
 
 
 def force_left_figure(residual: Residual) -> Figure:
-    """Return the force left on a cart against each quantity, with what the formula says of it."""
+    """Return the force left on a cart over each quantity, with the curve of the formula."""
     figure, axes = panels(*(1.6 for _ in residual.against), share_x=False)
     for ax, shown in zip(axes, residual.against, strict=True):
         bars = [0.0 if spread is None else spread for spread in shown.spread]
@@ -212,7 +223,7 @@ def force_left_figure(residual: Residual) -> Figure:
 def timing_figure(
     forces: Sequence[ResidualForce], *, drive: str, added: str = ADDED
 ) -> Figure | None:
-    """Return the force that arrives on cart 1 around the sharpest edge of the input."""
+    """Return the force on cart 1 around the sharpest edge of the input."""
     own = [f for f in forces if f.cart == 1 and np.ptp(f.u) > 0]
     if not own:
         return None
@@ -233,7 +244,7 @@ def timing_figure(
 
 
 def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str = ADDED) -> Figure:
-    """Return the amplitude over frequency of motion and misfits, pooled over runs."""
+    """Return amplitude spectra of the motion and of the models' errors, pooled over runs."""
     longest = max(float(t.t[-1] - t.t[0]) for t in traces)
     dt = max(float(np.median(np.diff(t.t))) for t in traces)
     f = np.fft.rfftfreq(2 * int(longest / dt), dt)
@@ -250,7 +261,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
             pooled[i] += np.abs(spectrum / window.sum()) ** 2
     motion, before, after = np.sqrt(pooled)
     total = np.cumsum(motion**2)
-    # Half as far again as nearly all of the motion goes.
+    # Up to 1.5 times the frequency below which nearly all of the motion lies.
     end = 1.5 * f[np.searchsorted(total, 0.995 * total[-1])]
     shown = (f > 0) & (f <= max(end, 8 * f[1]))
     step = max(1, int(np.count_nonzero(shown) / 600))

@@ -1,4 +1,4 @@
-"""Figures of a graded class, and of one submission beside its own recordings."""
+"""Figures of a graded class, and of reported numbers next to the recordings."""
 
 from collections.abc import Sequence
 
@@ -30,12 +30,13 @@ from pipeline.words.text import clean
 
 
 def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
-    """Return how many submissions have how many points: a bar for each tenth of them."""
+    """Return a histogram of points, with one bar for each tenth of the total."""
     counts, edges = np.histogram(points, bins=10, range=(0.0, out_of))
     centres = (edges[:-1] + edges[1:]) / 2
     figure, (ax,) = panels(1.5)
     ax.bar(centres, counts, width=0.94 * np.diff(edges), color=MODEL)
-    (tops,) = ax.plot(centres, counts, ls="none", marker="none")  # what a reader points at
+    # Invisible points that show values when a reader points at a bar.
+    (tops,) = ax.plot(centres, counts, ls="none", marker="none")
     tell(tops, centres, counts.astype(float), name="submissions")
     ax.set_xlim(0.0, out_of)
     ax.set_ylim(0.0, 1.08 * max(1, counts.max()))
@@ -46,11 +47,11 @@ def distribution_figure(points: Sequence[float], *, out_of: float) -> Figure:
 
 
 def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Figure:
-    """Return how many submissions have how much of the points, now and under another rubric.
+    """Return histograms of points, under the current rubric and under another one.
 
     Parameters
     ----------
-    before, after : of each tenth of the points, from the lowest on.
+    before, after : number of submissions in each tenth of the points, from the lowest on.
     """
     edges = np.linspace(0.0, 100.0, len(before) + 1)
     width = 0.42 * (edges[1] - edges[0])
@@ -69,7 +70,7 @@ def two_distributions_figure(before: Sequence[int], after: Sequence[int]) -> Fig
 
 
 def difficulty_figure(titles: Sequence[str], shares: Array) -> Figure:
-    """Return the mean share of the points that each criterion earned: a bar under each title.
+    """Return the mean share of the points earned in each criterion, as a bar below its title.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ def reported_bode_figure(
 
     Parameters
     ----------
-    reported : what reported parameters stand for, see `transfer_functions`; None draws no curve.
+    reported : the transfer functions of the reported parameters; None draws no curve.
     """
     figure = bode_panels(response, chain=chain, units=units)
     ax = figure.axes[0]
@@ -115,7 +116,7 @@ def reported_bode_figure(
         low, high = ax.get_ylim()
         omega = np.geomspace(*ax.get_xlim(), 300)
         decibel = reported_magnitude(omega, cart=response.cart, reported=reported)
-        # The curve may stick out 30 dB above and below what was measured.
+        # The axis allows the curve to leave the measured range by 30 dB.
         seen = np.abs(decibel - (low + high) / 2) < (high - low) / 2 + 30.0
         if seen.any():
             ax.plot(omega[seen], decibel[seen], color=SECOND, ls="--", label="your numbers")
@@ -127,11 +128,11 @@ def reported_bode_figure(
 def reported_step_figure(
     gain: StepGain, *, record: Record, reported: float, title: str, position_unit: str
 ) -> Figure:
-    """Return a step record with the level that a reported gain leads to.
+    """Return a step recording with the level that the reported gain would give.
 
     Parameters
     ----------
-    title : the number as it is reported and as the record gives it.
+    title : the number as reported and as the recording gives it.
     """
     figure = step_figure([[gain]], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
@@ -150,18 +151,18 @@ def reported_decay_figure(
     title: str,
     position_unit: str,
 ) -> Figure:
-    """Return a decay with the curve of the reported numbers from the same start.
+    """Return a decay with the curve that the reported numbers would give from the same start.
 
     Parameters
     ----------
     reported : natural frequency (rad/s) and damping ratio; a curve that would swing too fast to be
-        seen, or does not swing, is not drawn.
-    title : the numbers as they are reported and as the record gives them.
+        visible, or would not swing, is not drawn.
+    title : the numbers as reported and as the recording gives them.
     """
     figure = decay_figure([decay], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
     omega, zeta = reported
-    # Ten times: hertz taken for rad/s, and the other way, are still seen.
+    # A factor of ten leaves room for hertz and rad/s confused either way.
     if 0 <= zeta < 1 and 0 < omega < 10.0 * decay.omega_n:
         t = np.linspace(decay.peak_t[0], decay.fit_t[-1], 2000)
         rest = (decay.envelope_upper[-1] + decay.envelope_lower[-1]) / 2
@@ -182,11 +183,16 @@ def _titled(figure: Figure, ax: Axes, title: str) -> Figure:
 def reported_magnitude(
     omega: Array, *, cart: int, reported: tuple[Array, Sequence[Array]]
 ) -> Array:
-    """Return 20 log10 |X_cart/U| in dB, (n,), at `omega` in rad/s; see `Chain.tails`."""
+    """Return 20 log10 |X_cart/U| in dB, (n,), at `omega` in rad/s.
+
+    Parameters
+    ----------
+    reported : gains and polynomials; see `Chain.tails`.
+    """
     gains, tails = reported
     s = 1j * omega
     numerator = tails[cart] if cart < len(tails) else np.ones(1)
-    with np.errstate(divide="ignore", invalid="ignore"):  # without damping a null has no size
+    with np.errstate(divide="ignore", invalid="ignore"):  # without damping, a null is zero
         above, below = np.polyval(numerator, s), np.polyval(tails[0], s)
         relative = (above / numerator[-1]) / (below / tails[0][-1])
         return 20 * np.log10(np.abs(gains[cart - 1] * relative))

@@ -1,7 +1,7 @@
-"""One style for all figures.
+"""The style of all figures.
 
-Measured data are points (dark, diamonds for single values), models are lines (blue), so that a
-figure reads in grey and for the colour-blind. Text stays text: it can be searched and selected.
+Measured data are points (dark; single values are diamonds) and models are lines (blue). So figures
+are clear in grey and to colour-blind readers. Text stays text, which can be searched and selected.
 """
 
 import warnings
@@ -23,14 +23,14 @@ from pipeline.report.figures.svg import tell
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
-WIDTH = 5.2  # inches: as wide as a page of text, on a phone three quarters of it
+WIDTH = 5.2  # inches: as wide as the text of a page, three quarters of this on a phone
 MEASURED = "#222222"
-MODEL = "#0072b2"  # blue and vermillion of Okabe and Ito, apart in grey too
+MODEL = "#0072b2"  # blue and vermillion of Okabe and Ito, which also differ in grey
 SECOND = "#d55e00"
 THIRD = "#009e73"
 QUIET = "#8a8a8a"
 SHADE = "#ececec"
-# Carts that share a panel: colour, line, mark of single points, and what the mark is called.
+# For carts in the same panel: colour, line style, marker of single points, and the marker's name.
 CARTS = (
     (MODEL, "-", "o", "circles"),
     (SECOND, "--", "s", "squares"),
@@ -38,12 +38,12 @@ CARTS = (
     (MEASURED, ":", "D", "diamonds"),
 )
 
-Look = dict[str, Any]  # of a line: colour, kind, width (points), by matplotlib's names
+Look = dict[str, Any]  # options of a line for matplotlib, such as colour, style and width (points)
 SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}
 
-_LIFT = 0.22  # inches, of a legend above the titles of panels
+_LIFT = 0.22  # inches from the titles of panels to a legend above
 _STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],  # comes with matplotlib, so the PDF has it too
+    "font.family": ["DejaVu Sans"],  # part of matplotlib, so the PDF has it too
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.labelsize": 8.5,
@@ -54,7 +54,7 @@ _STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.7,
     "axes.edgecolor": "#444444",
     "lines.linewidth": 1.2,
-    "text.parse_math": False,  # a dollar sign in a student's text is a dollar sign
+    "text.parse_math": False,  # a dollar sign in a student's text is no formula
     "svg.fonttype": "none",
     "figure.facecolor": "none",
     "savefig.facecolor": "none",
@@ -65,7 +65,8 @@ _STYLE: dict[Any, Any] = {
 def drawing() -> Iterator[None]:
     """Draw in the report's style, whatever the user's own matplotlib settings are."""
     with matplotlib.rc_context(), warnings.catch_warnings():
-        # A name in Chinese is fine: the reader's browser has the font that matplotlib lacks.
+        # matplotlib's font may lack a name's characters, such as Chinese; the reader's browser has
+        # them.
         warnings.filterwarnings("ignore", message="Glyph .* missing from font")
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
@@ -79,16 +80,16 @@ def panels(
     share_y: bool = False,
     titled: bool = False,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure with rows of the given heights (inches), its axes row by row.
+    """Return a figure with rows of the given heights (inches), and its axes row by row.
 
-    Margins are set in inches, not searched for: a search draws every figure twice. Panels that
-    do not share their time axis each get room for tick labels and a title.
+    Margins are set in inches. If matplotlib computed them, it would draw every figure twice. Panels
+    that do not share their time axis each get room for tick labels and a title.
     """
-    left, right, bottom = 0.62, 0.12, 0.47  # inches, for tick labels and axis titles
+    left, right, bottom = 0.62, 0.12, 0.47  # inches for tick labels and axis titles
     top = 0.26 + (_LIFT if titled else 0.0)  # for a legend
     gap = 0.24 if titled else 0.13 if share_x else 0.53
     column_gap = 0.13 if share_y else 0.5
-    # Sums that round once: from Python 3.12 on `sum` does, and before it did at every step.
+    # `fsum` rounds once. `sum` does so only from Python 3.12 on.
     height = fsum(heights) + gap * (len(heights) - 1) + top + bottom
     width = (WIDTH - left - right - column_gap * (columns - 1)) / columns
     figure = Figure(figsize=(WIDTH, height))
@@ -112,7 +113,7 @@ def panels(
                 sharex=first if share_x else None,
                 sharey=first if share_y else None,
             )
-            # Given places for labels save a search among all tick labels, and line them up.
+            # Fixed positions line the labels up, and save a search among all tick labels.
             ax.yaxis.set_label_coords(-0.46 / width, 0.5)
             ax.xaxis.set_label_coords(0.5, -0.31 / heights[row])
             axes.append(ax)
@@ -122,35 +123,39 @@ def panels(
 def small_multiples(
     titles: Sequence[str], *, height: float, share_y: bool
 ) -> tuple[Figure, list[Axes]]:
-    """Return a panel under each title, on one time axis, so that repeats can be compared."""
+    """Return a panel below each title, with a common time axis, so that repeats can be compared."""
     columns = 2 if len(titles) == 4 else min(len(titles), 3)
     rows = -(-len(titles) // columns)
     figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)
     for spare in axes[len(titles) :]:
         figure.delaxes(spare)
-    # Side by side, 60 letters fill the whole width.
+    # 60 characters fill the whole width.
     for ax, title in zip(axes, _short(titles, most=60 // columns), strict=False):
         ax.set_title(title, loc="left", y=1.0)
     return figure, axes[: len(titles)]
 
 
 def _short(titles: Sequence[str], *, most: int) -> list[str]:
-    """Return titles of so many letters; long ones lose first what they all begin with."""
+    """Return titles with at most so many characters.
+
+    A common beginning of long titles is cut off.
+    """
     titles = [clean(title) for title in titles]
     if len(titles) > 1 and max(map(len, titles)) > most:
-        pairs = zip(min(titles), max(titles), strict=False)  # what these two share, all do
+        # The first and the last title in alphabetical order share only what all titles share.
+        pairs = zip(min(titles), max(titles), strict=False)
         same = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
         titles = [f"…{title[same:]}" for title in titles] if same > 1 else titles
     return [shorten(title, most=most) for title in titles]
 
 
 def shorten(text: str, *, most: int) -> str:
-    """Return a text of at most so many letters, an ellipsis for what is cut off."""
+    """Return a text with at most so many characters; an ellipsis marks a cut."""
     return text if len(text) <= most else f"{text[: most - 1]}…"
 
 
 def name_rows(ax: Axes, rows: Sequence[tuple[str, str]]) -> None:
-    """Write names in colours where the numbers of the axis would stand; row i lies at y = -i."""
+    """Write coloured names in place of the axis numbers; row i is at y = -i."""
     ax.set_ylim(1 - len(rows) - 0.7, 0.7)
     ax.yaxis.set_visible(False)
     for i, (name, colour) in enumerate(rows):
@@ -161,19 +166,20 @@ def name_rows(ax: Axes, rows: Sequence[tuple[str, str]]) -> None:
 
 
 def log_frequency_axis(ax: Axes, omega: Array) -> None:
-    """Make x a logarithmic frequency axis around the measured points."""
+    """Make x a logarithmic frequency axis with the range of the measured points."""
     ax.set_xscale("log")
     ax.set_xlim(0.9 * float(omega.min()), 1.1 * float(omega.max()))
 
 
 def legend_above(ax: Axes, *, columns: int = 4) -> None:
-    """Put the legend above the axes and their title, where it hides no data."""
+    """Put the legend above the axes and their title, where it covers no data."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     tall = ax.get_position().height * figure.get_size_inches()[1]
     lift = _LIFT if ax.get_title(loc="left") else 0.0
     handles, labels = ax.get_legend_handles_labels()
-    order = sorted(range(len(labels)), key=lambda i: labels[i] != "measured")  # first what is
+    # The measurement comes first.
+    order = sorted(range(len(labels)), key=lambda i: labels[i] != "measured")
     ax.legend(
         [handles[i] for i in order],
         [labels[i] for i in order],
@@ -188,11 +194,11 @@ def legend_above(ax: Axes, *, columns: int = 4) -> None:
 
 
 def thin(t: Array, y: Array) -> tuple[Array, Array]:
-    """Keep the least and greatest value of each stretch of a long line, in their order in time.
+    """Keep the smallest and largest value of each stretch of a long line, in order of time.
 
-    What the eye sees stays: every peak, and the envelope of what is too fast to see.
+    So every peak stays visible, and also the envelope of oscillations too fast to be seen.
     """
-    buckets = 240  # twice this many points a line: finer than print at this width shows
+    buckets = 240  # a line gets at most twice as many points, which is finer than print
     if t.size <= 2 * buckets:
         return t, y
     starts = np.linspace(0, t.size, buckets + 1).astype(int)[:-1]
@@ -208,7 +214,7 @@ def thin(t: Array, y: Array) -> tuple[Array, Array]:
 
 
 def plot_measured(ax: Axes, t: Array, y: Array, *, most: int = 200) -> None:
-    """Draw a measured time series as points, and a point in the legend."""
+    """Draw a measured time series as points, with an entry in the legend."""
     plot_points(ax, t, y, most=most)
     ax.plot([], [], ".", color=MEASURED, ms=3 * 2.2, mew=0, label="measured")
 
@@ -222,15 +228,15 @@ def plot_points(
     name: str = "measured",
     color: str = MEASURED,
 ) -> None:
-    """Draw a time series as points, of a long one `most` spread evenly.
+    """Draw a time series as points, at most `most` of them, evenly spread.
 
-    More would hide the line of the model. They lie below the lines of models, which are thinner:
-    both are seen where they agree.
+    More points would hide the line of the model. The points are drawn below models, whose lines are
+    thinner, so that both are visible where they agree.
     """
     shown = np.linspace(0, t.size - 1, min(t.size, most)).astype(int)
-    # Round-ended strokes too short to see as such: one path for all points takes a fifth of the
-    # time and a third of the text that markers do. (Some readers drop strokes of no length at
-    # all.) Added as an artist, or matplotlib walks every stroke.
+    # Points are drawn as very short strokes with round ends, all in one path. This takes a fifth of
+    # the time and a third of the text of markers. Some viewers leave out strokes of zero length.
+    # Adding the path as an artist saves matplotlib a loop over all strokes.
     points = np.column_stack([t[shown], y[shown]])
     strokes = points.repeat(2, axis=0)
     strokes[1::2, 0] += 1e-4 * (points[-1, 0] - points[0, 0])
@@ -239,13 +245,13 @@ def plot_points(
     tell(dots, t, y, name=name)
     ax.add_artist(dots)
     ax.update_datalim(points)
-    ax.autoscale_view()  # a patch does not ask for it, and nothing else may be drawn here
+    ax.autoscale_view()  # a patch does not do this by itself, and this may be the only artist
 
 
 def plot_line(
     ax: Axes, t: Array, y: Array, look: Look, *, name: str, in_legend: bool = True
 ) -> None:
-    """Draw a long line thinned to what the eye can resolve; a reader who zooms gets all of it."""
+    """Draw a long line, thinned to what the eye can resolve; a reader who zooms sees all of it."""
     (line,) = ax.plot(*thin(t, y), label=name if in_legend else None, **look)
     tell(line, t, y, name=name)
 
@@ -256,12 +262,17 @@ def plot_model(ax: Axes, t: Array, y: Array, *, label: str = "model") -> None:
 
 
 def plot_second(ax: Axes, t: Array, y: Array, *, label: str) -> None:
-    """Draw what a model is set against: another model, the same without effects."""
+    """Draw the model with which another one is compared, for example the one without effects."""
     plot_line(ax, t, y, SECOND_LINE, name=label)
 
 
 def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
-    """Draw the residuals of one or two models, by their names, in the models' colours."""
+    """Draw the residuals of one or two models, in the colours of these models.
+
+    Parameters
+    ----------
+    residuals : by the name of the model.
+    """
     ax.axhline(0.0, color=QUIET, lw=0.6)
     looks = ({"color": MODEL, "lw": 0.8}, SECOND_LINE | {"lw": 0.8})
     for (name, y), look in zip(residuals.items(), looks, strict=False):
@@ -269,7 +280,10 @@ def plot_residuals(ax: Axes, t: Array, residuals: Mapping[str, Array]) -> None:
 
 
 def keep_in_sight(ax: Axes, measured: Array) -> None:
-    """Limit the axis to one span beyond what was measured: an unstable model may leave any."""
+    """Limit the axis to the measured range plus its span.
+
+    An unstable model may leave this range.
+    """
     low, high = float(np.min(measured)), float(np.max(measured))
     span = high - low or 1.0
     bottom, top = ax.get_ylim()
@@ -277,5 +291,5 @@ def keep_in_sight(ax: Axes, measured: Array) -> None:
 
 
 def position_label(cart: int, unit: str) -> str:
-    """Return the title of a position axis, "x₁ [cm]"."""
+    """Return the title of a position axis: "x₁ [cm]"."""
     return f"x{subscript(cart)} [{unit}]"

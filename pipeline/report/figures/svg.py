@@ -1,4 +1,4 @@
-"""From a figure to SVG text, with the data of its lines for a page that lets readers explore it."""
+"""Convert a figure to SVG text, with the data of its lines, so that readers can explore it."""
 
 import io
 import json
@@ -16,28 +16,30 @@ from matplotlib.figure import Figure
 from pipeline.arrays import Array
 from pipeline.report.figures.ticks import TAGS, draw_ticks
 
-_POINTS = 72.0  # units of the drawing in an inch
-_SAME = 1e-6  # of the figure
+_POINTS = 72.0  # units of the drawing per inch
+_SAME = 1e-6  # of the size of the figure
 
-# Names that matplotlib gives to groups: nobody refers to them, and each page needs them once.
+# Ids that matplotlib gives to groups. Nothing refers to them, and on a page they would not be
+# unique.
 _GROUP_ID = re.compile(r' id="[a-zA-Z0-9.]+_\d+"')
 _TAG = re.compile(rf' id="({"|".join(TAGS)})"')
 _TOLD = re.compile(r""" id=(["'])(\{.*?\})\1""")
 
 
 def tell(artist: Artist, x: Array, y: Array, *, name: str) -> None:
-    """Give a drawn series a name and its whole data, which the drawing itself may thin out."""
+    """Give a drawn series a name and its complete data; the drawing itself may be thinned out."""
     artist.set_gid(json.dumps({"name": name, "x": packed_time(x), "y": _packed(y)}))
 
 
 def to_svg(figure: Figure, *, name: str, alt: str) -> str:
-    """Return the figure as an SVG element, its alternative text inside; the same bytes each time.
+    """Return the figure as an SVG element with its text alternative; the same bytes each time.
 
-    Panels carry their limits and series their data as `data-` attributes, which `plain_svg` takes
-    off. The canvas is called directly: `savefig` would draw everything twice.
+    Panels have their limits and series their data in `data-` attributes, which `plain_svg` removes.
+    The canvas is called directly, because `savefig` would draw everything twice.
     """
     for ax in figure.axes:
-        # Panels on one axis are labelled below the last of a column, left of the first of a row.
+        # Panels that share an axis have labels only at the bottom of a column and at the left of a
+        # row.
         at = ax.get_position()
         column = [
             other for other in ax.get_shared_x_axes().get_siblings(ax)
@@ -77,12 +79,12 @@ def blank_svg(figure: Figure) -> str:
 
 
 def plain_svg(svg: str) -> str:
-    """Return the drawing without the data, for print and for files of its own."""
+    """Return the drawing without the data, for print and for separate files."""
     return re.sub(r' data-[a-z]+="[^"]*"', "", svg)
 
 
 def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
-    """Return where a panel lies on the page (points), its limits, scales and titles."""
+    """Return position (in points), limits, scales and titles of a panel."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     width, height = _POINTS * figure.get_size_inches()
@@ -99,17 +101,17 @@ def _panel(ax: Axes, *, x_label: str, y_label: str) -> dict[str, object]:
 
 def _packed(values: Array) -> str:
     """Return numbers as base64 of little-endian float32: seven digits in five characters."""
-    # The largest that float32 holds; only a model that runs away gets there.
+    # Larger numbers do not fit into float32; only an unstable model has them.
     shown = np.clip(np.asarray(values, dtype=float), -1e38, 1e38)
     return b64encode(shown.astype("<f4").tobytes()).decode()
 
 
 def packed_time(values: Array) -> str:
-    """Return evenly spaced numbers as "first last", others packed."""
+    """Return evenly spaced numbers as "first last", and others packed."""
     if values.size < 2:
         return _packed(values)
     even = np.linspace(values[0], values[-1], values.size)
-    # Nobody sees a sample stand off by less than this share of the whole span.
+    # A sample that is off by less than this share of the span looks evenly spaced.
     if np.max(np.abs(values - even)) > 1e-5 * abs(even[-1] - even[0]):
         return _packed(values)
     return f"{float(values[0]):.9g} {float(values[-1]):.9g}"

@@ -1,4 +1,4 @@
-"""Ticks drawn as one line of grid and a few texts for each axis.
+"""Draw ticks as one grid line and a few texts for each axis.
 
 matplotlib makes seven objects for every tick, which takes half the time of a figure.
 """
@@ -11,14 +11,15 @@ from matplotlib.transforms import ScaledTranslation
 
 from pipeline.arrays import Array
 
-# Parts that a zooming page redraws or moves: grids, tick labels, letters that mark a place.
+# Parts that a page moves or draws again when it zooms: grids, tick labels, letters that mark a
+# place.
 TAGS = ("grid-x", "grid-y", "tick-x", "tick-y", "mark")
 GRID = "#e4e4e4"
-_SIZE = 7.5  # points, of the labels
+_SIZE = 7.5  # points; size of the labels
 
 
 def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
-    """Draw grid and labels of both axes, at the limits the data have set by now."""
+    """Draw grid and labels of both axes, with the limits that the data have set so far."""
     figure = ax.get_figure(root=True)
     assert figure is not None
     sizes = ax.get_position().size * figure.get_size_inches()
@@ -28,9 +29,9 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
             continue
         low, high = sorted((ax.get_xlim, ax.get_ylim)[direction]())
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
-        most = max(2, int(size / (0.45, 0.18)[direction]))  # inches at least between ticks
+        most = max(2, int(size / (0.45, 0.18)[direction]))  # smallest distance of ticks in inches
         own = axis.get_major_locator()
-        # What a figure asks for itself: right angles, whole numbers.
+        # What a figure may set itself: right angles, whole numbers.
         if type(own) in (MultipleLocator, MaxNLocator):
             ticks = np.asarray(own())
             ticks = ticks[(ticks >= low) & (ticks <= high)]
@@ -70,12 +71,13 @@ def _labels(ax: Axes, ticks: Array, *, direction: int, shift: ScaledTranslation)
 
 
 def linear_ticks(low: float, high: float, *, most: int) -> Array:
-    """Return at least two round numbers between two limits, and no more than `most` if it can."""
+    """Return at least two round numbers between two limits, and if possible at most `most`."""
     magnitude = 10.0 ** np.floor(np.log10((high - low) / most))
     ticks = np.array([low, high])
     for factor in (1.0, 2.0, 5.0, 10.0):  # from fine to coarse
         step = factor * magnitude
-        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)  # rounding
+        # The small numbers allow for rounding errors.
+        first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
         if last - first < 1:
             break
         ticks = step * np.arange(first, last + 1)
@@ -95,14 +97,14 @@ def log_ticks(low: float, high: float) -> Array:
 
 
 def tick_labels(ticks: Array) -> list[str]:
-    """Return the numbers in one form: as many decimals as the finest needs, a true minus sign."""
+    """Return the numbers with the same number of decimals, and with a true minus sign."""
     if ticks.size == 0:
         return []
     step = np.min(np.diff(ticks)) if ticks.size > 1 else abs(ticks[0]) or 1.0
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    if decimals > 4 or np.abs(ticks).max() >= 1e6:  # powers of ten are clearer
+    if decimals > 4 or np.abs(ticks).max() >= 1e6:  # powers of ten are clearer then
         texts = [f"{tick + 0.0:.3g}" for tick in ticks]
-    elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # logarithmic
+    elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # ticks of a logarithmic axis
         texts = [f"{tick:g}" for tick in ticks]
     else:
         texts = [f"{tick + 0.0:.{decimals}f}" for tick in ticks]

@@ -1,4 +1,4 @@
-"""Records in time: decays, steps, sine dwells (Figures 12-14), closed loops (Figures 15-17)."""
+"""Recordings over time: decays, steps, sine dwells (Figures 12-14), closed loops (15-17)."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -41,9 +41,9 @@ from pipeline.set_up import Units
 from pipeline.words.numbers import subscript
 from pipeline.words.text import clean
 
-_CYCLES_SHOWN = 10  # of the steady part: single cycles can still be seen
+_CYCLES_SHOWN = 10  # cycles of the steady part; few enough to see each
 _LOOPS = {"closed": "loop model", "open": "model on measured input"}
-_SMALL = 1.15  # inches, the height of a panel among many
+_SMALL = 1.15  # inches; height of one panel among many
 
 
 # --------------------------------------------------------------------- decays
@@ -52,7 +52,7 @@ _SMALL = 1.15  # inches, the height of a panel among many
 def decay_figure(
     decays: Sequence[LogDecrement], *, records: Sequence[Record], position_unit: str
 ) -> Figure:
-    """Return the decays of one cart as small multiples, repeats side by side."""
+    """Return the decays of one cart in small panels, repeats side by side."""
     swings = [float(np.ptp(decay.peak_y)) for decay in decays]
     figure, axes = small_multiples(
         [decay.name for decay in decays], height=_SMALL, share_y=_alike(swings)
@@ -65,7 +65,7 @@ def decay_figure(
 
 
 def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
-    """Plot one decay and what is near it: record, fit, envelope, and the extrema used."""
+    """Plot one decay: recording, fit, envelope, and the extrema used."""
     fit_t, zero = decay.fit_t - decay.release, decay.release
     t, length = record.t - zero, fit_t[-1] - fit_t[0]
     shown = (t >= min(fit_t[0], 0.0) - 0.15 * length) & (t <= fit_t[-1] + 0.25 * length)
@@ -82,7 +82,7 @@ def plot_decay(ax: Axes, decay: LogDecrement, *, record: Record) -> None:
 
 
 def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Figure:
-    """Return damping ratio against amplitude, a panel for each cart, a marker for each record."""
+    """Return damping ratio over amplitude: a panel for each cart, a marker for each recording."""
     carts = sorted({decay.cart for decay in decays})
     figure, axes = panels(1.35, columns=len(carts), share_x=False)
     for ax, cart in zip(axes, carts, strict=True):
@@ -99,7 +99,7 @@ def damping_figure(decays: Sequence[LogDecrement], *, position_unit: str) -> Fig
 
 
 def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
-    """Plot the local damping ratio against the amplitude it was seen at."""
+    """Plot the local damping ratio over the amplitude at which it was measured."""
     amplitude, zeta = decay.zeta_at_amplitude
     (line,) = ax.plot(amplitude, zeta, marker, ms=3.2, mfc="white", mec=MEASURED, mew=0.8, ls="-",
                       lw=0.6, color=QUIET)  # fmt: skip
@@ -112,7 +112,10 @@ def plot_damping(ax: Axes, decay: LogDecrement, *, marker: str) -> None:
 def step_figure(
     steps: Sequence[Sequence[StepGain]], *, records: Sequence[Record], position_unit: str
 ) -> Figure:
-    """Return step records as small multiples; each entry of `steps` is one record's carts."""
+    """Return step recordings in small panels.
+
+    Each entry of `steps` has the carts of one recording.
+    """
     swings = [
         max(float(np.ptp(record.position(gain.cart))) for gain in gains)
         for gains, record in zip(steps, records, strict=True)
@@ -128,9 +131,9 @@ def step_figure(
 
 
 def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
-    """Plot the positions of all carts of a step record, with the levels that were read off.
+    """Plot the positions of all carts in a step recording, and the levels that were read.
 
-    A level is dashed over the window that it was read from, behind the points.
+    A level is a dashed line over the window from which it was read, behind the points.
     """
     for gain in gains:
         _plot_cart_points(ax, record.t, record.position(gain.cart), cart=gain.cart)
@@ -146,18 +149,20 @@ def plot_step(ax: Axes, gains: Sequence[StepGain], *, record: Record) -> None:
 
 
 def _plot_cart_points(ax: Axes, t: Array, y: Array, *, cart: int) -> None:
-    """Plot the points of one of several carts that share a panel, some with its own mark."""
+    """Plot the points of one of several carts in a panel.
+
+    Some of the points have the cart's marker.
+    """
     style, name = (cart - 1) % len(CARTS), f"x{subscript(cart)}"
     colour, _, mark, _ = CARTS[style]
     plot_points(ax, t, y, most=400, name=name, color=colour)
-    # Every cart has 16 marks at its own times, because equal motions would otherwise hide each
-    # other.
+    # Each cart has 16 markers, at times of its own; otherwise equal motions would hide each other.
     at = np.linspace(0, t.size - 1, 16 * len(CARTS)).astype(int)[style :: len(CARTS)]
     ax.plot(t[at], y[at], mark, ms=3.6, mfc="white", mec=colour, mew=0.9, label=name)
 
 
 def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> None:
-    """Plot one of several carts that share a panel: its colour, and its own kind of line."""
+    """Plot the line of one of several carts in a panel, in the cart's colour and line style."""
     colour, ls, *_ = CARTS[(cart - 1) % len(CARTS)]
     plot_line(ax, t, y, {"color": colour, "ls": ls, "lw": lw}, name=f"x{subscript(cart)}")
 
@@ -166,7 +171,7 @@ def _plot_cart(ax: Axes, t: Array, y: Array, *, cart: int, lw: float = 1.0) -> N
 
 
 def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: str) -> Figure:
-    """Return one dwell, a panel for each cart, the transient shaded."""
+    """Return one dwell, with a panel for each cart; the transient is shaded."""
     figure, axes = panels(*[1.0] * len(points))
     for ax, point in zip(axes, points, strict=True):
         plot_sine(ax, point, record=record)
@@ -179,7 +184,10 @@ def sine_figure(points: Sequence[SinePoint], *, record: Record, position_unit: s
 
 
 def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
-    """Plot one cart's motion, transient shaded, the steady amplitude as two lines."""
+    """Plot the motion of one cart.
+
+    The transient is shaded, and two lines show the steady amplitude.
+    """
     end = point.steady_from + _CYCLES_SHOWN * 2 * np.pi / point.omega
     shown = record.t <= end
     t, y = record.t[shown], record.position(point.cart)[shown]
@@ -187,7 +195,7 @@ def plot_sine(ax: Axes, point: SinePoint, *, record: Record) -> None:
     plot_line(ax, t, y, {"color": QUIET, "lw": 0.7}, name="record", in_legend=False)
     plot_measured(ax, t, y, most=300)
     ax.axvspan(float(t[0]), point.steady_from, color=SHADE, lw=0, label="transient")
-    # The middle of the steady swing: mean over samples, near enough for ten cycles.
+    # The mean of the samples is near enough to the middle of the swing over ten cycles.
     middle = float(np.mean(y[steady])) if np.any(steady) else float(np.mean(y))
     for k, level in enumerate((middle - point.amplitude, middle + point.amplitude)):
         ax.plot((point.steady_from, float(t[-1])), (level, level), color=MODEL, lw=1.1,
@@ -203,9 +211,12 @@ def hardware_figure(
     record: Record | None,
     units: Units,
 ) -> Figure:
-    """Return one run: each cart with its set point, below it the residuals, last the input.
+    """Return one run: each cart with its set point, then the residuals, then the input.
 
-    An entry holds the one or two models of a cart; without the record there is no input.
+    Parameters
+    ----------
+    checks : for each cart, its comparison with one or two models.
+    record : None leaves out the input.
     """
     driven = record if record is not None and record.u is not None else None
     figure, axes = panels(*[0.9, 0.62] * len(checks), *([0.6] if driven else []))
@@ -228,7 +239,7 @@ def hardware_figure(
 
 
 def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
-    """Plot the input as logged, and what the modelled loop asks for."""
+    """Plot the logged input, and the input that the modelled loop would need."""
     assert record.u is not None
     plot_points(ax, record.t, record.u)
     if model is not None:
@@ -238,7 +249,7 @@ def plot_effort(ax: Axes, record: Record, *, model: Array | None) -> None:
 
 
 def plot_hardware(ax: Axes, checks: Sequence[HardwareCheck]) -> None:
-    """Plot measured points against the simulated loop, and the model under the measured input."""
+    """Plot measured points, the simulated loop, and the model driven by the measured input."""
     plot_measured(ax, checks[0].t, checks[0].measured)
     for check, plot in zip(checks, (plot_model, plot_second), strict=False):
         plot(ax, check.t, check.model, label=_LOOPS[check.loop])
@@ -258,7 +269,7 @@ def design_figure(design: FeedbackDesign, *, units: Units) -> Figure:
 
 
 def plot_design(ax: Axes, design: FeedbackDesign) -> None:
-    """Plot all carts' positions, the chosen cart's goal and its 2 % band."""
+    """Plot the positions of all carts, and for the controlled cart the goal and its 2 % band."""
     r = design.reference
     ax.axhspan(r - 0.02 * abs(r), r + 0.02 * abs(r), color=SHADE, lw=0)
     ax.axhline(r, color=QUIET, lw=0.8)
@@ -272,12 +283,12 @@ def plot_design(ax: Axes, design: FeedbackDesign) -> None:
 
 
 def _alike(swings: Sequence[float]) -> bool:
-    """Return whether motions are of a size to be drawn on one scale."""
+    """Return whether motions are similar enough in size to share one scale."""
     return max(swings) < 4.0 * min(swings)
 
 
 def label_outer(axes: Sequence[Axes], *, x: str, y: str) -> None:
-    """Title the axes at the left and at the lower end of each column."""
+    """Put axis titles only at the left and at the bottom of each column."""
     columns = len({ax.get_position().x0 for ax in axes})
     for i, ax in enumerate(axes):
         if i % columns == 0:

@@ -1,4 +1,7 @@
-"""The gap's verdict inside the report, where a gap analysis of the same data lies beside it."""
+"""The verdict of the gap analysis, as a section of the report.
+
+It is included if the folder has a gap analysis of the same data.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,15 +42,15 @@ from pipeline.submission.toml_file import read_text
 from pipeline.words.numbers import listing
 from pipeline.words.text import capital, clean
 
-_PLACES = ("gap/gap.json", "gap.json")  # in the submission's folder
-_MOST_BYTES = 10_000_000  # ten times that of three carts and a hundred runs
+_PLACES = ("gap/gap.json", "gap.json")  # paths in the submission's folder
+_MOST_BYTES = 10_000_000  # ten times the size for three carts and a hundred runs
 _MOST_RUNS = 4
 
 
 def with_gap(analysis: Analysis, folder: Path) -> tuple[Analysis, Gap | None]:
-    """Return the analysis, and the gap analysis of the same data that lies in its folder.
+    """Return the analysis, and the gap analysis of the same data from its folder.
 
-    One that is of other data or cannot be read becomes a warning.
+    A gap analysis of other data, or one that cannot be read, becomes a warning.
     """
     gap, warning = _find(folder, analysis)
     if warning:
@@ -74,7 +77,7 @@ def _find(folder: Path, analysis: Analysis) -> tuple[Gap | None, str]:
 
 
 def gap_in_short(gap: Gap | None) -> list[Block]:
-    """Return the verdict in one paragraph, which leads to the section about it."""
+    """Return the verdict as one paragraph with a link to its section."""
     if gap is None:
         return []
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
@@ -88,7 +91,7 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
 
 
 def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
-    """Return the verdict, its errors, and the equations with the effects."""
+    """Return the verdict, the errors, and the equations with the effects."""
     if gap is None:
         return []
     blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
@@ -105,7 +108,7 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
 
 
 def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
-    """Return the model with effects beside the linear one, both driven by the measured input."""
+    """Return the model with effects next to the linear one, both driven by the measured input."""
     if gap is None or not gap.model.terms:
         return []
     opened = [check for check in page.analysis.hardware if check.loop == "open"]

@@ -1,4 +1,4 @@
-"""The gap report: the verdict on one page, then the story step by step."""
+"""The gap report: the verdict on one page, then the evidence step by step."""
 
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -53,8 +53,8 @@ from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import plain
 from pipeline.words.text import capital, clean
 
-_MOST_ROWS = 28  # runs in the overview; the JSON has all
-_MORE_TRACES = 3  # drawn after the one in the summary
+_MOST_ROWS = 28  # runs in the overview; gap.json has all
+_MORE_TRACES = 3  # traces drawn after the one in the summary
 
 
 def render_gap(
@@ -71,7 +71,7 @@ def render_gap(
 
 
 def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = silent) -> Document:
-    """Return the gap report; sections that have nothing to show are left out."""
+    """Return the gap report; sections with nothing to show are left out."""
     page = Page(analysis)
     worst = _worst_first(gap)
     forces = residual_forces(gap, free={record.id: record.free for record in analysis.records})
@@ -139,7 +139,7 @@ def _where(page: Page, gap: Gap) -> list[Block]:
 
 
 def before_after_picture(page: Page, gap: Gap, trace: Trace, *, number: int) -> Block:
-    """Return one cart in one run: measured, both models, and what each leaves below."""
+    """Return one cart in one run: measured and both models above, the residuals below."""
     row = _row(gap, trace)
     noise = 0.0
     if row is not None and row.final > 0:
@@ -191,7 +191,7 @@ def _effect(page: Page, gap: Gap, index: int, *, forces: Sequence[ResidualForce]
 def _evidence(
     page: Page, gap: Gap, found: FoundEffect, *, forces: Sequence[ResidualForce], number: int
 ) -> list[Block]:
-    """Return the figure that shows the effect: force against what causes it, or in time."""
+    """Return the figure that shows an effect: its force over the cause, or its timing."""
     axis, added = found.effect.axis, added_name(gap)
     if axis == "frequency":
         held_out = [trace for trace in gap.traces if trace.held_out]
@@ -230,7 +230,7 @@ def _runs(page: Page, gap: Gap, worst: Sequence[Trace]) -> list[Block]:
 
 
 def _force_left(page: Page, gap: Gap) -> list[Block]:
-    """Show what no law of the model explains, cart by cart, and the formula for it."""
+    """Return the force that the model leaves unexplained, for each cart, with a formula for it."""
     if not gap.residual:
         return []
     model = whole_model(gap) if gap.effects else WORDS.text("linear_model")
@@ -265,7 +265,7 @@ def _hands(page: Page, gap: Gap) -> list[Block]:
 
 
 def _touched(page: Page, gap: Gap, trace: Trace) -> list[tuple[Array, Array]]:
-    """Return the stretches right before and after a run in which a hand moved a cart."""
+    """Return the stretches just before and after a run in which a hand moved a cart."""
     record = page.records.get(trace.experiment)
     if record is None:
         return []
@@ -293,7 +293,7 @@ def _apart(page: Page, gap: Gap) -> list[Block]:
 
 
 def _predicted(page: Page, gap: Gap) -> list[Block]:
-    """Return the recording proposed, and what each explanation predicts of it."""
+    """Return the proposed recording, and what each explanation predicts for it."""
     proposal = gap.proposal
     if proposal is None or proposal.prediction is None:
         return []
@@ -322,7 +322,7 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
 
 
 def _told_apart(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
-    """Return what either model has that the other has not, in words."""
+    """Return, for each of two models, the effects that the other model lacks, in words."""
     mine, yours = (
         [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)
     )
@@ -374,9 +374,9 @@ def _method(gap: Gap) -> list[Block]:
 
 
 def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
-    """Return the cart that the linear model describes worst, in the new runs.
+    """Return the cart that the linear model describes worst in the new runs.
 
-    Without new runs, all runs count; None if there are no runs at all.
+    Without new runs, all runs count. Returns None if there are no runs.
     """
 
     def size(trace: Trace) -> float:
@@ -388,13 +388,13 @@ def deciding_trace(gap: Gap, recorded: Collection[str]) -> Trace | None:
 
 
 def _worst_first(gap: Gap) -> list[Trace]:
-    """Return the held-out runs, that of the largest error before first; one a run."""
+    """Return the held-out runs, the largest error before first, with one cart for each run."""
 
     def size(trace: Trace) -> float:
         row = _row(gap, trace)
         return row.baseline if row else 0.0
 
-    # In ascending order, so that of each run the cart with the largest error stays.
+    # In ascending order, so that for each run the cart with the largest error is kept.
     held_out = sorted((trace for trace in gap.traces if trace.held_out), key=size)
     worst = {trace.experiment: trace for trace in held_out}
     return sorted(worst.values(), key=size, reverse=True)

@@ -12,7 +12,7 @@ from pipeline.words.text import clean
 
 
 def error_table(page: Page, gap: Gap) -> Table:
-    """Return the error on held-out runs, step by step, against noise and repeatability."""
+    """Return the error on held-out runs after each step, next to noise and repeatability."""
     models = [("linear model", gap.baseline)]
     models += [(f"with {effect_name(f.effect, f.where)}", f.nrmse_after) for f in gap.effects]
     limits = [("noise alone", gap.noise_floor)]
@@ -24,24 +24,29 @@ def error_table(page: Page, gap: Gap) -> Table:
 
 
 def window_table(page: Page, windows: Sequence[GapWindow], *, model: str) -> Table:
-    """Return where a model, "the linear model" say, fails most."""
+    """Return the stretches of time in which a model is wrong most.
+
+    Parameters
+    ----------
+    model : its name, for example "the linear model".
+    """
     rows = [(*_stretch(w), phase(w.what), percent(100 * w.share)) for w in windows]
     return page.table(WORDS, "window_table", rows, "lcddld", model=model)
 
 
 def intervention_table(page: Page, interventions: Sequence[Intervention]) -> Table:
-    """Return where a hand moved a cart."""
+    """Return the stretches of time in which a hand moved a cart."""
     rows = [(*_stretch(one), one.what) for one in interventions]
     return page.table(WORDS, "intervention_table", rows, "lcddl")
 
 
 def _stretch(one: GapWindow | Intervention) -> tuple[str, str, str, str]:
-    """Return run, cart, first and last second of a stretch."""
+    """Return run, cart, and start and end (in s) of a stretch."""
     return clean(one.experiment), str(one.cart), f"{one.start:.2f}", f"{one.end:.2f}"
 
 
 def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
-    """Return the parameters of an effect with standard errors."""
+    """Return the parameters of an effect with their standard errors."""
     symbols = {p.name: p.symbol for p in found.effect.parameters}
     rows = [
         (
@@ -57,7 +62,7 @@ def effect_parameter_table(page: Page, found: FoundEffect) -> Table:
 
 
 def rival_table(page: Page, found: FoundEffect, gap: Gap) -> Table:
-    """Return the effects tried in this one's stead, each fitted as fully, with their scores."""
+    """Return the effects tried instead of this one, each fully fitted, with their scores."""
 
     def line(name: str, error: float, confidence: float, tone: Tone = "") -> list[Cell]:
         weight = f"{100 * confidence:.1f} %" if confidence >= 5e-4 else "< 0.1 %"

@@ -1,4 +1,4 @@
-"""The gap in plain words: what explains it, how well, and what to do next."""
+"""The gap in words: what explains it, how well, and what to do next."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -25,7 +25,7 @@ def added_name(gap: Gap) -> str:
 
 
 def whole_model(gap: Gap) -> str:
-    """Return what the last model is called in a sentence, "the model with its effects"."""
+    """Return the final model's name inside a sentence, such as "the model with its effects"."""
     return WORDS.text("model_suspects" if gap.verdict == "unexplained" else "model_effects")
 
 
@@ -36,9 +36,10 @@ def verdict_title(gap: Gap) -> str:
 
 
 def error_board(gap: Gap) -> Tiles:
-    """Return the error on runs no fit has seen: before, after, and what noise alone makes.
+    """Return the errors on held-out runs: before, after, and from noise alone.
 
-    The last model has the tone of the verdict; of two explanations neither is wrong or right yet.
+    The final model has the colour of the verdict. If two explanations are possible, it has no
+    colour.
     """
     tones: dict[str, Tone] = {"none": "good", "named": "good", "ambiguous": ""}
     tiles = [_tile("linear", gap.baseline)]
@@ -58,7 +59,7 @@ def _tile(key: str, error: float, **values: str) -> Tile:
 
 
 def verdict_blocks(gap: Gap) -> list[Block]:
-    """Say what explains the gap and how well; under `ambiguous`, both explanations."""
+    """Return what explains the gap and how well; for `ambiguous`, both explanations."""
     so_far = [] if gap.complete else [paragraph(WORDS.spans("so_far"))]
     match gap.verdict:
         case "none":
@@ -75,10 +76,11 @@ def verdict_blocks(gap: Gap) -> list[Block]:
 
 
 def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
-    """Say of a linear model that is enough what that covers, and what would have shown."""
+    """Return what a sufficient linear model covers, and how large a hidden effect could be."""
     repeats = AS_REPEATS * (gap.repeatability or 0.0)
     noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
-    # A search begins above both: the square of what is hidden adds to that of the noise.
+    # A search begins above both. The square of a hidden effect's error adds to the square of the
+    # noise.
     hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
     lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
     blocks: list[Block] = [
@@ -88,7 +90,7 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
     for trace in gap.traces:
         far = float(np.max(np.abs(trace.measured - trace.zero)))
         reach[trace.cart] = max(far, reach.get(trace.cart, 0.0))
-    if not reach:  # read from a file
+    if not reach:  # not known, because the analysis was read from a file
         return blocks
     said = [
         f"cart {cart} up to {significant(far, digits=3)} {position}"
@@ -101,7 +103,7 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
 
 
 def next_block(gap: Gap) -> list[Block]:
-    """Say what comes next."""
+    """Return the next recording to make."""
     if gap.verdict == "none":
         return [paragraph(WORDS.spans("next_none"))]
     if not gap.next_experiment:
@@ -111,7 +113,7 @@ def next_block(gap: Gap) -> list[Block]:
 
 
 def terminal_verdict(gap: Gap) -> str:
-    """Return the verdict as a few lines of plain text."""
+    """Return the verdict as a few lines of text."""
     return plain_lines([paragraph(verdict_title(gap)), *verdict_blocks(gap), *next_block(gap)])
 
 
@@ -174,7 +176,7 @@ def _unexplained(gap: Gap) -> Block:
 
 
 def _suspicion(gap: Gap) -> str:
-    """Return who else is suspected, as a further sentence."""
+    """Return which other effects are suspected, as a further sentence."""
     if not gap.suspects:
         return ""
     named = [
@@ -185,13 +187,13 @@ def _suspicion(gap: Gap) -> str:
 
 
 def shares(gap: Gap | RecordGap) -> dict[str, str]:
-    """Return the errors before and after, and the noise, of all runs or of one."""
+    """Return the errors before and after, and the noise, as text; of all runs or of one."""
     errors = {"baseline": gap.baseline, "final": gap.final, "noise_floor": gap.noise_floor}
     return {name: share(error) for name, error in errors.items()}
 
 
 def _noise(gap: Gap) -> str:
-    """Return what no model can be better than, as a clause."""
+    """Return the error that no model can undercut, as a clause."""
     if gap.repeatability is not None and gap.repeatability >= gap.noise_floor:
         return WORDS.text("repeats_differ", share=share(gap.repeatability))
     return WORDS.text("noise_makes", share=share(gap.noise_floor))
@@ -220,12 +222,12 @@ def _times_left(times: float) -> str:
 
 
 def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
-    """Return the two explanations that the data do not tell apart: chosen effect and rival."""
+    """Return the chosen effect and the rival that the data cannot distinguish from it."""
     close = [
         (rival.confidence, i, found, rival)
         for i, found in enumerate(gap.effects)
         for rival in found.rivals
-        if rival.nrmse_after <= 1.15 * gap.final  # the data do not tell it from what was chosen
+        if rival.nrmse_after <= 1.15 * gap.final  # as good as the chosen one
         and rival.effect.grows_from != found.effect.key
     ]
     if not close:
@@ -238,12 +240,12 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
 
 
 def effect_name(effect: Effect, where: Mapping[str, int]) -> str:
-    """Return "dry (Coulomb) friction on cart 2", as it stands inside a sentence."""
+    """Return an effect's name inside a sentence: "dry (Coulomb) friction on cart 2"."""
     title = effect.title[:1].lower() + effect.title[1:]
     place = place_name(where)
     if not place:
         return title
-    named = any(kind in title for kind in where)  # "a hidden mass on a cart"
+    named = any(kind in title for kind in where)  # for example "a hidden mass on a cart"
     return f"{title} ({place})" if named else f"{title} on {place}"
 
 
@@ -253,32 +255,32 @@ def place_name(where: Mapping[str, int]) -> str:
 
 
 def sizes_text(parameters: Mapping[str, NamedValue]) -> str:
-    """Return "force 0.41 ± 0.01 V, distance 0.02 ± 0.01 cm", for a sentence."""
+    """Return sizes inside a sentence: "force 0.41 ± 0.01 V, distance 0.02 ± 0.01 cm"."""
     return ", ".join(
         f"{name.replace('_', ' ')} {_size(value)}" for name, value in parameters.items()
     )
 
 
 def _sizes_there(found: FoundEffect, *, several: bool) -> str:
-    """Return the sizes of one effect; of several, with the cart or spring that they belong to."""
+    """Return the sizes of one effect; if there are several effects, with its cart or spring."""
     place = place_name(found.where) if several else ""
     return sizes_text(found.parameters) + (f" on {place}" if place else "")
 
 
 def _size(value: NamedValue) -> str:
     unit = unit_text(clean(value.unit))
-    # An error so small is only in the table.
+    # A smaller error is only in the table.
     exact = value.std is not None and value.std < 1e-3 * abs(value.value)
     text = significant(value.value) if exact else with_error(value.value, value.std)
     return text + (f" {unit}" if unit else "")
 
 
 def phase(what: str) -> str:
-    """Return what a cart does in a stretch of time, as the gap's windows name it, in words."""
+    """Return the name of a kind of motion as text, such as "velocity near zero"."""
     return WORDS.text("throughout") if what == "throughout" else clean(what)
 
 
 def share(value: float) -> str:
-    """Return a share of the motion in percent, with as many digits as matter."""
+    """Return a share of the motion in percent, with the digits that matter."""
     digits = 3 if value >= 0.0995 else 2
     return f"{significant(100 * value, digits=digits)} %"

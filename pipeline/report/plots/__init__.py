@@ -1,1 +1,1 @@
-"""The page of plots to look through: every record with its models, laid over each other."""
+"""The page with interactive plots of every recording and its models."""

@@ -1,4 +1,4 @@
-"""Runs as compact text inside a page: thinned so that every peak stays, sixteen bits a number."""
+"""Pack runs as compact text for a page: every peak is kept, and each number takes sixteen bits."""
 
 from base64 import b64encode
 from collections.abc import Sequence
@@ -14,17 +14,18 @@ from pipeline.report.plots.runs import ComparedCart, ComparedRun
 from pipeline.report.plots.spectrum import amplitude_spectrum, thin_lines
 from pipeline.words.text import clean
 
-MOST_WHOLE = 4_000  # samples of a run that is shown whole
-_STRETCHES = 1_000  # of a longer one; each keeps its ends, and the extremes of every signal
-_LEVELS = 65_534  # of a number; the one below them all is for none
-_SMALLEST = 1e-12  # of the largest amplitude
+MOST_WHOLE = 4_000  # samples of a run that is shown completely
+# Stretches of a longer run; each keeps its ends and the extremes of every signal.
+_STRETCHES = 1_000
+_LEVELS = 65_534  # levels of a number; the one below them all marks a missing number
+_SMALLEST = 1e-12  # share of the largest amplitude
 
 
 def pack_run(run: ComparedRun) -> dict[str, Any]:
     """Return a run as the page's script reads it.
 
-    Positions and residuals stand by themselves, so that a residual has all its digits; a model is
-    the one less the other.
+    Positions and residuals are packed separately, so that residuals keep all digits. The script
+    computes each model as position minus residual.
     """
     signals = [cart.measured for cart in run.carts]
     signals += [cart.measured - one.y for cart in run.carts for one in cart.models]
@@ -60,7 +61,7 @@ def pack_run(run: ComparedRun) -> dict[str, Any]:
 
 
 def keep_extremes(signals: Sequence[Array]) -> NDArray[np.intp]:
-    """Return which samples (k,) of signals (n,) show the ends and extremes of every stretch."""
+    """Return the samples (k,) of signals (n,) that show the ends and extremes of every stretch."""
     bounds = np.linspace(0, signals[0].size, _STRETCHES + 1).astype(int)
     kept = [bounds[:-1], bounds[1:] - 1]
     for signal in signals:
@@ -72,7 +73,10 @@ def keep_extremes(signals: Sequence[Array]) -> NDArray[np.intp]:
 
 
 def pack(values: Array) -> list[Any]:
-    """Return numbers, NaN for none, as [lowest, step, base64 of little-endian int16]."""
+    """Return numbers as [middle, step, base64 of little-endian int16].
+
+    The lowest int16 marks NaN.
+    """
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
     step = (high - low) / _LEVELS
@@ -86,7 +90,8 @@ def pack(values: Array) -> list[Any]:
 def _spectra(run: ComparedRun) -> tuple[Array, Any]:
     """Return frequencies (k,), and an iterator over packed spectra in the order of the page.
 
-    Spectra are logarithms to base ten. What is not simulated from the first sample is of the rest.
+    Spectra are logarithms to base ten. If a model is simulated only from a later sample on, all
+    spectra begin there.
     """
     signals = [signal for cart in run.carts for signal in _signals_of(cart)]
     first = max((int(np.argmax(np.isfinite(one))) for one in signals), default=0)
@@ -99,6 +104,6 @@ def _spectra(run: ComparedRun) -> tuple[Array, Any]:
 
 
 def _signals_of(cart: ComparedCart) -> list[Array]:
-    """Return measured, and of each model what it reads and what it leaves."""
+    """Return the measured signal, then each model's positions and residuals."""
     pairs = [(one.y, cart.measured - one.y) for one in cart.models]
     return [cart.measured, *(signal for pair in pairs for signal in pair)]

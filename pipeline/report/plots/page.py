@@ -1,4 +1,7 @@
-"""The page of plots to look through: one file, its data inside, readable without scripts."""
+"""The page with interactive plots: one file with its data inside, which also shows a picture.
+
+Without scripts, readers see the picture and the table of errors.
+"""
 
 import json
 from collections.abc import Sequence
@@ -35,7 +38,7 @@ from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 from pipeline.words.text import clean
 
-NAME = "compare.html"  # beside report.html
+NAME = "compare.html"  # next to report.html
 _KINDS = ("decay", "step", "sine", "sweep", "closed_loop")
 _SHOWS = ("overlay", "residual", "spectrum", "leftover")
 _MODELS = ("linear", "effects", "loop")
@@ -56,8 +59,8 @@ def render_page(
 
     Parameters
     ----------
-    gap : whose effects are in the runs.
-    report : whether it leads to a report beside it.
+    gap : the gap analysis whose effects are in the runs.
+    report : whether the page links to a report next to it.
     """
     page = Page(analysis)
     added = added_name(gap) if gap else ""
@@ -91,19 +94,19 @@ def render_page(
         thinned=_WORDS.text("thinned") if any(r.t.size > MOST_WHOLE for r in runs) else "",
         tables=_WORDS.text("tables") if analysis.tables else "",
         still=_draw_still(page, runs, added=names["effects"]),
-        # No text in it can end its script element.
+        # No text in the data can end the script element.
         data=Markup(json.dumps(data, ensure_ascii=False).replace("<", "\\u003c")),
     )
 
 
 def _write_address(run: str, cart: int, model: str) -> str:
-    """Return the fragment of the address under which the page shows a residual."""
+    """Return the part of the address after "#" that makes the page show a residual."""
     lines = [("line", "measured"), ("line", model)]
     return urlencode([("run", run), ("cart", cart), *lines, ("show", "residual")])
 
 
 def _find_worst(runs: Sequence[ComparedRun]) -> tuple[str, int, float] | None:
-    """Return the run and cart that the linear model is furthest off in, and how far."""
+    """Return the run and cart that the linear model describes worst, and its error."""
     found = [
         (clean(run.id), cart.cart, one.nrmse)
         for run in runs
@@ -123,7 +126,7 @@ def _tell_result(runs: Sequence[ComparedRun]) -> str:
 
 
 def _group_runs(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
-    """Return the runs of each kind under its name."""
+    """Return the names of the runs of each kind."""
     groups = [(kind, [clean(run.id) for run in runs if run.kind == kind]) for kind in _KINDS]
     return [(_WORDS.text(f"kind_{kind}"), ids) for kind, ids in groups if ids]
 
@@ -131,7 +134,7 @@ def _group_runs(runs: Sequence[ComparedRun]) -> list[tuple[str, list[str]]]:
 def _list_errors(
     runs: Sequence[ComparedRun], names: dict[str, str]
 ) -> list[tuple[str, str, str, dict[int, str]]]:
-    """Return rows of run, model, its name, and each cart's error."""
+    """Return rows with run, model, name of the model, and each cart's error."""
     rows = []
     for run in runs:
         for model in _MODELS:
@@ -147,7 +150,7 @@ def _list_errors(
 
 
 def _draw_still(page: Page, runs: Sequence[ComparedRun], *, added: str) -> Picture | None:
-    """Return one run as a picture: the one that the linear model is furthest off in."""
+    """Return the run that the linear model describes worst, as a picture."""
     worst = _find_worst(runs)
     chosen = [run for run in runs if run.carts and (not worst or clean(run.id) == worst[0])]
     if not chosen:

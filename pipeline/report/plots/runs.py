@@ -1,7 +1,7 @@
-"""Every record of a submission beside its models: measured, and simulated by each of them.
+"""Every recording of a submission with its models: measured, and simulated by each model.
 
-Driven runs are simulated as in the report's "Model and measurement": from rest, by the measured
-input. A decay is simulated from where the hand has let go, its start fitted to the run.
+Driven runs are simulated as in the report's section "Model and measurement": from rest, by the
+measured input. A decay is simulated from the moment of release, with its start fitted to the run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,12 +29,13 @@ _WORDS = phrases("plots")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Simulated:
-    """One cart of a run by one model: readings (n,), NaN where nothing is simulated.
+    """One cart of a run, simulated by one model.
 
     Attributes
     ----------
-    nrmse : root-mean-square of measured minus simulated position over that of the measured one
-        about its rest, over the samples that are simulated.
+    y : readings (n,), NaN where nothing is simulated.
+    nrmse : root mean square of measured minus simulated position, divided by that of the measured
+        position about its rest; both over the simulated samples.
     """
 
     model: ModelName
@@ -44,7 +45,7 @@ class Simulated:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ComparedCart:
-    """One cart of a run: measured (n,), and by each model."""
+    """One cart of a run: measured (n,), and simulated by each model."""
 
     cart: int
     measured: Array
@@ -53,7 +54,12 @@ class ComparedCart:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ComparedRun:
-    """One run; `note` says why a model is missing, or what a reader must know."""
+    """One run.
+
+    Attributes
+    ----------
+    note : why a model is missing, or what readers must know.
+    """
 
     id: str
     kind: Kind
@@ -66,7 +72,7 @@ class ComparedRun:
 def compare_runs(
     analysis: Analysis, *, gap: Gap | None, progress: Progress
 ) -> tuple[ComparedRun, ...]:
-    """Return every record with its models; a run that no model can be held against says why.
+    """Return every recording with its models; if a run has none, its note says why.
 
     Parameters
     ----------
@@ -92,7 +98,7 @@ def compare_runs(
 
 
 def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun:
-    """Return one record with its models."""
+    """Return one recording with its models."""
     models: Mapping[int, Sequence[Simulated]] = {}
     note = ""
     if analysis.chain is None:
@@ -124,7 +130,10 @@ def _compare(record: Record, analysis: Analysis, gap: Gap | None) -> ComparedRun
 def _driven(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return by cart what the measured input, or the loop that ran, makes of a run."""
+    """Return, by cart, a run simulated with the measured input and with the loop that ran.
+
+    And a note.
+    """
     checks = [check for check in analysis.hardware if check.experiment == record.id]
     checks = checks or list(check_hardware(record, chain))
     opened = [check for check in checks if check.loop == "open"]
@@ -144,9 +153,10 @@ def _driven(
 def _with_effects(
     record: Record, opened: Sequence[HardwareCheck], gap: Gap, *, springs: tuple[bool, ...]
 ) -> dict[int, Simulated]:
-    """Return by cart the model with effects under the measured input.
+    """Return, by cart, the model with effects driven by the measured input.
 
-    It starts from rest or, where that comes nearer, as fitted to the run: a dwell begins in motion.
+    It starts from rest or from a state fitted to the run, whichever is nearer to the measurement,
+    because a dwell begins in motion.
     """
     replays = replay_driven(record, opened, gap.model)
     found = {one.check.cart: one.model for one in replays}
@@ -184,7 +194,7 @@ def _simulated(check: HardwareCheck) -> Simulated:
 def _released(
     record: Record, analysis: Analysis, chain: Chain, gap: Gap | None
 ) -> tuple[dict[int, list[Simulated]], str]:
-    """Return by cart what the models make of a decay, from where the hand has let go."""
+    """Return, by cart, a decay simulated by the models from the moment of release; and a note."""
     springs = analysis.bench.springs
     run = prepare_run(record, springs=springs)
     linear = released_run(_motion_alone(run), chain)
@@ -204,7 +214,7 @@ def _released(
 
 
 def _motion_alone(run: GapRun) -> Record:
-    """Return the record of a run without what lies before its first sample."""
+    """Return the record of a run without the samples before its first one."""
     record, n = run.record, run.t.size
     return replace(
         record,
@@ -221,7 +231,7 @@ def _from_release(
     models: Sequence[tuple[ModelName, Mapping[int, Array]]],
     rest: Mapping[int, float],
 ) -> Iterator[tuple[int, list[Simulated]]]:
-    """Yield each cart with what its models read over the whole record."""
+    """Yield each cart with the models' positions over the whole recording."""
     before = np.full(record.t.size - run.t.size, np.nan)
     for j, cart in enumerate(row + 1 for row in run.rows):
         measured = run.y[j]

@@ -1,1 +1,1 @@
-"""A document as HTML and as PDF."""
+"""Render a document as HTML and as PDF."""

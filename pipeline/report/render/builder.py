@@ -1,4 +1,4 @@
-"""One builder for every page: running numbers, figures and tables with their words, sections."""
+"""Build any page: number figures and tables, add their captions, collect sections."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +16,13 @@ from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import Spans
 from pipeline.words.text import clean, rich
 
-Part = tuple[str, str, Callable[[Any], Sequence[Block]]]  # anchor, title, blocks of a page
+# Anchor, title, and a function that returns the blocks of a page.
+Part = tuple[str, str, Callable[[Any], Sequence[Block]]]
 
 
 @dataclass(frozen=True)
 class PageBuilder:
-    """The running numbers of a page's figures and tables."""
+    """Counts the figures and tables of a page."""
 
     _figures: Iterator[int] = field(default_factory=lambda: count(1), init=False)
     _tables: Iterator[int] = field(default_factory=lambda: count(1), init=False)
@@ -29,7 +30,7 @@ class PageBuilder:
     def sections(
         self, parts: Iterable[Part], *, doing: str = "", progress: Progress = silent
     ) -> tuple[Section, ...]:
-        """Return the sections that have something to show, each said to `progress` beforehand."""
+        """Return the sections that have something to show; `progress` is called before each."""
         found = []
         with drawing():
             for id_, title, blocks_of in parts:
@@ -47,9 +48,13 @@ class PageBuilder:
         /,
         **said: object,
     ) -> Table:
-        """Return a table, see `make_table`, under the next number.
+        """Return a table with the next number; see `make_table`.
 
-        The sentence `key` is its caption, `key_head` has its headings, `said` what both name.
+        Parameters
+        ----------
+        words : the texts of the page.
+        key : of its caption; `key_head` is that of its headings.
+        said : values that caption and headings contain.
         """
         head = [rich(text) for text in words.cells(f"{key}_head", **said)]
         return self.headed_table(words.text(key, **said), head[: len(align)], rows, align)
@@ -61,7 +66,7 @@ class PageBuilder:
         rows: Iterable[Sequence[Cell | str | Spans]],
         align: str,
     ) -> Table:
-        """Return a table whose headings are no fixed words, under the next number."""
+        """Return a table with the next number whose headings are not fixed texts."""
         return make_table(next(self._tables), caption, head, rows, align)
 
     def picture(
@@ -77,7 +82,13 @@ class PageBuilder:
     ) -> Picture:
         """Return a figure, to be drawn later, under the next number.
 
-        The sentence `key` is its caption; `alt`, by default `key_alt`, reads it to who sees none.
+        Parameters
+        ----------
+        name : of its file.
+        words : the texts of the page.
+        key : of its caption.
+        alt : key of its text alternative; default: `key_alt`.
+        said : values that these texts contain.
         """
         alt = clean(words.text(alt or f"{key}_alt", **said))
         return Picture(

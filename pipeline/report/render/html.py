@@ -1,6 +1,6 @@
-"""A document as one self-contained HTML file: nothing loaded from anywhere, one script of ours.
+"""Render a document as one self-contained HTML file with one script; it loads nothing else.
 
-The page's policy knows the script by its hash.
+The security policy in the page allows only this script, by its hash.
 """
 
 import base64
@@ -23,21 +23,21 @@ from pipeline.words.math import Term, to_mathml
 from pipeline.words.numbers import unbroken
 from pipeline.words.spans import plain
 
-# The style sheet says what each colour is in light and in dark.
+# The style sheet defines each colour for light and dark pages.
 _ROLES = {
     MEASURED: "ink", MODEL: "model", SECOND: "second", THIRD: "third", QUIET: "quiet",
     SHADE: "shade", GRID: "grid", "#444444": "axis", "#555555": "mark",
 }  # fmt: skip
 ALWAYS, EXPLORE, FINDER = "page.js", "explore.js", "finder.js"
 _SOMETIMES = (EXPLORE, FINDER)
-PLOTS = ("uplot.min.js", "plots.js")  # of the page of plots, which has no others
+PLOTS = ("uplot.min.js", "plots.js")  # scripts of the page of plots; other pages do not have them
 _TITLE = re.compile(r"<title>.*?</title>", re.DOTALL)
-_NARROW = " .,()"  # half a digit wide
-_WIDE = "±×%"  # wider than a digit
+_NARROW = " .,()"  # characters that are half as wide as a digit
+_WIDE = "±×%"  # characters that are wider than a digit
 
 
 def render_html(document: Document) -> str:
-    """Return the page; every text is escaped, only our own SVG, MathML and script are not."""
+    """Return the page; every text is escaped, except cartlab's own SVG, MathML and script."""
     text = script(*_scripts(document))
     return (
         _environment()
@@ -52,24 +52,24 @@ def render_html(document: Document) -> str:
 
 
 def render_fragment(blocks: Sequence[Block]) -> str:
-    """Return blocks as a piece of a page that is not ours, such as a notebook; no script."""
+    """Return blocks as HTML for another page, such as a notebook; without scripts."""
     return _environment().get_template("fragment.html.j2").render(blocks=blocks)
 
 
 def render_plots(**values: object) -> str:
-    """Return the page of plots to look through; every value is escaped."""
+    """Return the page of plots; every value is escaped."""
     text = script(*PLOTS)
     page = _environment().get_template("plots.html.j2")
     return page.render(script=Markup(text), script_hash=Markup(script_hash(text)), **values)
 
 
 def render_text(template: str, **values: object) -> str:
-    """Return a text of ours, nothing in it escaped."""
+    """Return a text from one of cartlab's templates, without escaping."""
     return _environment().overlay(autoescape=False).get_template(template).render(**values)
 
 
 def render_blocks(blocks: Sequence[Block]) -> Markup:
-    """Return blocks for a page that has the report's style sheet, and allows no style in itself."""
+    """Return blocks for a page that has the report's style sheet and allows no inline styles."""
     plain = [
         replace(block, align=block.align.replace("d", "r")) if isinstance(block, Table) else block
         for block in blocks
@@ -78,7 +78,7 @@ def render_blocks(blocks: Sequence[Block]) -> Markup:
 
 
 def render_drawing(svg: str) -> str:
-    """Return a drawing as a file of its own, in the colours of the page by day and by night."""
+    """Return a drawing as a separate file, with colours for light and dark pages."""
     css = (TEMPLATES / "report.css").read_text(encoding="utf-8")
     colours = css[: css.index("* {")] + "text { fill: var(--f-ink); }"
     return _coloured(svg).replace("</title>", f"</title><style>{colours}</style>", 1)
@@ -86,17 +86,17 @@ def render_drawing(svg: str) -> str:
 
 @cache
 def script(*names: str) -> str:
-    """Join scripts into the one of a page."""
+    """Join the scripts of a page into one."""
     return "".join((TEMPLATES / name).read_text(encoding="utf-8") for name in names)
 
 
 def script_hash(text: str) -> str:
-    """Return the hash by which a page's policy knows its one script."""
+    """Return the hash by which a page's security policy allows its script."""
     return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
 
 
 def every_hash() -> Iterable[str]:
-    """Return the hashes of all that may be a page's script."""
+    """Return the hashes of all scripts that a page may have."""
     for n in range(len(_SOMETIMES) + 1):
         for names in combinations(_SOMETIMES, n):
             yield script_hash(script(ALWAYS, *names))
@@ -104,7 +104,7 @@ def every_hash() -> Iterable[str]:
 
 
 def _scripts(document: Document) -> list[str]:
-    """Return the scripts that a page has something for."""
+    """Return the scripts that a document needs."""
     blocks = [block for section in document.sections for block in flat(section.blocks)]
     names = [ALWAYS]
     if any(isinstance(block, Picture) for block in blocks):
@@ -131,14 +131,14 @@ def _environment() -> Environment:
 
 
 def _mathml(term: Term, display: bool = False, alt: str = "") -> Markup:
-    mathml = to_mathml(term, display=display)  # every leaf is escaped
+    mathml = to_mathml(term, display=display)  # all its text is escaped
     return Markup(mathml.replace("<math", f'<math alttext="{escape(alt)}"', 1))
 
 
 def _svg(picture: Picture) -> Markup:
-    """Return the drawing, which matplotlib has escaped, in the colours of the page.
+    """Return the drawing in the colours of the page; matplotlib has escaped its text.
 
-    Its title becomes a label: browsers show a title wherever the pointer rests.
+    Its title becomes a label, because browsers show a title wherever the pointer rests.
     """
     named = f'<svg aria-label="{escape(picture.alt)}" '
     svg = _TITLE.sub("", picture.svg, count=1).replace("<svg ", named, 1)
@@ -153,7 +153,7 @@ def _coloured(svg: str) -> str:
 
 
 def _tails(table: Table) -> list[str]:
-    """Return the width from the decimal mark on for each column, "" without decimals."""
+    """Return the width from the decimal mark on, for each column; "" for other columns."""
     columns = zip(*table.rows, strict=True)
     return [
         f"{math.ceil(max(_digits_wide(cell.parts[1]) for cell in column))}ch" if how == "d" else ""
@@ -162,12 +162,12 @@ def _tails(table: Table) -> list[str]:
 
 
 def _heads(table: Table) -> list[str]:
-    """Return the heading that a phone shows before each value of a row, or ""."""
+    """Return the heading that a phone shows before each value of a row; "" for no heading."""
     return [plain(head.text) if table.told else "" for head in table.head]
 
 
 def _board(board: Tiles) -> str:
-    """Return how a board is laid out: letters of the longest value, and tiles side by side."""
+    """Return the layout of a board: characters of its longest value, and tiles side by side."""
     return f"--least:{board.longest}ch;--across:{board.across}"
 
 
@@ -177,5 +177,5 @@ def _digits_wide(text: str) -> float:
 
 @cache
 def _math_font() -> str:
-    """Return the font of the formulas; without it many phones cannot grow brackets."""
+    """Return the font of the formulas; many phones have none with large brackets."""
     return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

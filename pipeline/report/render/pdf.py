@@ -1,4 +1,4 @@
-"""A document as PDF, by typst: everything goes in as JSON, so no text is ever markup."""
+"""Render a document as PDF with typst; all content goes in as JSON, so no text is markup."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -17,8 +17,8 @@ from pipeline.resources import TEMPLATES
 from pipeline.words.numbers import unbroken
 from pipeline.words.text import clean
 
-_TIMESTAMP = 0  # archival PDF wants a date; a real one would make two reports differ
-_MISSING = "□"  # stands for a character that no font has
+_TIMESTAMP = 0  # archival PDF needs a date; the real one would make two reports differ
+_MISSING = "□"  # replaces a character that no font has
 _SHOWN_IN_WARNING = 20
 
 
@@ -84,7 +84,7 @@ def _try(parts: Any) -> Pages:
 
 
 def missing_characters(text: str) -> str:
-    """Return the characters of a text that no font of the PDF has (Chinese, emoji), apart."""
+    """Return the characters of a text that no font of the PDF has, separated by spaces."""
     lost = sorted(_lost(clean(text)))
     more = " …" if len(lost) > _SHOWN_IN_WARNING else ""
     return " ".join(lost[:_SHOWN_IN_WARNING]) + more
@@ -93,9 +93,8 @@ def missing_characters(text: str) -> str:
 def _printable(value: Any) -> Any:
     """Return JSON with the characters that no font has replaced.
 
-    Numbers keep to their units, but in what is quoted as it is typed.
-
-    Left as they are they would become empty boxes without a word, and the file no valid PDF/A.
+    Otherwise these characters would become empty boxes without a warning, and the file would not be
+    a valid PDF/A. A number and its unit are kept on one line, except in text quoted as typed.
     """
     if isinstance(value, str):
         lost = _lost(value)
@@ -117,7 +116,7 @@ def _lost(text: str) -> set[str]:
 
 @cache
 def _charset() -> frozenset[int]:
-    """Return the code points of DejaVu Sans, the last font that all text falls back to."""
+    """Return the code points of DejaVu Sans, the font that is tried last for any text."""
     return frozenset(FT2Font(str(_font_folder() / "DejaVuSans.ttf")).get_charmap())
 
 

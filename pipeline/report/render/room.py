@@ -1,22 +1,28 @@
 """Fill the pages of a PDF.
 
-A block that does not fit on a page moves to the next one and leaves white space. If that is much,
-two things are tried: the figures of the page and the next one are drawn a little smaller, or a
-broken table is kept whole. The version with less white space is used.
+A block that does not fit on a page moves to the next one and leaves white space. If there is much
+of it, two things are tried: drawing the figures of the page and the next one a little smaller, or
+keeping a broken table whole. The version with less white space is used.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-_GAP = 28.0  # points, between the end of a page and the next block, such as a heading
-_WHITE = 0.3  # of a page: less white space is accepted
-_LEAST = 0.75  # of the usual size: the labels of a figure are then still 6 points high
-_MOST_TRIES = 8  # each takes a quarter of the time that the first takes
+_GAP = 28.0  # points between the end of a block and the next block, such as a heading
+_WHITE = 0.3  # share of a page; less white space is accepted
+_LEAST = 0.75  # smallest scale of a figure; its labels are then still 6 points high
+_MOST_TRIES = 8  # layouts tried; each takes a quarter of the time of the first one
 
 
 @dataclass(frozen=True, kw_only=True)
 class Choices:
-    """Deviations from the default layout, by the numbers of figures and tables."""
+    """Changes to the default layout.
+
+    Attributes
+    ----------
+    shares : scale of figures, by number.
+    whole : numbers of the tables that must not break across pages.
+    """
 
     shares: Mapping[int, float] = field(default_factory=dict)  # of the usual size
     whole: tuple[int, ...] = ()  # tables that do not break
@@ -28,9 +34,11 @@ class End:
 
     Attributes
     ----------
-    page, y : its page, and points from the top.
+    page : its page.
+    y : points from the top of the page.
     picture, table : its number, or 0; a table has a second entry for the end of its caption.
-    share, height : relative size of a figure (1 by default), and its height in points.
+    share : scale of a figure, 1 by default.
+    height : of a figure, in points.
     """
 
     page: int
@@ -43,7 +51,13 @@ class End:
 
 @dataclass(frozen=True, kw_only=True)
 class Pages:
-    """A document laid out: where its blocks end, and where the text of every page may stand."""
+    """The layout of a document.
+
+    Attributes
+    ----------
+    ends : where its blocks end.
+    top, bottom : limits of the text on every page, in points.
+    """
 
     ends: Sequence[End]
     top: float
@@ -51,11 +65,11 @@ class Pages:
 
     @property
     def count(self) -> int:
-        """Return how many pages there are."""
+        """The number of pages."""
         return max((end.page for end in self.ends), default=0)
 
     def white_under(self, page: int) -> float:
-        """Return the share of a page that is empty at its foot; of the last one none."""
+        """Return the share of a page that is empty at the bottom; 0 for the last page."""
         lowest = max((end.y for end in self.ends if end.page == page), default=self.bottom)
         if page >= self.count or page in self.broken.values():
             return 0.0
@@ -63,22 +77,29 @@ class Pages:
 
     @property
     def broken(self) -> dict[int, int]:
-        """Return the tables that go on beyond a page, and the page that they begin on."""
+        """The tables that continue on another page, each with its first page."""
         first = {end.table: end.page for end in reversed(self.ends) if end.table}
         last = {end.table: end.page for end in self.ends if end.table}
         return {table: page for table, page in first.items() if page < last[table]}
 
     def white(self, last: int) -> float:
-        """Return how white pages 1 to `last` are: one that is half empty is worse than two."""
+        """Return a penalty for white space on pages 1 to `last`.
+
+        One half-empty page is worse than two.
+        """
         pages = range(1, last + 1)
         return sum(max(self.white_under(page) - _WHITE, 0.0) ** 2 for page in pages)
 
 
 def fill_pages(lay_out: Callable[[Choices], Pages]) -> Choices:
-    """Return what is best set otherwise than usual; `lay_out` lays the document out.
+    """Return the changes to the layout that leave least white space.
 
-    Pages are filled from the first to the last. A remedy may leave white space on a later page,
-    whose turn comes later; the best layout of all is returned.
+    Pages are filled from first to last. A change may leave white space on a later page, which is
+    then filled in its turn. In the end, the best of all layouts is returned.
+
+    Parameters
+    ----------
+    lay_out : returns the layout of the document with some changes.
     """
     chosen = best = Choices()
     pages = lay_out(chosen)
@@ -99,7 +120,7 @@ def fill_pages(lay_out: Callable[[Choices], Pages]) -> Choices:
 
 
 def _remedies(pages: Pages, page: int, chosen: Choices) -> Iterator[Choices]:
-    """Yield what may fill a page, the least disturbing first."""
+    """Yield changes that may fill a page, the smallest change first."""
     pictures = [end for end in pages.ends if end.picture]
     coming = next((end for end in pictures if end.page == page + 1), None)
     if coming:

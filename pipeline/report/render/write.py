@@ -1,4 +1,4 @@
-"""Write a document as HTML and as PDF, with its figures beside them."""
+"""Write a document as HTML and as PDF, with its figures in a folder next to it."""
 
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""What sections of several reports share, and the sections on measurements and control."""
+"""Sections on measurements and control, and parts that several reports share."""

@@ -1,4 +1,4 @@
-"""What to do next: about every failed check, the worst first, and what else there is to do."""
+"""What to do next: for every failed check, the most serious first, and further advice."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,9 +13,9 @@ from pipeline.words.spans import Span, Spans, spans
 from pipeline.words.text import clean, names_spans, rich
 
 _WORDS = phrases("summary")
-_MOST_TOLD = 3  # messages of one kind
-# The checks, the worst failure first: what spoils every number, what spoils some, and what the
-# linear carts leave out. One that is not listed stands before the last group.
+_MOST_TOLD = 3  # messages shown for one group of checks
+# Groups of checks, the most serious first: those that spoil every number, those that spoil some,
+# and effects that the linear model lacks. Groups that are not listed come before `_LAST`.
 _WORST_FIRST = (
     "input_sign",
     "data",
@@ -38,13 +38,14 @@ _WORST_FIRST = (
     "feedback",
 )
 _LAST = ("fit_explains_data", "step", "decay")
-_AT_THE_TOP = ("input_sign", "position_unit", "input_unit")  # what is wrong with every number
-_TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")  # there, and by the first words of a summary
-_ALIKE = ("initial_final", "step", "decay")  # of these one message stands for all
+_AT_THE_TOP = ("input_sign", "position_unit", "input_unit")  # problems that make every number wrong
+# The summary already shows the messages of these groups.
+_TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")
+_ALIKE = ("initial_final", "step", "decay")  # for these, one message represents all
 
 
 def next_steps(analysis: Analysis) -> Items:
-    """Name every failed check with what to do, the worst first; then what else there is to do."""
+    """Return what to do about every failed check, the most serious first, and further advice."""
     failed, advice = list(_failed(analysis)), list(_advice(analysis))
     return bullet_list([*failed, *advice] or [_nothing_left(analysis)])
 
@@ -69,7 +70,11 @@ def _failed(analysis: Analysis) -> Iterator[Spans]:
 
 
 def _group(check: Check) -> str:
-    """Return what one action is for: checks of a kind; those of the fit ask different things."""
+    """Return the group of checks to which one action belongs.
+
+    It is the kind of the check. Checks of the fit and of the input ask for different actions, so
+    they are grouped by their part too.
+    """
     return f"{check.kind}_{check.part}" if check.kind in ("fit", "input") else check.kind
 
 
@@ -81,7 +86,7 @@ def _place(group: str) -> tuple[int, int]:
 
 
 def _excess(check: Check) -> float:
-    """Return how far a check is beyond its limit, if that is known."""
+    """Return by what factor a check exceeds its limit; 0 if this is not known."""
     if check.value is None or not check.limit:
         return 0.0
     return abs(check.value / check.limit)
@@ -101,7 +106,7 @@ def _action(group: str, checks: Sequence[Check], analysis: Analysis) -> Spans:
 
 
 def _to_identify(analysis: Analysis) -> Spans:
-    """Return what lets the carts be identified, or why they cannot be."""
+    """Return what to record so that the carts can be identified, or why they cannot."""
     for skip in reversed(analysis.skipped):
         if skip.stage is Stage.FINAL_ESTIMATES:
             if skip.missing:
@@ -111,7 +116,7 @@ def _to_identify(analysis: Analysis) -> Spans:
 
 
 def _names(checks: Sequence[Check]) -> Spans:
-    """Return the names of failed checks of a group, as the report's table has them."""
+    """Return the names of failed checks as in the report's table."""
     abouts = [clean(check.about) for check in checks if check.about]
     if len(checks) == 1 or len(abouts) < len(checks):
         return spans(Span(", ".join(clean(check.id) for check in checks), "code"))
@@ -123,7 +128,7 @@ def _sentence(text: str) -> str:
 
 
 def _advice(analysis: Analysis) -> Iterator[Spans]:
-    """Yield what else to do, that no failed check asks for."""
+    """Yield further advice that does not come from a failed check."""
     say, fit, design = _WORDS.spans, analysis.fit, analysis.feedback
     asked = {_group(check) for check in analysis.failed_checks}
     if wrong := list(dict.fromkeys(reported_off(analysis))):
@@ -140,7 +145,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
     if to_run:
         yield say("next_run")
-    # Later actions wait for the carts and for the recordings that must be fixed.
+    # Other advice comes only when the carts are identified and no recording must be fixed.
     if fit is not None and not asked & {"data", "record"}:
         run = {Stage.HARDWARE_CHECK} if to_run else frozenset[Stage]()
         lacking = [skip for skip in analysis.skipped if skip.stage not in run]
@@ -152,7 +157,7 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
 
 
 def _may_lack_springs(analysis: Analysis) -> bool:
-    """Tell whether steps contradict a fit that leaves springs out, where dry friction does not."""
+    """Return whether steps contradict a fit that lacks springs, without signs of dry friction."""
     fit, dry = analysis.fit, any(d.friction and d.friction.present for d in analysis.log_decrements)
     off = any(row.consistent is False and read_name(row.name).is_gain for row in analysis.rows)
     may_be_whole = fit is None or fit.explains_data or all(analysis.bench.springs)
@@ -164,7 +169,10 @@ def _nothing_left(analysis: Analysis) -> Spans:
 
 
 def set_up_in_doubt(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Everything that follows hangs on it, so it comes first."""
+    """Return the problems that make every number wrong, as one finding, or None.
+
+    They are shown first.
+    """
     wrong = [check for check in analysis.failed_checks if _group(check) in _AT_THE_TOP]
     if not wrong:
         return None

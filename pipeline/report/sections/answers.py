@@ -1,4 +1,4 @@
-"""Answers in `notes.md`: each under a heading that begins with its question's id."""
+"""Answers in `notes.md`: each follows a heading that begins with the id of its question."""
 
 import re
 from itertools import pairwise
@@ -9,7 +9,7 @@ from pipeline.errors import SubmissionError
 from pipeline.submission.load import COMMENT
 
 _LEAD = re.compile(r"(?:question|q|answer|a)?[\s:.#]*([\w.-]+)", re.IGNORECASE)
-_LEVEL = 2  # of a heading that is added
+_LEVEL = 2  # level of a heading that is added
 _SPELT = str.maketrans({"ω": "omega", "ζ": "zeta", " ": " "})
 _OPEN = (
     "this answer would merge with others: close every block of code (```) and every comment "
@@ -18,25 +18,26 @@ _OPEN = (
 
 
 def named(heading: str) -> str:
-    """Return the id that a heading begins with, however it is spelt."""
+    """Return the id with which a heading begins, in its usual spelling."""
     match = _LEAD.match(heading.translate(_SPELT).strip())
     return match[1].rstrip(".:").lower() if match else ""
 
 
 def written_answer(notes: str, id_: str) -> str:
-    """Return the answer to a question as typed, or ""."""
+    """Return the answer to a question as typed; "" without one."""
     lines = _lines(notes)
     found = _span(notes, id_)
     return "".join(lines[found[2] : found[3]]).strip() if found else ""
 
 
 def with_answer(notes: str, id_: str, answer: str) -> str:
-    """Return the notes with another answer to a question; all else stays as it is.
+    """Return the notes with a new answer to a question; all other text is unchanged.
 
     Raises
     ------
-    SubmissionError : a heading in it would end the answer, or what it leaves open would swallow
-        another.
+    SubmissionError : a heading in the answer would end it early, or open Markdown in it would
+        include
+        other answers.
     """
     text = answer.replace("\r\n", "\n").strip()
     lines = _lines(notes)
@@ -63,12 +64,12 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
 
 
 def _lines(text: str) -> list[str]:
-    """Return the lines as Markdown counts them, each with its end."""
+    """Return the lines as Markdown counts them, including their ends."""
     return re.findall(r"[^\n]*\n|[^\n]+", text)
 
 
 def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
-    """Return the level and line of the heading, and where its answer begins and ends."""
+    """Return level and line of an answer's heading, and where the answer begins and ends."""
     headings = _headings(notes)
     for i, (level, start, end, text) in enumerate(headings):
         if named(text) == id_.lower():
@@ -78,7 +79,7 @@ def _span(notes: str, id_: str) -> tuple[int, int, int, int] | None:
 
 
 def _bodies(notes: str) -> dict[str, tuple[int, str]]:
-    """Return the line of every id's heading, and the text up to the next heading."""
+    """Return, by id, the line of the heading and the text up to the next heading."""
     lines, headings = _lines(notes), _headings(notes)
     found: dict[str, tuple[int, str]] = {}
     for i, (_, at, start, text) in enumerate(headings):
@@ -88,7 +89,7 @@ def _bodies(notes: str) -> dict[str, tuple[int, str]]:
 
 
 def _headings(markdown: str) -> list[tuple[int, int, int, str]]:
-    """Return level, first line, line after and text of the headings outside comments."""
+    """Return level, first line, line after, and text of each heading outside comments."""
     text = COMMENT.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), markdown)
     tokens = MarkdownIt("commonmark", {"html": False}).parse(text)
     found = []

@@ -1,4 +1,4 @@
-"""Checks, warnings, what was skipped, and where the numbers come from."""
+"""Sections on checks, warnings, skipped stages, and the origin of the numbers."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from pipeline.words.spans import Span, spans
 from pipeline.words.text import clean, rich
 
 _WORDS = phrases("report")
-OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of a table
+OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of the table
     "fail": ("failed", "bad"),
     "pass": ("passed", "good"),
     "skip": ("not checked", "quiet"),
@@ -20,7 +20,7 @@ OUTCOMES: dict[str, tuple[str, Tone]] = {  # in the order of a table
 
 
 def check_blocks(page: Page) -> list[Block]:
-    """Return what failed in sight, and the rest under a line that can be opened."""
+    """Return the checks: failed ones visible, the others folded."""
     failed = page.analysis.failed_checks
     others = [check for check in page.analysis.checks if check not in failed]
     passed = sum(check.outcome == "pass" for check in others)
@@ -49,7 +49,7 @@ def _check_table(page: Page, checks: Sequence[Check], key: str) -> Table:
 
 
 def assumption_blocks(page: Page) -> list[Block]:
-    """Return the assumptions behind all numbers, their sources, and the support by the data."""
+    """Return the assumptions of the analysis, with their sources and their support by the data."""
     assumptions = page.analysis.assumptions
     if not assumptions:
         return []
@@ -69,7 +69,7 @@ def assumption_blocks(page: Page) -> list[Block]:
 
 
 def taken_text(one: Assumption) -> str:
-    """Return the value of an assumption, as one says it."""
+    """Return the value of an assumption as text."""
     if isinstance(one.value, bool):
         return "there" if one.value else "not there"
     if isinstance(one.value, tuple):
@@ -81,7 +81,7 @@ def taken_text(one: Assumption) -> str:
 
 
 def skipped_blocks(page: Page) -> list[Block]:
-    """Return which stages were skipped, and why."""
+    """Return the skipped stages and the reasons."""
     told = [
         spans(Span(f"{clean(skip.name)}: ", "strong"), rich(clean(skip.reason)))
         for skip in page.analysis.skipped
@@ -90,7 +90,12 @@ def skipped_blocks(page: Page) -> list[Block]:
 
 
 def provenance_blocks(page: Page, made: str) -> list[Block]:
-    """Return with what a report was made, and the SHA-256 of its files where one can open them."""
+    """Return the versions with which the report was made, and the SHA-256 of its files, folded.
+
+    Parameters
+    ----------
+    made : sentence with the versions.
+    """
     blocks: list[Block] = [paragraph(made)]
     if files := page.analysis.files:
         blocks.append(Details(spans(count(len(files), "data file")), (file_table(page),)))

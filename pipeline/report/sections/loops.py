@@ -1,4 +1,4 @@
-"""Sections on control: the designed feedback, and model against measurement."""
+"""Sections on control: the designed feedback, and the comparison of model and measurement."""
 
 import numpy as np
 
@@ -12,7 +12,8 @@ from pipeline.words.phrases import phrases
 from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-CLOSE = 0.10  # of the motion, rms: within it a good linear model; beyond, worth a question
+# Share of the motion (rms): a good linear model is within it; a larger error raises a question.
+CLOSE = 0.10
 
 
 def feedback_blocks(page: Page) -> list[Block]:
@@ -42,7 +43,7 @@ def feedback_blocks(page: Page) -> list[Block]:
 
 
 def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
-    """Return gains, prefilter and what the simulated step does."""
+    """Return gains, prefilter, and the properties of the simulated step."""
     position, drive = page.position, page.drive
     rows = []
     for i, value in enumerate(design.gains):
@@ -72,7 +73,7 @@ def _feedback_table(page: Page, design: FeedbackDesign) -> Table:
 
 
 def margin_rows(margins: Margins | None) -> list[tuple[str, str, str, str]]:
-    """Return name, number, unit and place of each margin; none where they are unknown."""
+    """Return name, value, unit and frequency of each margin; empty if margins are unknown."""
     if margins is None:
         return []
     gain, phase = margins.gain, margins.phase_deg
@@ -90,7 +91,7 @@ def _at(omega: float | None) -> str:
 
 
 def _pole_table(page: Page, design: FeedbackDesign) -> Table:
-    """Return the closed-loop poles, beside the requested ones where some were."""
+    """Return the closed-loop poles, next to the requested ones if there are any."""
     rows = [
         [
             complex_text(pole, digits=3),
@@ -101,7 +102,7 @@ def _pole_table(page: Page, design: FeedbackDesign) -> Table:
     ]
     if design.requested_poles is None:
         return page.table(_WORDS, "pole_table", rows, "rrr")
-    # A delay adds poles that nobody asked for.
+    # A delay adds poles that were not requested.
     requested = [complex_text(pole, digits=3) for pole in _ascending(design.requested_poles)]
     requested += [NOTHING] * (len(rows) - len(requested))
     rows = [[asked, *row] for asked, row in zip(requested, rows, strict=True)]
@@ -113,7 +114,7 @@ def _ascending(poles: ComplexArray) -> ComplexArray:
 
 
 def hardware_blocks(page: Page) -> list[Block]:
-    """Return model against measurement of every run, cart by cart."""
+    """Return the comparison of model and measurement, for every run and cart."""
     checks = page.analysis.hardware
     if not checks:
         return []
@@ -134,7 +135,8 @@ def hardware_blocks(page: Page) -> list[Block]:
     scales = [
         _WORDS.text("input_scale", run=c.experiment, scale=significant(c.input_scale, digits=3))
         for c in checks
-        if c.input_scale is not None and abs(c.input_scale - 1) > 0.05  # nearer is not worth a word
+        # A difference below 5 % is not worth mentioning.
+        if c.input_scale is not None and abs(c.input_scale - 1) > 0.05
     ]
     return [*blocks, *remarks(list(dict.fromkeys(scales)))]
 

@@ -15,14 +15,14 @@ from pipeline.words.spans import spans
 from pipeline.words.text import clean
 
 _WORDS = phrases("measurements")
-_MOST_PANELS = 6  # repeats drawn in one figure; the tables hold all
+_MOST_PANELS = 6  # repeats drawn in one figure; the tables have all
 
 
 # ----------------------------------------------------------- frequency response
 
 
 def response_blocks(page: Page) -> list[Block]:
-    """Return a Bode figure for every cart, last cart first as the paper shows them."""
+    """Return a Bode figure for every cart, the last cart first, as in the paper."""
     responses, chain = page.analysis.frequency_responses, page.analysis.chain
     key, pictures = "bode" if chain else "bode_points", []
     for response in sorted(responses, key=lambda r: -r.cart):
@@ -42,14 +42,14 @@ def response_blocks(page: Page) -> list[Block]:
 
 
 def _kinds(page: Page) -> str:
-    """Return of which kinds the records are that a response was taken from."""
+    """Return the kinds of recordings from which a response was computed, in words."""
     runs = {run for r in page.analysis.frequency_responses for run in r.experiments}
     kinds = {page.records[run].kind for run in runs if run in page.records}
     return listing([_WORDS.text(f"of_{kind}") for kind in ("step", "sweep") if kind in kinds])
 
 
 def overview_blocks(page: Page) -> list[Block]:
-    """Return one picture of what was identified: all carts, measured and fitted."""
+    """Return one picture of the identification: all carts, measured and fitted."""
     shown = [r for r in page.analysis.frequency_responses if np.any(r.magnitude > 0)]
     if not shown:
         return []
@@ -60,7 +60,7 @@ def overview_blocks(page: Page) -> list[Block]:
 
 
 def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
-    """Say how far the points reach, how near the fit is, and where it is farthest off."""
+    """Return values for the caption: range of the points, quality of the fit, largest error."""
     chain, n, cart = page.analysis.chain, page.analysis.bench.n, response.cart
     omega, magnitude = response.omega, response.magnitude
     peak = int(np.argmax(magnitude))
@@ -96,7 +96,7 @@ def _bode_words(page: Page, response: FrequencyResponse) -> dict[str, object]:
 
 
 def decay_blocks(page: Page) -> list[Block]:
-    """Return the table of decays, their figures, and damping against amplitude."""
+    """Return the table of decays, their figures, and damping over amplitude."""
     decays = page.analysis.log_decrements
     if not decays:
         return []
@@ -121,7 +121,7 @@ def decay_blocks(page: Page) -> list[Block]:
         }
         figure = decay_figure(drawn, records=records, position_unit=page.position)
         blocks.append(page.picture(f"decay-cart-{cart}", figure, _WORDS, "decay", **said))
-    # Of one amplitude there is no rise to see.
+    # A decay with only one amplitude shows no change of damping.
     if rubbing := [d for d in decays if _is_dry(d) and d.zeta_at_amplitude.shape[1] > 1]:
         figure = damping_figure(rubbing, position_unit=page.position)
         runs = listing(list(dict.fromkeys(clean(d.name) for d in rubbing)))
@@ -134,7 +134,7 @@ def _is_dry(decay: LogDecrement) -> bool:
 
 
 def _decay_table(page: Page) -> Table:
-    """Return frequency and damping of every decay, by both methods, with the friction test."""
+    """Return frequency and damping of every decay, by two methods, and the test for friction."""
     rows = []
     for decay in page.analysis.log_decrements:
         friction = decay.friction
@@ -156,7 +156,7 @@ def _decay_table(page: Page) -> Table:
 
 
 def step_blocks(page: Page) -> list[Block]:
-    """Return the static gains and the step responses they were read from."""
+    """Return the static gains, and the step responses from which they were read."""
     gains = page.analysis.step_gains
     if not gains:
         return []
@@ -179,7 +179,7 @@ def step_blocks(page: Page) -> list[Block]:
 
 
 def _step_table(page: Page) -> Table:
-    """Return the static gain of every step record and cart."""
+    """Return the static gain of every step recording and cart."""
     rows = []
     for gain in page.analysis.step_gains:
         value = with_error(gain.gain, gain.gain_std)
@@ -192,11 +192,11 @@ def _step_table(page: Page) -> Table:
 
 
 def dwell_blocks(page: Page) -> list[Block]:
-    """Return one dwell, the transient told from the steady state, and the numbers of all."""
+    """Return one dwell with its transient and steady state, and the numbers of all dwells."""
     points = [p for p in page.analysis.sine_points if p.experiment in page.records]
     if not points:
         return []
-    # A settled one, the nearest to the 4 Hz of the paper's Figures 12-14.
+    # The settled dwell that is nearest to the 4 Hz of the paper's Figures 12-14.
     paper = 2 * np.pi * 4.0
     chosen = min(points, key=lambda p: (not p.settled, abs(float(np.log(p.omega / paper)))))
     shown = sorted((p for p in points if p.experiment == chosen.experiment), key=lambda p: p.cart)
@@ -221,7 +221,7 @@ def dwell_blocks(page: Page) -> list[Block]:
 
 
 def dwell_table(page: Page) -> Table:
-    """Return frequency, amplitudes, ratio and phase of every dwell and cart; whether it settled."""
+    """Return frequency, amplitudes, ratio, phase and settling of every dwell and cart."""
     rows = [
         (
             clean(point.experiment),

@@ -1,6 +1,7 @@
-"""The students' notes: Markdown read into blocks, so that nothing in them is ever markup.
+"""The students' notes: read Markdown into blocks, so that no text in them is markup.
 
-Raw HTML is text, images leave their description, links keep only web and mail addresses.
+Raw HTML is shown as text. Images are replaced by their descriptions. Only links to web and mail
+addresses are kept.
 """
 
 import re
@@ -15,17 +16,18 @@ from pipeline.words.spans import Span, Spans, plain
 from pipeline.words.text import clean
 
 _DEEPEST_HEADING = 6
-_TOP_HEADING = 3  # the report's own headings are above
-_DEEPEST_READ = 200  # levels; the parser leaves out what is nested further
-_DEEPEST_NESTING = 6  # lists and quotations further in are set flat: nobody reads them, and a page
-# has no room for them
-_ENDLESS = re.compile(r"\S{2000}")  # letters in a row: no address is longer, and no page as wide
+_TOP_HEADING = 3  # larger headings belong to the report
+_DEEPEST_READ = 200  # levels; the parser leaves out text that is nested deeper
+# Lists and quotations that are nested deeper are not indented further, because a page has no room.
+_DEEPEST_NESTING = 6
+# Characters without a space; longer than any address, and wider than any page.
+_ENDLESS = re.compile(r"\S{2000}")
 _SCHEMES = ("http", "https", "mailto")
 _ALIGN = {"text-align:center": "c", "text-align:right": "r"}
 
 
 def note_blocks(markdown: str) -> tuple[Block, ...]:
-    """Return Markdown as blocks of inert text; nested beyond sense, it is shown as written."""
+    """Return Markdown as blocks of text; if it is nested too deeply, show it as typed."""
     text = _ENDLESS.sub(r"\g<0> ", clean(markdown))
     parser = MarkdownIt("commonmark", {"html": False, "maxNesting": _DEEPEST_READ}).enable("table")
     try:
@@ -35,7 +37,7 @@ def note_blocks(markdown: str) -> tuple[Block, ...]:
 
 
 def discussion_blocks(markdown: str) -> tuple[Block, ...]:
-    """Return the notes as a section, which has a title already."""
+    """Return the notes as blocks of a section; the section already has a title."""
     blocks = note_blocks(markdown)
     first = blocks[0] if blocks else None
     if isinstance(first, Heading) and plain(first.text).strip().lower() == "discussion":
@@ -44,8 +46,8 @@ def discussion_blocks(markdown: str) -> tuple[Block, ...]:
 
 
 def even_headings(blocks: Iterable[Block]) -> tuple[Block, ...]:
-    """Return blocks whose headings go down one level at a time, as an outline needs."""
-    above: list[int] = []  # the levels, as written, of the headings that this one is under
+    """Return blocks whose headings never skip a level, as an outline needs."""
+    above: list[int] = []  # levels, as typed, of the headings above this one
 
     def even(block: Block) -> Block:
         match block:
@@ -86,12 +88,15 @@ def _block(node: SyntaxTreeNode, depth: int) -> list[Block]:
             return [Code(node.content.rstrip("\n"))]
         case "table":
             return [_table(node)]
-        case _:  # a rule between paragraphs says nothing here
+        case _:  # a horizontal rule has no meaning here
             return []
 
 
 def _plain(node: SyntaxTreeNode) -> str:
-    """Return all text below a node, without a call per level: there may be a thousand."""
+    """Return all text inside a node.
+
+    It uses no recursion, because there may be a thousand levels.
+    """
     return " ".join(n.content for n in node.walk() if n.type in ("text", "code_inline", "fence"))
 
 
@@ -116,7 +121,10 @@ def _inline(node: SyntaxTreeNode) -> Spans:
 
 
 def _spans(node: SyntaxTreeNode, around: Span) -> list[Span]:
-    """Return a node's text in the style of what is around it; the innermost style wins."""
+    """Return the text of a node in the style of its surroundings.
+
+    An inner style takes precedence.
+    """
     match node.type:
         case "text":
             return [Span(node.content, around.style, around.url)] if node.content else []

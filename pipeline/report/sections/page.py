@@ -1,4 +1,4 @@
-"""What all sections of a report share: the analysis, its records and its units."""
+"""The parts that all sections of a report share: the analysis, its records and its units."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from pipeline.words.text import clean, rich
 
 @dataclass(frozen=True)
 class Page(PageBuilder):
-    """A page about an analysis, its text made fit to show."""
+    """A page about an analysis; its units and other text are safe to show."""
 
     analysis: Analysis
 
@@ -25,7 +25,7 @@ class Page(PageBuilder):
 
     @cached_property
     def units(self) -> Units:
-        """The units, fit to show."""
+        """The units, without control characters."""
         stated = self.analysis.bench.units
         return Units(position=clean(stated.position), input=clean(stated.input))
 
@@ -40,9 +40,11 @@ class Page(PageBuilder):
         return self.units.input
 
     def document(self, sections: Iterable[Section], *, about: str) -> Document:
-        """Return the sections under title, authors and subject of the document.
+        """Return the sections as a document, with title and authors.
 
-        Without a title from the students, the subject is the title and appears once.
+        Parameters
+        ----------
+        about : the subject; it becomes the title if the students gave none.
         """
         analysis = self.analysis
         title = clean(analysis.title).strip()
@@ -58,10 +60,10 @@ class Page(PageBuilder):
 
 
 def remarks(notes: Sequence[str]) -> list[Block]:
-    """Return notes as a list, or nothing without notes."""
+    """Return notes as a list; empty without notes."""
     return [bullet_list(rich(clean(note)) for note in notes)] if notes else []
 
 
 def left_out(n: int) -> str:
-    """Return the sentence that says how many records a figure does not show."""
+    """Return a sentence with the number of recordings that a figure does not show."""
     return f" {count(n, 'further record')} not drawn." if n > 0 else ""

@@ -1,4 +1,4 @@
-"""What was identified: initial and final estimates, the students' own numbers, the chain."""
+"""The identified parameters: initial and final estimates, the students' numbers, the chain."""
 
 from collections.abc import Collection, Mapping, Sequence
 from decimal import Decimal
@@ -26,7 +26,7 @@ _WORDS = phrases("report")
 
 
 def parameter_blocks(page: Page) -> list[Block]:
-    """Return the estimates, remarks on them, and what the students claim."""
+    """Return the estimates, remarks on them, and the students' numbers."""
     rows, reported = page.analysis.rows, page.analysis.reported
     if not rows:
         return []
@@ -41,7 +41,7 @@ def parameter_blocks(page: Page) -> list[Block]:
 
 
 def _origins(analysis: Analysis) -> Spans:
-    """Name the sources of the estimates, for the existing sources only."""
+    """Return a sentence with the sources of the estimates that exist."""
     names: dict[str, list[str]] = {}
     for row in analysis.rows:
         if row.initial:
@@ -62,10 +62,11 @@ def _origins(analysis: Analysis) -> Spans:
 
 
 def parameter_table(page: Page) -> Table:
-    """Return initial and final estimates as the paper's Tables 1-3, with errors and a verdict."""
+    """Return initial and final estimates like the paper's Tables 1-3, with errors and verdicts."""
     words, carts = {1: "one", 2: "two", 3: "three", 4: "four"}, page.analysis.bench.n
     rows, steps = page.analysis.rows, page.analysis.steps
-    columns = None if any(row.final for row in rows) else 4  # all that is filled without a fit
+    # Without a fit, only the first four columns are filled.
+    columns = None if any(row.final for row in rows) else 4
     shown = [_parameter_row(row, steps=steps)[:columns] for row in rows]
     align, told = "lldlddrl"[:columns], words.get(carts, carts)
     return page.table(_WORDS, "parameter_table", shown, align, carts=told)
@@ -89,7 +90,12 @@ def _parameter_row(row: ParameterRow, *, steps: Collection[str]) -> list[Cell]:
 
 
 def source_text(estimate: Estimate | None, *, steps: Collection[str]) -> str:
-    """Return what an estimate comes from; what rings after one of the `steps` is no decay."""
+    """Return the source of an estimate in words.
+
+    Parameters
+    ----------
+    steps : recordings of steps; the ringing after a step is not called a decay.
+    """
     if estimate is None:
         return ""
     if estimate.source == "log_decrement" and set(estimate.experiments) & set(steps):
@@ -112,7 +118,7 @@ def _unit(row: ParameterRow) -> str:
 def _estimate(estimate: Estimate | None) -> str:
     if estimate is None:
         return NOTHING
-    if estimate.source == "assumed":  # a guess has no more digits than were thought of
+    if estimate.source == "assumed":  # a guess has few meaningful digits
         return significant(estimate.value, digits=2)
     return with_error(estimate.value, estimate.std)
 
@@ -124,9 +130,10 @@ def _verdict(consistent: bool | None) -> Cell:
 
 
 def reported_table(page: Page) -> Table:
-    """Return the students' own numbers beside those of their data.
+    """Return the students' numbers next to those from their data.
 
-    What is off beyond its rounding, three standard errors and a few percent says what to look at.
+    For a number that is wrong, the table says what to look at. Rounding, three standard errors and
+    a few percent are allowed.
     """
     lines = [
         [
@@ -145,7 +152,7 @@ def reported_table(page: Page) -> Table:
 
 
 def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
-    """Return how far a number is off, and what to look at where that is too far."""
+    """Return the error of a number, and what to look at if it is too large."""
     if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")
     share = percent(100 * (float(yours) - found.value) / abs(found.value), signed=True)
@@ -161,13 +168,14 @@ def _is_off(name: str, yours: Decimal, found: Estimate | None) -> bool:
     if found is None or not found.value or found.source == "assumed":
         return False
     rounding = 0.5 * 10.0 ** int(yours.as_tuple().exponent)
-    # Other ways through the same data differ by a third of the limit for initial and final.
+    # Other methods on the same data differ by a third of the limit between initial and final
+    # estimates.
     few = change_limit(name) / 3 / 100 * abs(found.value)
     return abs(float(yours) - found.value) > rounding + SIGMA_LIMIT * (found.std or 0.0) + few
 
 
 def reported_off(analysis: Analysis) -> list[str]:
-    """Return the parameters of which the students report what their data do not give."""
+    """Return the parameters for which the students' numbers disagree with their data."""
     return [
         row.name
         for row in analysis.rows
@@ -178,7 +186,7 @@ def reported_off(analysis: Analysis) -> list[str]:
 
 
 def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
-    """Return the remarks on single parameters, equal remarks told once."""
+    """Return remarks on single parameters; equal remarks are combined."""
     by_note: dict[str, list[str]] = {}
     for row in rows:
         if row.note:
@@ -189,7 +197,7 @@ def _parameter_notes(rows: Sequence[ParameterRow]) -> list[Spans]:
 
 
 def _staged_differences(analysis: Analysis) -> Block | None:
-    """Say where the fit cart by cart ended up elsewhere than the joint fit."""
+    """Return how much the fit cart by cart differs from the joint fit."""
     fit = analysis.fit
     if fit is None or fit.chain.n == 1:
         return None
@@ -201,14 +209,14 @@ def _staged_differences(analysis: Analysis) -> Block | None:
     if not changes:
         return None
     worst = max(changes, key=changes.__getitem__)
-    if changes[worst] < 0.05:  # percent: nothing to speak of
+    if changes[worst] < 0.05:  # percent; a smaller difference is not worth mentioning
         return paragraph(_WORDS.text("staged_same"))
     differs = {"share": percent(changes[worst]), "name": names_spans([worst])}
     return paragraph(_WORDS.spans("staged_differs", **differs))
 
 
 def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
-    """Return masses, dampings and springs, each with its standard error where it was fitted."""
+    """Return masses, dampings and springs, with standard errors for those that were fitted."""
     units = page.units
     kinds = (
         ("m", "mass", chain.m, units.mass),
@@ -219,7 +227,8 @@ def chain_table(page: Page, chain: Chain, *, std: Mapping[str, float]) -> Table:
         (letter, noun, unit, i, float(value), std.get(f"{letter}_{i}"))
         for letter, noun, values, unit in kinds
         for i, value in enumerate(values, start=1)
-        if chain.n > 1 or letter != "k" or i == 1  # of a lone cart's springs the sum is known
+        # On a single cart only the sum of the springs is known.
+        if chain.n > 1 or letter != "k" or i == 1
     ]
     numbers = with_errors([(value, error) for *_, value, error in listed])
     rows = [

@@ -1,7 +1,7 @@
-"""Questions that this data raises, and the students' answers from their notes.
+"""Questions that the data raise, and the students' answers from their notes.
 
-A question stands where its figures are. It is answered in `notes.md` under a heading that begins
-with the question's id; the other notes are the discussion.
+A question is in the section of its figures. It is answered in `notes.md`, after a heading that
+begins with the question's id. All other notes are the discussion.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -24,8 +24,8 @@ from pipeline.words.spans import Span, plain
 from pipeline.words.text import clean, rich
 
 _WORDS = phrases("questions")
-_MOST = 6  # a report with more would be a questionnaire
-_LISTED = 4  # runs; of more the first
+_MOST = 6  # a report with more questions would be a questionnaire
+_LISTED = 4  # runs that a question lists
 
 
 Kind = Literal[
@@ -36,7 +36,13 @@ Kind = Literal[
 
 @dataclass(frozen=True, kw_only=True)
 class Asked:
-    """A question in plain text; `kind` is what it is about, `section` where its figures are."""
+    """A question in plain text.
+
+    Attributes
+    ----------
+    kind : what it is about.
+    section : where its figures are.
+    """
 
     kind: Kind
     id: str
@@ -45,7 +51,7 @@ class Asked:
 
 
 def ask(analysis: Analysis) -> tuple[Asked, ...]:
-    """Return what this data raises, the most telling first; nothing where all is well."""
+    """Return the questions that the data raise, the most important first; none if all is well."""
     rules = (
         _turned,
         _damping,
@@ -100,11 +106,11 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         else:
             key = "gain" if name.is_gain else "frequency"
         yield _of_row(row, analysis, key)
-        return  # the largest change stands for the others
+        return  # the largest change represents the others
 
 
 def _of_row(row: ParameterRow, analysis: Analysis, key: Kind, **values: str) -> Asked:
-    """Ask why two estimates differ."""
+    """Return the question why two estimates differ."""
     initial, final = (source_text(one, steps=analysis.steps) for one in (row.initial, row.final))
     text = _WORDS.text(
         key, name=row.name, change=_change(row), initial=initial, final=final, **values
@@ -118,7 +124,7 @@ def _assumed(analysis: Analysis) -> Iterator[Asked]:
         for row in analysis.rows
         if row.initial is not None
         and row.final is not None
-        and row.final.source == "bode_fit"  # else no points show it
+        and row.final.source == "bode_fit"  # otherwise no points show it
         and row.initial.source == "assumed"
         and abs(row.change_percent or 0.0) > DAMPING_LIMIT
     ]
@@ -198,7 +204,7 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
     design = analysis.feedback
     controlled = [c for c in closed if design is None or c.cart == design.cart] or closed
     off = max(controlled, key=_level_error, default=None)
-    if off and _level_error(off) > 0.03:  # of the level: worth a question
+    if off and _level_error(off) > 0.03:  # share of the level; a larger error raises a question
         yield _of_run(
             off,
             "level",
@@ -207,7 +213,8 @@ def _hardware(analysis: Analysis) -> Iterator[Asked]:
             unit=clean(analysis.bench.units.position),
         )
     over = max(controlled, key=_overshoot_error, default=None)
-    if over and _overshoot_error(over) > 5.0:  # percent of the step: worth a question
+    # Percent of the step; a larger error raises a question.
+    if over and _overshoot_error(over) > 5.0:
         measured, model = percent(over.overshoot_measured), percent(over.overshoot_model)
         yield _of_run(over, "overshoot", measured=measured, model=model)
     far = max(analysis.hardware, key=lambda check: check.nrmse, default=None)
@@ -244,7 +251,7 @@ def split_notes(
 ) -> tuple[dict[str, tuple[Block, ...]], tuple[Block, ...]]:
     """Return the answers by id, and the notes that answer no question.
 
-    An answer ends at the next heading of the same level or above.
+    An answer ends at the next heading of the same or a higher level.
     """
     ids = {question.id.lower(): question.id for question in asked}
     answers: dict[str, list[Block]] = {}
@@ -268,7 +275,10 @@ def split_notes(
 def placed(
     sections: Sequence[Section], asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]]
 ) -> tuple[Section, ...]:
-    """Return the sections with each question at the end of its own, else of the discussion."""
+    """Return the sections with each question at the end of its own section.
+
+    If the report lacks that section, the question goes into the discussion.
+    """
     there = {section.id for section in sections}
     return tuple(
         replace(
@@ -294,9 +304,11 @@ def placed(
 def open_questions(
     asked: Sequence[Asked], answers: Mapping[str, tuple[Block, ...]], *, by_model: bool = False
 ) -> list[Paragraph]:
-    """Return a paragraph that leads to every question, and says which are not answered.
+    """Return a paragraph with a link to each question, which also says which are unanswered.
 
-    `by_model`: the answers are not the students', but model answers.
+    Parameters
+    ----------
+    by_model : the answers are model answers, not those of students.
     """
     if not asked:
         return []
@@ -319,7 +331,7 @@ def open_questions(
 
 
 def open_line(analysis: Analysis) -> str:
-    """Return one line for the terminal on what is still to be answered, "" where nothing is."""
+    """Return a line for the terminal on questions that are still open; "" if there are none."""
     asked = ask(analysis)
     answers, _ = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     missing = [question.id for question in asked if question.id not in answers]

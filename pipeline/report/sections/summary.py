@@ -26,7 +26,7 @@ from pipeline.words.spans import Span, Spans, plain, spans
 from pipeline.words.text import clean, name_span, names_spans, rich
 
 _WORDS = phrases("summary")
-_KINDS = {  # of recordings
+_KINDS = {  # names for kinds of recordings
     "decay": "decay",
     "step": "step",
     "sine": "sine dwell",
@@ -34,13 +34,13 @@ _KINDS = {  # of recordings
     "closed_loop": "closed-loop run",
     "bode": "table of amplitude ratios",
 }
-_MOST_TOLD = 3  # of one kind: a summary is short
+_MOST_TOLD = 3  # findings of one kind; a summary is short
 
 
 def summary(page: Page) -> list[Block]:
-    """Say what was identified, what agrees, what does not, what is missing, what to do next.
+    """Return what was identified, what agrees or not, what is missing, and what to do next.
 
-    What is well is a tile on a board; what is not has a sentence as well. One picture shows all
+    Results are shown on boards of tiles. Problems also have a sentence. One picture shows all
     carts.
     """
     analysis = page.analysis
@@ -56,7 +56,7 @@ def summary(page: Page) -> list[Block]:
 
 
 def terminal_summary(analysis: Analysis) -> str:
-    """Return the summary as a few lines of plain text."""
+    """Return the summary as a few lines of text."""
     numbers = [
         f"{plain(tile.label)} = {plain(tile.value)} {plain(tile.note)}".rstrip()
         for tile in _numbers_board(analysis, error="share")
@@ -71,7 +71,7 @@ def terminal_summary(analysis: Analysis) -> str:
 
 
 def _findings(analysis: Analysis) -> list[tuple[bool, Spans]]:
-    """Return whether each thing found is well, with a sentence about it."""
+    """Return the findings: for each, whether it is good, and a sentence."""
     found = (
         set_up_in_doubt,
         _assumed,
@@ -116,7 +116,7 @@ def _identified(analysis: Analysis) -> Block:
 
 
 def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
-    """Return the recordings behind the initial estimates, "" if nothing was measured."""
+    """Return the recordings from which initial estimates come; "" if nothing was measured."""
     runs = dict.fromkeys(
         run for row in analysis.rows if row.initial for run in row.initial.experiments
     )
@@ -130,14 +130,19 @@ def _first_estimates(analysis: Analysis, *, fitted_to: Sequence[str]) -> str:
 
 
 def _runs(analysis: Analysis, ids: Collection[str]) -> str:
-    """Return the number of recordings of each kind; a table counts separately."""
+    """Return the number of recordings of each kind; tables are counted as a kind of their own."""
     known = {record.id: record.kind for record in analysis.records}
     kinds = Counter(known.get(id_, "bode") for id_ in dict.fromkeys(ids))
     return listing([count(kinds[kind], noun) for kind, noun in _KINDS.items() if kinds[kind]])
 
 
 def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[Tile, ...]:
-    """Return the gains and the resonances; `error` words those smaller than a calibration's."""
+    """Return the gains and the resonances.
+
+    Parameters
+    ----------
+    error : key of the note on an error that is smaller than that of a calibration.
+    """
     return tuple(
         _number_tile(
             row.name,
@@ -152,21 +157,22 @@ def _numbers_board(analysis: Analysis, *, error: str = "statistical") -> tuple[T
 
 
 def _is_explained(analysis: Analysis) -> bool:
-    """Tell whether the standard errors hold: they rest on noise alone being left."""
+    """Return whether the standard errors are valid, because only noise is left unexplained."""
     return analysis.fit is not None and analysis.fit.explains_data
 
 
 def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error: str) -> Tile:
-    """Return a number in four digits; a smaller error than any calibration's is only a note."""
+    """Return a number with four digits; an error smaller than a calibration's is only a note."""
     share = (final.std or 0.0) / abs(final.value) if final.value else 1.0
     if not is_sure:
-        value = significant(final.value, digits=3)  # the error says too little of the rest
+        # The true error is unknown, so only three digits are shown.
+        value = significant(final.value, digits=3)
     elif 0 < share < CALIBRATION:
         value = significant(final.value)
         told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {told}" if unit else told
     else:
-        # Of an error from a percent on two digits leave four of the value.
+        # With an error of 1 % or more, two digits of the error leave four digits of the value.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 
@@ -176,7 +182,7 @@ def _is_told(name: Name) -> bool:
 
 
 def _verdict_board(analysis: Analysis) -> tuple[Tile, ...]:
-    """Return what agrees and what does not, each leading to its section."""
+    """Return what agrees and what does not, each with a link to its section."""
     tiles = []
     if fit := analysis.fit:
         good = fit.converged and fit.explains_data
@@ -218,7 +224,7 @@ def _tone(good: bool) -> Tone:
 
 
 def _assumed(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Name what nobody stated and the data do not tell either."""
+    """Return the assumptions that nobody stated and the data do not determine, as a finding."""
     taken = [a for a in analysis.assumptions if a.origin == "default" and a.support == "open"]
     if not taken:
         return None
@@ -244,7 +250,7 @@ def _agreement(analysis: Analysis) -> tuple[bool, Spans] | None:
 
 
 def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
-    """Say of which parameters the two estimates are no two measurements."""
+    """Return a sentence on parameters whose two estimates come from the same recordings."""
     same = [row.name for row in judged if row.independent is False]
     if not same:
         return ()
@@ -254,7 +260,10 @@ def _same_recordings(judged: Sequence[ParameterRow]) -> Spans:
 
 
 def _undecided(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """What was measured twice and may be either: a number of the board must not stand alone."""
+    """Return parameters measured twice with different results, as a finding.
+
+    Otherwise the number on the board would look certain.
+    """
     told = [
         _WORDS.text(
             "undecided_one",
@@ -282,7 +291,7 @@ def _checks(analysis: Analysis) -> tuple[bool, Spans] | None:
 
 
 def _friction(analysis: Analysis) -> tuple[bool, Spans] | None:
-    """Say which runs show dry friction: decays, or what rings after a step."""
+    """Return the runs that show dry friction (decays, ringing after a step), as a finding."""
     shown = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     if not shown:
         return None
@@ -342,7 +351,7 @@ def _skipped(analysis: Analysis) -> tuple[bool, Spans] | None:
         return None
     names = list(dict.fromkeys(clean(skip.name) for skip in analysis.skipped))
     more = len(names) - _MOST_TOLD
-    # A name has commas in it: "log decrement, decay-1, cart 1".
+    # Semicolons, because names contain commas: "log decrement, decay-1, cart 1".
     stages = "; ".join(names[:_MOST_TOLD] + ([f"{more} more"] if more > 0 else []))
     return False, _WORDS.spans("skipped", stages=stages)
 

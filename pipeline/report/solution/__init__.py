@@ -1,1 +1,1 @@
-"""The instructor's reference."""
+"""The instructor's solution."""

@@ -1,4 +1,4 @@
-"""The controller worked: sampled plant, gains by Ackermann's formula or Riccati's equation."""
+"""Work out the controller: sampled plant, gains by Ackermann's formula or Riccati's equation."""
 
 from dataclasses import dataclass
 
@@ -26,15 +26,17 @@ _WEIGHED = row("R", "+", _GAMMA_T, "P", "Γ")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class WorkedDesign:
-    """The numbers on the way to the gains.
+    """The numbers of the derivation of the gains.
 
     Attributes
     ----------
-    phi (2n, 2n), gamma (2n,) : the plant over one sample.
-    z : (2n,) poles that the loop has, in the z plane.
+    phi : (2n, 2n), the plant over one sample.
+    gamma : (2n,), the input over one sample.
+    z : (2n,) poles of the loop in the z plane, as requested, or as the regulator gives them.
     open_loop, closed_loop : (2n + 1,) the polynomials of phi and of z, in falling powers.
-    P : (2n, 2n) cost to go of the linear quadratic regulator, or None.
-    gains : (2n,) by the formula shown; prefilter from them.
+    P : (2n, 2n) cost matrix of the linear quadratic regulator; None for pole placement.
+    gains : (2n,) from the formula shown.
+    prefilter : from these gains.
     """
 
     phi: Array
@@ -74,15 +76,15 @@ def work_design(chain: Chain, design: FeedbackDesign) -> WorkedDesign:
 
 
 def _polynomial_of(roots: np.ndarray) -> Array:
-    """Return the monic polynomial of roots that come in conjugate pairs, in falling powers."""
+    """Return the monic polynomial, in falling powers, of roots in conjugate pairs."""
     return np.asarray(np.real(np.poly(roots)), dtype=np.float64)
 
 
 def ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
     """Return the gains that give phi - gamma G the polynomial `wanted` (falling powers).
 
-    The columns of the controllability matrix are scaled to one: the formula is the same, and its
-    rounding smaller.
+    The columns of the controllability matrix are scaled to one. The formula is the same, but
+    rounding errors are smaller.
     """
     n = gamma.size
     columns, value = [gamma], np.zeros_like(phi)
@@ -97,7 +99,7 @@ def ackermann(phi: Array, gamma: Array, wanted: Array) -> Array:
 
 
 def design_blocks(page: Page) -> list[Block]:
-    """Work the state feedback out, with every number that a student needs to check his own."""
+    """Return the derivation of the state feedback, with all numbers that a student may compare."""
     design, chain = page.analysis.feedback, page.analysis.chain
     if design is None or chain is None:
         return []
@@ -147,7 +149,7 @@ def design_blocks(page: Page) -> list[Block]:
 
 
 def _simulated(design: FeedbackDesign, *, drive: str) -> str:
-    """Say what the step does, simulated with the delay and the input's limit."""
+    """Return a sentence on the simulated step, with the delay and the limit of the input."""
     settled = design.settling_time
     return _WORDS.text(
         "simulated" if settled is not None else "simulated_unsettled",
@@ -186,7 +188,12 @@ def _regulator(design: FeedbackDesign, worked: WorkedDesign, *, tied: bool) -> l
 
 
 def _numbers(letter: str, values: Array, name: str) -> Block:
-    """Return a matrix with its numbers, to be copied with all digits under a plain name."""
+    """Return a matrix with numbers; it can be copied with all digits.
+
+    Parameters
+    ----------
+    name : of the matrix in the copied text.
+    """
     return formula(row(letter, "=", number_matrix(values)), copy=matlab_matrix(name, values))
 
 
@@ -231,7 +238,7 @@ def _polynomial(name: str, falling: Array) -> Math:
 
 
 def _matlab(design: FeedbackDesign) -> str:
-    """Return the commands that give the same gains, A and B being those of the state model."""
+    """Return MATLAB commands that give the same gains from A and B of the state model."""
     c = f"c = zeros(1, {design.gains.size}); c({2 * design.cart - 1}) = 1;"
     poles = design.poles if design.requested_poles is None else design.requested_poles
     listed = "; ".join(

@@ -1,4 +1,4 @@
-"""What a rubric would expect: every number with its tolerance, and why so wide."""
+"""What a rubric expects: every number with its tolerance, and the reason for the tolerance."""
 
 from collections.abc import Iterable, Mapping
 from typing import Literal
@@ -30,7 +30,7 @@ _WORDS = phrases("solution")
 
 @result()
 class Expected:
-    """A parameter and what the rubric gives full points for; null where it is not judged."""
+    """A parameter, with the range in which a rubric gives full points; null if it is not judged."""
 
     name: str = written()
     unit: str = written()
@@ -43,13 +43,13 @@ class Expected:
     @property
     @computed()
     def tolerance(self) -> float | None:
-        """Half of the way between the two."""
+        """Half the width of the range."""
         return None if self.low is None or self.high is None else (self.high - self.low) / 2
 
 
 @result(eq=False)
 class ExpectedModel:
-    """The state model, and how far each entry moves within the parameters' tolerances.
+    """The state model, and how much each entry changes within the tolerances of the parameters.
 
     A is (2n, 2n), B is (2n, 1).
     """
@@ -62,7 +62,7 @@ class ExpectedModel:
 
 @result(eq=False)
 class Solution:
-    """What a rubric would expect, with tolerances."""
+    """The content of `solution.json`: what a rubric expects, with tolerances."""
 
     schema: Literal["cartlab-solution/1"] = written(default="cartlab-solution/1")
     submission: Submitted = written(part=("title", "carts", "springs", "units"))
@@ -85,7 +85,7 @@ class Solution:
 
 
 def default_rubric(analysis: Analysis) -> Rubric:
-    """Return the shipped rubric for so many carts, else one with the checks' own limits."""
+    """Return the shipped rubric for this number of carts, or one with the limits of the checks."""
     if shipped := shipped_rubric(analysis.bench.n):
         return shipped
     checks = (
@@ -99,11 +99,11 @@ def default_rubric(analysis: Analysis) -> Rubric:
 
 
 def check_carts(rubric: Rubric, *, carts: int) -> None:
-    """Insist that a rubric is for so many carts.
+    """Refuse a rubric for another number of carts.
 
     Raises
     ------
-    ConfigError : it is for others.
+    ConfigError : the rubric is for another number of carts.
     """
     if rubric.system.carts != carts:
         for_ = count(rubric.system.carts, "cart")
@@ -111,7 +111,10 @@ def check_carts(rubric: Rubric, *, carts: int) -> None:
 
 
 def expected_parameters(analysis: Analysis, rubric: Rubric) -> tuple[Expected, ...]:
-    """Return the final estimates with what the rubric accepts, by the grading's own reference."""
+    """Return the final estimates with the ranges that the rubric accepts.
+
+    The ranges come from the references that grading uses.
+    """
     known, found = in_doubt(recompute(analysis), analysis=analysis).final, []
     for row in analysis.rows:
         if row.final is None:
@@ -138,7 +141,7 @@ def expected_parameters(analysis: Analysis, rubric: Rubric) -> tuple[Expected, .
 
 
 def _final_check(rubric: Rubric, name: str) -> asked.Parameters | None:
-    """Return the criterion that judges a final estimate, None if nothing judges it."""
+    """Return the criterion that judges a final estimate; None if there is none."""
     for criterion in rubric.criteria:
         if isinstance(criterion, asked.Parameters) and criterion.check == "final":
             if matching(criterion.parameters, [name]):
@@ -147,9 +150,10 @@ def _final_check(rubric: Rubric, name: str) -> asked.Parameters | None:
 
 
 def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedModel:
-    """Return A and B, and how far each entry moves when the table moves within its tolerances.
+    """Return A and B, and how much each entry changes within the tolerances of the table.
 
-    The moves are combined as independent errors are, by the root of the sum of squares.
+    The changes due to single parameters are combined as independent errors: root of the sum of
+    squares.
     """
     A, B, _, _ = chain.state_space()
     if not chain.is_tied or chain.n > derivation.MOST_CARTS:
@@ -178,7 +182,7 @@ def expected_model(chain: Chain, tolerances: Mapping[str, float]) -> ExpectedMod
 
 
 def expected_blocks(page: Page, rubric: Rubric) -> list[Block]:
-    """Return the tables of what is expected, and how to judge a hand-in by them."""
+    """Return the tables of expected numbers, and how to judge a submission by them."""
     analysis = page.analysis
     parameters = expected_parameters(analysis, rubric)
     if not parameters or analysis.chain is None:
@@ -219,7 +223,7 @@ def _tolerances(parameters: Iterable[Expected]) -> dict[str, float]:
 
 
 def _state_judged(rubric: Rubric) -> list[Block]:
-    """Return how the rubric judges A and B; nothing where it does not."""
+    """Return how the rubric judges A and B; empty if it does not."""
     return [
         paragraph(
             _WORDS.text(
@@ -253,9 +257,11 @@ def _state_table(page: Page, model: ExpectedModel) -> Block:
 
 
 def solution_text(analysis: Analysis, *, rubric: Rubric | None = None) -> str:
-    """Return `solution.json` as text, numbers at ten significant digits.
+    """Return `solution.json` as text, with ten significant digits.
 
-    `rubric` says what is accepted; by default that of `default_rubric`.
+    Parameters
+    ----------
+    rubric : states what is accepted; default: `default_rubric`.
     """
     rubric = rubric or default_rubric(analysis)
     parameters = expected_parameters(analysis, rubric)

@@ -1,4 +1,4 @@
-"""The worked model: free bodies, transfer functions, and the state model put in step by step."""
+"""The derivation of the model: free bodies, transfer functions, state model with numbers."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -23,12 +23,12 @@ from pipeline.words.spans import spans
 from pipeline.words.text import rich
 
 _WORDS = phrases("solution")
-_MOST_ADDENDS = 3  # of a sum whose products are written out with numbers
-_A_LINE = 7  # terms of a sum
+_MOST_ADDENDS = 3  # terms of a sum whose products are written with numbers
+_A_LINE = 7  # terms of a sum in one line
 
 
 def motion_blocks(page: Page) -> list[Block]:
-    """Derive the equations of motion from the carts cut free."""
+    """Return the equations of motion, derived from free-body diagrams."""
     springs = page.analysis.bench.springs
     n = len(springs) - 1
     return [
@@ -42,7 +42,7 @@ def motion_blocks(page: Page) -> list[Block]:
 
 
 def transfer_blocks(page: Page) -> list[Block]:
-    """Derive the transfer functions by eliminating the carts from the last to the first."""
+    """Return the transfer functions, derived by eliminating carts from the last to the first."""
     springs = page.analysis.bench.springs
     n = len(springs) - 1
     symbolic = symbolic_transfer_functions(springs)
@@ -76,7 +76,7 @@ def transfer_blocks(page: Page) -> list[Block]:
 
 
 def state_blocks(page: Page) -> list[Block]:
-    """Put the numbers in: from the table of parameters to A and B, and to masses and springs."""
+    """Return the steps, with numbers, from the table to A and B, and to masses and springs."""
     analysis = page.analysis
     fit, springs = analysis.fit, analysis.bench.springs
     if fit is None:
@@ -109,7 +109,7 @@ def state_blocks(page: Page) -> list[Block]:
 
 
 def _steps(n: int) -> Iterable[tuple[str, str, Sequence[Equation]]]:
-    """Yield title, explanation and equations of each step from the table to the entries."""
+    """Yield title, explanation and equations of each step from the table to A and B."""
     if n > 1:
         what = "Δ(s) and N(s)" if n == 3 else "Δ(s)"
         yield (f"Coefficients of {what}", _WORDS.text("coefficients"), derivation.coefficients(n))
@@ -155,9 +155,9 @@ def _law(law: Equation, values: Mapping[str, float]) -> Formula:
 
 
 def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
-    """Return each equation with names, with numbers put in, and its result.
+    """Return each equation with symbols, with numbers, and with its result.
 
-    Short ones share a formula, a line each; a sum of several terms takes two lines of its own.
+    Short equations share a block, one per line. A sum of several terms gets lines of its own.
     """
     blocks: list[Block] = []
     short: list[Math] = []
@@ -167,7 +167,7 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
         result = value_term(evaluate(equation.right, values))
         if len(terms) == 1 and "-" not in equation.right:
             put_in = row(shown_with(equation.right, values), "≈", result)
-            # The square of a frequency that the table holds has no other name.
+            # The square of a frequency in the table has no other name.
             short.append(row(left, "=", *(() if left == right else (right, row("="))), put_in))
             continue
         blocks += [_together(short)] if short else []
@@ -179,11 +179,11 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
 def _long(
     left: Term, terms: Sequence[str], text: str, values: Mapping[str, float], result: Term
 ) -> list[Math]:
-    """Return a sum in lines of a few terms, then with numbers, then what it comes to."""
+    """Return a long sum: terms in several lines, then numbers, then the result."""
     if len(terms) <= _MOST_ADDENDS:
         put_in = row("=", shown_with(text, values), "≈", result)
         return [row(left, "=", shown(text)), put_in]
-    # The products of a long sum are worked out first, so that it can be read.
+    # Products in a long sum are computed first, to keep it readable.
     numbers = [value_term(evaluate(term, values)) for term in terms]
     return [
         *_broken((left, "="), [shown(term) for term in terms]),
@@ -193,7 +193,7 @@ def _long(
 
 
 def _broken(head: Sequence[Term], terms: Sequence[Term]) -> list[Math]:
-    """Return a sum over as many lines as it needs."""
+    """Return a sum in as many lines as it needs."""
     rows = [total(terms[i : i + _A_LINE]) for i in range(0, len(terms), _A_LINE)]
     return [row(*head, rows[0]), *(row("+", terms) for terms in rows[1:])]
 

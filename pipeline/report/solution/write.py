@@ -1,4 +1,4 @@
-"""The instructor's reference: the report, with the derivations and the numbers put in."""
+"""The instructor's solution: the report with derivations and with numbers inserted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -40,11 +40,11 @@ def make_solution(
     pdf: bool = True,
     progress: Progress,
 ) -> tuple[Analysis, str]:
-    """Analyse a submission, write its reference; return the analysis and solution.json.
+    """Analyse a submission and write its solution; return the analysis and solution.json.
 
     Parameters
     ----------
-    rubric : says what is accepted; by default the shipped one for so many carts.
+    rubric : states what is accepted; default: the shipped one for this number of carts.
 
     Raises
     ------
@@ -80,10 +80,9 @@ def build_solution(
     gap: Gap | None = None,
     progress: Progress = silent,
 ) -> Document:
-    """Return the report with the worked sections in the place of the short ones on the model.
+    """Return the report with derivations in place of the short sections on the model.
 
-    It holds no text of students: their notes are left out, and each question of the data has a
-    model answer.
+    It contains no text of students: their notes are left out, and each question has a model answer.
     """
     accepted = rubric or default_rubric(analysis)
     worked: tuple[Part, ...] = (
@@ -107,6 +106,6 @@ def build_solution(
 
 
 def model_answer(question: Asked) -> Paragraph:
-    """Return what a good answer to a question says."""
+    """Return a paragraph with a good answer to a question."""
     lead = Span(_WORDS.text("model_answer"), "strong")
     return paragraph(lead, rich(_WORDS.text(f"answer_{question.kind}")))
