@@ -28,7 +28,7 @@ MOST_FORM = 2_000_000  # bytes of a request that is not an upload
 
 
 class SecretDoor:
-    """Let in the person at this computer: whoever first opens the address that was printed.
+    """Let in the person at this computer: the first one to open the address that was printed.
 
     The secret in that address works once. From then on a cookie identifies the person. Scripts
     cannot read it, and other sites cannot send it. So no secret stays in an address, where the

@@ -27,7 +27,7 @@ def sees_check(user: User, folder: Place | None) -> bool:
     """Return whether the room of a folder shows the check instead of the report.
 
     On a lab server, the rubric in the list of users decides. Without one, `[students] see` of the
-    submission does. That is only an agreement, because whoever has the folder can change it.
+    submission does. That is only an agreement, because a student with the folder can change it.
     """
     if user.role == "instructor" or not isinstance(folder, Path):
         return False

@@ -33,7 +33,7 @@ def read_plan(
     Parameters
     ----------
     session : the last session in the folder; it knows why a run ended early.
-    before : ids of the plan before recordings were last added; None: none is new.
+    before : ids of the plan before recordings were last added; None: no recording is new.
     """
     found = {"sound": False, "rows": [], "left": "", "wrong": "", "units": None, "parameters": []}
     found |= {"carts": 0, "recorded": 0}

@@ -160,7 +160,7 @@ def show_figures(
 ) -> list[dict[str, str]]:
     """Return the figures of a criterion; the one with the largest relative error comes first.
 
-    Without a criterion, the figures that belong to none are returned.
+    Without a criterion, the figures that belong to no criterion are returned.
 
     Parameters
     ----------

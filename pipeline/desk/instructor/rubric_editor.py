@@ -28,7 +28,7 @@ _NEW = "new"  # what a form states as the version of a file that does not exist 
 
 
 def show(ask: Ask) -> Response:
-    """Show a rubric in the editor, or the list of rubrics if none is named.
+    """Show a rubric in the editor, or the list of rubrics if the request names no rubric.
 
     A file that does not exist begins with a shipped rubric, or empty.
     """

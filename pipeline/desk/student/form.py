@@ -111,7 +111,7 @@ class Group:
     Attributes
     ----------
     summary : the fields in one line.
-    missing : what still has to be filled in.
+    missing : fields that must still be filled in.
     """
 
     key: str

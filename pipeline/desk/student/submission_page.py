@@ -68,7 +68,7 @@ def set_aside(ask: Ask) -> Response:
 
 
 def fill(ask: Ask) -> Response:
-    """Add tables for data files that have none."""
+    """Add tables for data files without a table."""
     return _go_back(ask, _fill_tables(ask, ask.folder()), _FILES)
 
 

@@ -31,7 +31,7 @@ def draw_ticks(ax: Axes, *, label_x: bool, label_y: bool = True) -> None:
         scale = (ax.get_xscale, ax.get_yscale)[direction]()
         most = max(2, int(size / (0.45, 0.18)[direction]))  # smallest distance of ticks in inches
         own = axis.get_major_locator()
-        # What a figure may set itself: right angles, whole numbers.
+        # A figure may set some ticks itself: right angles, whole numbers.
         if type(own) in (MultipleLocator, MaxNLocator):
             ticks = np.asarray(own())
             ticks = ticks[(ticks >= low) & (ticks <= high)]

@@ -72,7 +72,7 @@ class ComparedRun:
 def compare_runs(
     analysis: Analysis, *, gap: Gap | None, progress: Progress
 ) -> tuple[ComparedRun, ...]:
-    """Return every recording with its models; if a run has none, its note says why.
+    """Return every recording with its models; the note of a run without a model says why.
 
     Parameters
     ----------

@@ -177,5 +177,5 @@ def _digits_wide(text: str) -> float:
 
 @cache
 def _math_font() -> str:
-    """Return the font of the formulas; many phones have none with large brackets."""
+    """Return the font of the formulas; the fonts of many phones lack large brackets."""
     return base64.b64encode((TEMPLATES / "fonts" / "mathematics.woff").read_bytes()).decode()

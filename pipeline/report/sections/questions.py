@@ -331,7 +331,7 @@ def open_questions(
 
 
 def open_line(analysis: Analysis) -> str:
-    """Return a line for the terminal on questions that are still open; "" if there are none."""
+    """Return a line for the terminal on questions that are still open, or ""."""
     asked = ask(analysis)
     answers, _ = split_notes(discussion_blocks(analysis.discussion or ""), asked)
     missing = [question.id for question in asked if question.id not in answers]

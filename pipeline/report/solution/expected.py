@@ -141,7 +141,7 @@ def expected_parameters(analysis: Analysis, rubric: Rubric) -> tuple[Expected, .
 
 
 def _final_check(rubric: Rubric, name: str) -> asked.Parameters | None:
-    """Return the criterion that judges a final estimate; None if there is none."""
+    """Return the criterion that judges a final estimate; None if the rubric lacks it."""
     for criterion in rubric.criteria:
         if isinstance(criterion, asked.Parameters) and criterion.check == "final":
             if matching(criterion.parameters, [name]):
