@@ -128,12 +128,13 @@ class Table:
 
 @dataclass(frozen=True)
 class Picture:
-    """A numbered figure; `name` is its file in `figures/`.
+    """A numbered figure.
 
     Attributes
     ----------
+    name : of its file in `figures/`.
     draw : returns it as SVG; called once, when `svg` is first used.
-    blank : an empty SVG of its size, from which pages are laid out before it is drawn.
+    blank : an empty SVG of its size, with which pages are laid out before it is drawn.
     """
 
     number: int

@@ -80,7 +80,7 @@ class PageBuilder:
         alt: str = "",
         **said: object,
     ) -> Picture:
-        """Return a figure, to be drawn later, under the next number.
+        """Return a figure with the next number; it is drawn later.
 
         Parameters
         ----------

@@ -24,19 +24,25 @@ _SHOWN_IN_WARNING = 20
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """How a document is laid out: its content as JSON, and what is set otherwise than usual."""
+    """The layout of a document.
+
+    Attributes
+    ----------
+    text : its content as JSON.
+    choices : changes to the default layout.
+    """
 
     text: str
     choices: Choices
 
 
 def render_pdf(document: Document) -> bytes:
-    """Return the PDF (archival A-2a, accessible UA-1), with its own fonts only."""
+    """Return the PDF (archival A-2a, accessible UA-1), which uses only its own fonts."""
     return print_pages(document, lay_out(document))
 
 
 def lay_out(document: Document) -> Layout:
-    """Lay out the pages, which takes most of the time of a PDF; no figure needs to be drawn yet."""
+    """Lay out the pages, which takes most of the time; figures need not be drawn before."""
     text = json.dumps(_printable(as_json(document)), ensure_ascii=False, allow_nan=False)
     blanks = {_file(one): (one.blank or one.svg).encode() for one in document.pictures()}
     choices = fill_pages(lambda choices: _try(_parts(text, choices, blanks)))
@@ -44,7 +50,10 @@ def lay_out(document: Document) -> Layout:
 
 
 def print_pages(document: Document, layout: Layout) -> bytes:
-    """Return the PDF of a document that is laid out; typst remembers what has not changed since."""
+    """Return the PDF of a document whose layout is known.
+
+    It is fast, because typst keeps its results for files that have not changed.
+    """
     drawn = {_file(one): _printable(plain_svg(one.svg)).encode() for one in document.pictures()}
     pdf = typst.compile(
         _parts(layout.text, layout.choices, drawn),
@@ -58,7 +67,7 @@ def print_pages(document: Document, layout: Layout) -> bytes:
 
 
 def _parts(text: str, choices: Choices, figures: dict[str, bytes]) -> Any:
-    """Return what is compiled, a part a file: typst remembers what follows from each alone."""
+    """Return the source in several files, because typst keeps the results for unchanged files."""
     return {
         "main.typ": (TEMPLATES / "report.typ").read_bytes(),
         "document.json": text.encode(),
@@ -73,7 +82,7 @@ def _file(picture: Picture) -> str:
 
 @cache
 def _fonts() -> typst.Fonts:
-    """Leave out fonts of the system, as another machine must give the same pages."""
+    """Return the fonts, without those of the system, so that all computers make the same pages."""
     return typst.Fonts(include_system_fonts=False, font_paths=[_font_folder()])
 
 
@@ -91,7 +100,7 @@ def missing_characters(text: str) -> str:
 
 
 def _printable(value: Any) -> Any:
-    """Return JSON with the characters that no font has replaced.
+    """Return JSON in which characters that no font has are replaced.
 
     Otherwise these characters would become empty boxes without a warning, and the file would not be
     a valid PDF/A. A number and its unit are kept on one line, except in text quoted as typed.

@@ -16,7 +16,7 @@ def write_document(document: Document, out: Path, *, name: str, pdf: bool) -> No
     figures.mkdir(parents=True, exist_ok=True)
     clear_files(figures, "*.svg")
     clear_files(out, f"{name}.pdf")
-    with ThreadPoolExecutor(max_workers=1) as beside:  # typst works outside the interpreter's lock
+    with ThreadPoolExecutor(max_workers=1) as beside:  # typst runs without the interpreter's lock
         layout = beside.submit(lay_out, document) if pdf else None
         for picture in document.pictures():
             write_file(figures / f"{picture.name}.svg", plain_svg(picture.svg))
