@@ -27,10 +27,10 @@ EFFECT = Effect(
         ),
         EffectParameter("phase", "φ", "rad", scale="1", typical=3.142, signed=True),
     ),
-    fingerprint="The cart tends to rest at evenly spaced positions. The remaining force is a sine "
-    "wave over position, the same in both directions of travel.",
+    fingerprint="The cart tends to rest at evenly spaced positions. Plotted over position, the "
+    "unexplained force is a sine wave, the same in both directions of travel.",
     deciding_run="A slow ramp of the input, up and down: the cart jumps between rest positions "
-    "that are the same both ways. With dry friction they differ.",
+    "that are the same both ways. With dry friction these positions differ.",
     reference="D. C. Hanselman, Brushless Permanent Magnet Motor Design, 2nd ed., chapter 5",
     axis="position",
 )
