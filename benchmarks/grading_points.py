@@ -95,7 +95,8 @@ def points(benches: Sequence[Iterable[Grading]]) -> Table:
         ],
         rows=rows,
         note=f"""
-{len(benches)} fresh benches, each with an honest team and up to four mistakes, as in the first table.
+{len(benches)} fresh benches, each with an honest team and up to four mistakes, as in the first
+table.
 A TA who knew the mistake would take points for the numbers that it changed, and for no others.
 A criterion counts as lost if the same team had more points there before the mistake. Criteria that
 compare two tables, or ask for all pieces, are left out of the last two columns.
