@@ -144,8 +144,7 @@ class Benches:
     Attributes
     ----------
     planned : for each folder, the ids of its plan before recordings were last added; None if there
-        was
-        no plan.
+        was no plan.
     """
 
     def __init__(self) -> None:

@@ -18,8 +18,7 @@ class Member:
     submission : its id, unique in the batch.
     owner : the account that submitted it, as the learning platform names it, or "".
     key : hash of everything that affects the grade (submitted files, rubric, code, name and
-        lateness),
-        a hyphen, and the hash of the files alone.
+        lateness), a hyphen, and the hash of the files alone.
     fingerprints : noise patterns of its recordings, to find them in other submissions; see
         `shared.py`.
     reason : why it could not be graded, in one line, or "".

@@ -232,8 +232,7 @@ class Rubric(TomlTable):
     step : points are rounded to it.
     anonymous : names are left out of all files unless requested.
     examples : submission folders given out with the assignment, relative to the rubric's folder;
-        any
-        submission may contain their recordings.
+        any submission may contain their recordings.
     students : what students see at the desk of a lab server whose list of users names the rubric.
     """
 

@@ -60,8 +60,7 @@ def acquire(
     HardwareError : no bench answers.
     Runaway : the motor of the bench was on between runs.
     ConfigError : another session writes to the folder, or plan or submission do not fit the bench.
-        If
-        only one recording does not fit, its outcome says why, and the session continues.
+        If only one recording does not fit, its outcome says why, and the session continues.
     """
     with stopping_on_signals(), alone_in(folder):
         work = _Acquisition(

@@ -147,8 +147,7 @@ def limit_words(limits: PlanLimits, submission: Submission, bench: Description) 
     Raises
     ------
     ConfigError : the input limit is above full scale, so that amplitudes given as its shares would
-        be
-        too large.
+        be too large.
     """
     system = submission.system
     unit, position = system.input.unit, system.position.unit

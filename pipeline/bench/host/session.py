@@ -58,8 +58,7 @@ class Session:
     Parameters
     ----------
     carts : number of carts in the submission; a bench that describes itself may have more, and
-        their
-        travel is watched too.
+        their travel is watched too.
     buttons : read before anything moves and at every look at the port.
 
     Attributes
@@ -131,8 +130,7 @@ class Session:
         Parameters
         ----------
         let_in : called while lines arrive; it raises an interrupt that is being held. Once the last
-            line
-            has arrived, the run is complete, and interrupts wait.
+            line has arrived, the run is complete, and interrupts wait.
         """
         recording = order.recording
         stream = self._stream(recording.carts, closed=recording.controller is not None)

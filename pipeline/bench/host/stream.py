@@ -111,8 +111,7 @@ class Stream:
         ----------
         data : new bytes from the port.
         since : time in s when the port was last found empty; data that waited while this computer
-            was busy
-            are not late.
+            was busy are not late.
         now : time in s, of the same clock.
         """
         *lines, self._tail = (self._tail + data).split(b"\n")

@@ -40,8 +40,7 @@ class CommandReader:
     ----------
     encoders : of the bench; state feedback has two gains for each.
     extensions : letters of the commands that the stock bench does not know; without any, there is
-        no
-        query either.
+        no query either.
     """
 
     def __init__(self, *, encoders: int, extensions: Collection[str] = EXTENSIONS) -> None:

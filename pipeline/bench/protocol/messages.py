@@ -220,8 +220,7 @@ class Description:
     period : nominal s between lines.
     baud : of the line.
     commands : letters of the commands beyond the stock ones; `c` also means that it knows the
-        chirp,
-        `m` the multisine.
+        chirp, `m` the multisine.
     input_unit, input_per_count : unit of the input, and its value per duty count.
     position_unit, position_per_count : unit of the positions, and its value per encoder count.
     """

@@ -40,8 +40,7 @@ class Item:
     id : of the criterion, or the code of the flag.
     lost : points lost before points by hand, so that a criterion keeps its row after a decision.
     doubt : whether a person should look or has looked: points were lost, it was not judged, or it
-        has a
-        flag or points by hand.
+        has a flag or points by hand.
     """
 
     id: str

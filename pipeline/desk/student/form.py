@@ -75,8 +75,7 @@ class Field:
     ----------
     path : of the key in the file.
     kind : text, number, numbers, rows (of numbers, one per line), flags, authors, columns, or words
-        (a
-        text of several lines).
+        (a text of several lines).
     choices : the possible values; "" means that the key is left out.
     names : of the flags.
     value : as stored or typed.
@@ -204,8 +203,8 @@ def find_changes(fields: Iterable[Field], form: Mapping[str, Any], values: Any) 
     ----------
     form : typed text by path; a field without an entry was not shown.
     values : function that returns all values of a form field. For a field of flags they are the
-        numbers
-        of those that are on. For `answer` they are "path=value", one for each question answered.
+        numbers of those that are on. For `answer` they are "path=value", one for each question
+        answered.
     """
     changed = []
     answered = dict(one.partition("=")[::2] for one in values("answer"))

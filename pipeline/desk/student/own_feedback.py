@@ -78,8 +78,7 @@ def _read(ask: Ask) -> OwnFeedback | None:
     Raises
     ------
     ConfigError : it cannot be read. The message gives no reason, because the reason may contain
-        paths of
-        the server.
+        paths of the server.
     """
     own = _find_own(ask)
     try:

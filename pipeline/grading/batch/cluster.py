@@ -36,8 +36,8 @@ def run_on(address: str) -> Executor:
     Raises
     ------
     ConfigError : the address is on another machine and not encrypted (a scheduler runs any code
-        that
-        it receives), nobody answers, certificates are missing, or the cluster runs another version.
+        that it receives), nobody answers, certificates are missing, or the cluster runs another
+        version.
     """
     parts = urlsplit(address)
     if parts.scheme not in ("tcp", "tls") or not parts.hostname:

@@ -23,8 +23,7 @@ class SoFar:
     kept : submissions of the list that are not in this run.
     moved : for each renamed submission, its old and its new name.
     taken_over : (submission, authors before, authors now), for names that now belong to other
-        people;
-        these people do not inherit points given by hand.
+        people; these people do not inherit points given by hand.
     """
 
     kept: Mapping[str, Member]

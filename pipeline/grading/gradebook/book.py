@@ -334,8 +334,7 @@ class Gradebook:
         Raises
         ------
         ConfigError : there is no such submission or criterion, the points are not possible, or the
-            name of
-            the person or the reason is missing.
+            name of the person or the reason is missing.
         """
         with self._database.writing() as connection:
             last, row = self._find(connection, team)

@@ -90,8 +90,7 @@ def open_submission(sources: Sequence[Path], into: Path, *, digest: str = "") ->
     Raises
     ------
     SubmissionError : there is no submission, there are several, there are too many files, or an
-        archive
-        is bad.
+        archive is bad.
     OSError : this computer cannot read or copy a file.
     Changed : the copy has another digest.
     """

@@ -46,8 +46,8 @@ class HandIn:
     ----------
     id : unique in the batch, and valid as a folder name.
     sources : one folder, or several files, which may be archives.
-    owner : the account that submitted it, with the platform's name and number:
-        "Jane Doe (moodle 1024)"; or "".
+    owner : the account that submitted it, with the platform's name and number: "Jane Doe (moodle
+        1024)"; or "".
     handed_in : the time in ISO 8601, if the platform gives it; or "".
     problem : why it cannot be opened, if already known; or "".
     parent : name of the folder around it; needed until its id is unique.
@@ -85,8 +85,7 @@ def find_hand_ins(
     scratch : folder where archives of a whole class are unpacked.
     skip : folders that are not hand-ins, such as the output folder.
     known : ids in the current class. A folder `team-1` with the longer id `a-team-1` there keeps
-        it,
-        even if this run has no other `team-1`.
+        it, even if this run has no other `team-1`.
     say : called with a message for each folder that is skipped because it holds results of a
         grading.
 

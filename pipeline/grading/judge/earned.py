@@ -33,8 +33,7 @@ class Deviation:
     ----------
     error : in the unit of the tolerance (percent, or percentage points).
     by : name of the tolerance. `exact` is for a zero or a one of a state model: a right one does
-        not
-        count, because it is no achievement, and a wrong one counts like any other number.
+        not count, because it is no achievement, and a wrong one counts like any other number.
     """
 
     error: Fraction

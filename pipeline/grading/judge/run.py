@@ -44,8 +44,7 @@ class Graded:
     ----------
     analysis : of the student's recordings; None if the grading failed.
     verdicts : by criterion, including those that earn nothing because a required one was not
-        passed;
-        empty if the grading failed.
+        passed; empty if the grading failed.
     """
 
     grade: Grade

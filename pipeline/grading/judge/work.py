@@ -68,8 +68,7 @@ class Verdict:
     explained : a known mistake explains all lost points, so that its flag replaces the rubric's
         advice.
     models : for each acceptable model, the errors of the numbers; the best model counts. Empty if
-        the
-        share does not depend on tolerances.
+        the share does not depend on tolerances.
     most : the largest possible share, whatever the tolerances.
     agrees : for each number that is judged alone, whether it loses no points.
     """

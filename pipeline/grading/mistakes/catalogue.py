@@ -42,8 +42,7 @@ class Mistake:
     tries : number of variants tried; more variants match more easily by chance.
     beside : numbers that must be right for this mistake to be credible.
     from_time_records : it comes from reading a decay or a step, so it is in a final table only if
-        that
-        was copied from the initial one.
+        that was copied from the initial one.
     """
 
     codes: tuple[Code, ...]

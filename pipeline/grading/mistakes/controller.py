@@ -38,8 +38,7 @@ class Controller:
     ran : (2n,) gains that a closed-loop run states; None if no run does.
     models : the carts on which gains are simulated: the reference, and the student's own tables.
     goal : of the design; if both the reference design and these gains miss it, the easier goal that
-        the
-        reference design reaches.
+        the reference design reaches.
     blurred : friction makes the gains of the reference uncertain.
     own : the student's table is complete, so that their own model is known.
     reference : the carts from the recordings, first of the models; None if not identified.

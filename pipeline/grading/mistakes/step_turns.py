@@ -24,8 +24,7 @@ class StepTurns:
     ----------
     by_edge : for each edge, and each recording that repeats it, the first three turning points.
     furthest : for each edge, the largest displacements; when two motions beat, this is not the
-        first
-        turning point.
+        first turning point.
     """
 
     by_edge: dict[Edge, list[list[float]]]

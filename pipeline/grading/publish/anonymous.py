@@ -27,8 +27,7 @@ def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:
     Parameters
     ----------
     first_keys : by submission, the hash of its first version. Later versions keep it, and a
-        stranger
-        who knows the name cannot compute it.
+        stranger who knows the name cannot compute it.
     """
     hashes = {
         name: b32encode(hashlib.sha256(f"anonymous {key}".encode()).digest()).decode().lower()

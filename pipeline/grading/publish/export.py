@@ -59,8 +59,7 @@ def export(
     Raises
     ------
     ConfigError : the roster is not the platform's table, or has another maximum grade; or `out` has
-        the
-        name of another kind of file.
+        the name of another kind of file.
     """
     table = out if out.suffix.lower() == ".csv" and not out.is_dir() else None
     folder = table.parent if table else named_folder(out)

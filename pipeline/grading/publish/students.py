@@ -24,8 +24,7 @@ class Student:
     name, number : of the account that submitted, on the platform for which grades are exported; or
         "".
     uploader : this entry is the account that submitted, because it is unknown which of several
-        authors
-        it belongs to.
+        authors it belongs to.
     by_hand : the criteria whose points were given by hand.
     undecided : message that names the submissions, if the student is in several with different
         points.

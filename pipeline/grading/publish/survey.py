@@ -45,8 +45,7 @@ class Survey:
     students : number of students.
     opinions : Table 4, one row per question: how many students gave each answer; columns `SCALE`.
     means : Table 5, one row per concept: the mean scores (1 to 4), rounded to two decimals, halves
-        up;
-        NaN if nobody answered; columns `LEVELS`.
+        up; NaN if nobody answered; columns `LEVELS`.
     answers : how many answers each mean has.
     left_out : headings of columns that belong to neither table.
     """

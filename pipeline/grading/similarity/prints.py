@@ -53,13 +53,11 @@ class Print:
     ----------
     group : the kind of run; only recordings of the same group are compared.
     residual : (n_rows, n) whole numbers; one row for each free cart, and one for the input of a
-        closed
-        loop.
+        closed loop.
     step : (n_rows,) value of 1 in the recording's position unit or input unit.
     anchors : lists of samples that can be found again in a copy, the surest first; they give the
-        shift
-        of the copy. One list has midpoints between two extrema of the motion, which noise does not
-        affect. The others have maxima of the noise, which cutting does not affect.
+        shift of the copy. One list has midpoints between two extrema of the motion, which noise
+        does not affect. The others have maxima of the noise, which cutting does not affect.
     motion : of the first cart at every few samples; it gives the scale between two recordings.
     start : time of the first sample, in s.
     interval : time between samples, in s.

@@ -67,8 +67,7 @@ class SharedRecord:
     submission, other_experiment : the other submission, and the recording's name there.
     sigmas : agreement of the noise, in standard deviations above chance.
     equal_rows : number of consecutive rows that are equal up to one factor per column; 0 if this is
-        not
-        the evidence.
+        not the evidence.
     time, other_time : start and end of the equal part, in s, in both recordings.
     """
 

@@ -36,8 +36,7 @@ def with_answer(notes: str, id_: str, answer: str) -> str:
     Raises
     ------
     SubmissionError : a heading in the answer would end it early, or open Markdown in it would
-        include
-        other answers.
+        include other answers.
     """
     text = answer.replace("\r\n", "\n").strip()
     lines = _lines(notes)
