@@ -6,7 +6,7 @@ traceback. Only the imports of this file come earlier.
 
 import sys
 
-TYPE_CHECKING = False  # as in typing, which is slow to import
+TYPE_CHECKING = False  # the same as typing.TYPE_CHECKING, which is slow to import
 if TYPE_CHECKING:
     from pipeline.cli.common import app as app
 
@@ -33,5 +33,5 @@ def main() -> None:
         from pipeline.cli.commands import run
 
         run()
-    except KeyboardInterrupt:  # either nothing has started, or the message is already printed
+    except KeyboardInterrupt:  # either nothing has started yet, or the message is already printed
         sys.exit(INTERRUPTED)

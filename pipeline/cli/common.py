@@ -54,7 +54,7 @@ def run() -> None:
     Print an error that the user can fix as one line, with exit status 2.
     """
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):  # a console with few characters shows others as \u…
+        if isinstance(stream, TextIOWrapper):  # a console that lacks a character shows it as \u…
             stream.reconfigure(errors="backslashreplace")
     try:
         sys.exit(app(sys.argv[1:] or ["--help"], standalone_mode=False))

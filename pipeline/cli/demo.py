@@ -52,7 +52,7 @@ def search_beside(out: Path) -> Iterator[subprocess.Popen[str]]:
         try:
             yield beside
         finally:
-            beside.kill()  # if it still runs, after an error here
+            beside.kill()  # it still runs only after an error in the other parts
 
 
 def found_beside(beside: subprocess.Popen[str], out: Path) -> list[str]:

@@ -80,14 +80,14 @@ async def _tell_news(ask: Ask) -> Response:
 
 async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
     """Yield a line for every new stage of the work; a slow reader gets only the latest stage."""
-    seen, quiet, frame = -1, 0.0, 0.2  # s between two looks for news
+    seen, quiet, frame = -1, 0.0, 0.2  # `frame` is the time in s between two looks for news
     while (job := ask.desk.jobs.of(place)) is not None:
         if job.news != seen:
             seen, quiet = job.news, 0.0
             shown = ask.job or job
             said = " ".join(ask.user.told(shown.said).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
-        elif quiet > 5.0:  # s without news, after which a line keeps the connection open
+        elif quiet > 5.0:  # s without news; the line sent then keeps the connection open
             quiet = 0.0
             yield ": still here\n\n"
         if job.over:
@@ -98,7 +98,8 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
 
 
 # Address, method, handler. Every change is a POST from a form that works without scripts. Handlers
-# of streams are coroutines: as threads, they would soon occupy all threads that answer requests.
+# of streams are coroutines. If each took a thread, no threads would soon be left to answer
+# requests.
 ROUTES: tuple[tuple[str, str, Handler], ...] = (
     ("/", "GET", show_home),
     ("/open", "GET", show_folders),

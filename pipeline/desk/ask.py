@@ -68,7 +68,7 @@ class Desk:
     benches: Benches = field(default_factory=Benches)
     books: Books = field(default_factory=Books)
     said: dict[tuple[str, str], list[Said]] = field(default_factory=dict)
-    # The files and their state when the zip of a folder was last downloaded.
+    # By folder: the files that the last downloaded zip contained, with their time and size.
     handed: dict[Path, dict[str, list[int]]] = field(default_factory=dict)
     _shown: dict[str, OrderedDict[str, str]] = field(default_factory=dict)
     _looks: OrderedDict[Path, tuple[Stamp, dict[str, Any]]] = field(default_factory=OrderedDict)
@@ -290,8 +290,8 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["called"] = name_place
-    # A new number in the addresses of style sheets and scripts prevents old ones from a browser's
-    # cache.
+    # This random number in the addresses of style sheets and scripts keeps browsers from using old
+    # copies.
     environment.globals["fresh"] = secrets.token_hex(4)
     return environment
 

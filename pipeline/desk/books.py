@@ -65,7 +65,8 @@ class Class:
 def _find_user() -> str:
     try:
         return getpass.getuser()
-    except (OSError, KeyError):  # KeyError until Python 3.12: the system does not know the user
+    # Before Python 3.12, KeyError is raised for a user that the system does not know.
+    except (OSError, KeyError):
         return ""
 
 
@@ -73,7 +74,8 @@ class Books:
     """The open gradebooks; each is opened once, and its class is read again only after a change."""
 
     def __init__(self) -> None:
-        self.signed = _find_user()  # who changes points, unless a proxy states it
+        # Name of the person who changes points, unless a proxy states it.
+        self.signed = _find_user()
         # By gradebook: submissions and options of the last regrading.
         self.asked: dict[Path | str, dict[str, str]] = {}
         self._books: dict[Path | str, RequestBook] = {}

@@ -12,7 +12,7 @@ from pipeline.grading.gradebook.schema import FILE
 from pipeline.submission.load import NAME
 
 MOST = 200  # folders shown in a list
-_LOOKED_AT = 20_000  # folders whose content is checked, the first by name
+_LOOKED_AT = 20_000  # largest number of folders whose content is checked
 
 Kind = Literal["submission", "grading", "empty", "folder"]
 

@@ -35,7 +35,7 @@ class SecretDoor:
     browser's history or a screenshot could keep it.
     """
 
-    arrivals = False  # the cookie is not sent if the person comes from another site
+    arrivals = False  # a person who arrives from another site does not send the cookie yet
 
     def __init__(self, user: User, *, port: int, start: str) -> None:
         self._sites = list_own_names(port)
@@ -89,7 +89,7 @@ class ProxyDoor:
     def enter(self, scope: Scope, headers: Headers) -> dict[str, Any] | Response:
         """Return the person who asks, or a refusal."""
         sent = headers.getlist(self._proxy.secret_header)
-        # Other people on the proxy's computer have the same address, but not the proxy's secret.
+        # Other people on the proxy's computer share its address, but they do not know its secret.
         known = len(sent) == 1 and _is_same(sent[0].encode("latin-1"), self._proxy.secret)
         if not known or ip_address(scope["client"][0]) != ip_address(self._proxy.address):
             return refuse("use the address of the lab's server")

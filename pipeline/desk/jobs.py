@@ -14,7 +14,7 @@ from pipeline.errors import PipelineError
 from pipeline.processes import Failed, Supervisor
 
 _GLANCE = 0.1  # s between two looks at whether a job may start or must stop
-_HANDS = 3  # processes for short tasks, each with 150 MB
+_HANDS = 3  # number of processes for short tasks; each takes 150 MB
 _WAITING = 8  # requests that may wait for one folder; each holds one of the server's 40 threads
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]

@@ -10,13 +10,14 @@ from pipeline.report.render.html import every_hash
 from pipeline.resources import TEMPLATES
 from pipeline.submission.load import outside
 
-# A page from a submission's folder may come from a stranger. It gets an origin of its own, so that
-# it sees no cookie and sends nothing to the desk. It may run only the scripts of reports.
+# The policy for a page from a submission's folder, which may come from a stranger. The page gets an
+# origin of its own, so that it sees no cookie and sends nothing to the desk. It may run only the
+# scripts of reports.
 _STRANGE_PAGE = (
     "sandbox allow-scripts; default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; "
     "img-src data:; font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'self'"
 )
-# For complete pages that cartlab made; their one script is allowed by its hash.
+# The policy for complete pages that cartlab made. It allows their one script by its hash.
 _OWN_PAGE = (
     "default-src 'none'; style-src 'unsafe-inline'; script-src {hashes}; img-src data:; "
     "font-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"

@@ -179,7 +179,8 @@ def make_plots(folder: str, *, progress: Progress) -> None:
     from pipeline.report.plots.page import write_plots
     from pipeline.workflow import analyse
 
-    made_of = stat_sources(Path(folder))  # before the files are read, as for a report
+    # Note the state before the files are read, as for a report.
+    made_of = stat_sources(Path(folder))
     submission = load_submission(Path(folder))
     out = own_folder(submission.folder, "report")
     with alone_in(out):

@@ -196,7 +196,7 @@ def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) 
     If its check is unknown or missing, a problem is added to `complaints`, and the nearest valid
     check is used.
     """
-    # A list, because the value may be unhashable.
+    # A list, because the typed value may be unhashable.
     if not isinstance(own, dict) or own.get("check") in list(_CHECKS):
         return own
     at: Location = ("criteria", i, "check")
@@ -213,7 +213,7 @@ def _with_check(own: Any, i: int, document: dict, complaints: list[_Complaint]) 
     complaints.append(_Complaint(at=at, what=f"{dotted(at, document)}: {what}", missing=missing))
     left = {key: value for key, value in own.items() if key not in meant}
     close = get_close_matches(str(typed), list(_CHECKS), n=1)
-    if not close:  # no check is similar: only the common keys can be checked
+    if not close:  # no known check is similar, so only the common keys can be checked
         left = {key: value for key, value in left.items() if key in _OF_CRITERIA}
     return {**left, "check": close[0] if close else "data"}
 

@@ -178,7 +178,7 @@ class Tiles:
     def __post_init__(self) -> None:
         most = _WIDE_TILES if self.longest > _LONG else _MOST_TILES
         rows = -(-len(self.tiles) // most)
-        # Rows of equal length.
+        # Make the rows equally long.
         object.__setattr__(self, "across", -(-len(self.tiles) // rows))
 
     @property

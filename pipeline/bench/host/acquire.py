@@ -191,7 +191,7 @@ class _Acquisition:
         unsafe = run.outcome.is_unsafe
         if run.file and (unsafe or self._buttons.pressed != "keep"):
             self._observer.remark(f"{run.file} is partial ({partial}); it is not in {NAME}")
-        if unsafe:  # another try would be just as unsafe
+        if unsafe:  # a second try would be just as unsafe
             self._failed[name] = _TRIES
             less = (
                 "divide its amplitude in plan.toml by four"
@@ -232,7 +232,8 @@ class _Acquisition:
         outcome = replace(run.outcome, partial="", remarks=(*run.outcome.remarks, remark))
         with signals_held():
             self._note(replace(run, outcome=outcome))
-            (self._folder / run.file).unlink()  # the kept file has the same lines
+            # The data file that was just written has the same lines.
+            (self._folder / run.file).unlink()
         self._observer.finished(outcome)
         return outcome
 
@@ -388,7 +389,7 @@ def _is_lost(line: SerialLine) -> bool:
         line.stop()
         line.clear()
     except Runaway:
-        raise  # opening the line again would start the bench again
+        raise  # opening the line again would allow new runs
     except HardwareError:
         return True
     return False

@@ -150,7 +150,7 @@ class Importer:
             return self._take(path, final=final)
         except OSError:
             if path.exists() and self._opens(path):
-                raise  # the cause is in the submission's folder
+                raise  # reading the file is not what failed: the submission's folder is
             self._over.discard(path)
             self._looks[path] = 0
             return None

@@ -203,8 +203,8 @@ def _list_commands(
     if gains is not None:
         if isinstance(gains, StateGains):
             _check_known("f", "state feedback", bench)
-        # If a byte of the gains is lost, the bench drops them. The zeros before then act, not the
-        # gains of an earlier run.
+        # If a byte of the gains is lost on the line, the bench drops them. It then uses the zeros
+        # sent before, not the gains of an earlier run.
         commands += [PidGains(kp=0.0, ki=0.0, kd=0.0), gains]
     if recording.wave == "chirp":
         _check_known("c", "chirp", bench)

@@ -70,7 +70,8 @@ class RawWriter:
         # Without a buffer, the system has the bytes when each write returns.
         self._bytes = path.open("xb", buffering=0)
         times = path.with_suffix(".times")
-        # The times of a deleted raw file; if it is a link, its target stays.
+        # If a deleted raw file has left its times, remove them. If they are a link, its target
+        # stays.
         times.unlink(missing_ok=True)
         self._times = times.open("xb", buffering=0)
         self._bytes.write(header.to_json().encode() + b"\n")

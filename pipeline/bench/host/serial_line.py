@@ -60,7 +60,7 @@ class SerialLine:
         self.resets = 0
         self._lock = threading.RLock()  # for the port, which `watched` also reads, in a thread
         self._in_run = False
-        self._is_cleared = False  # whether all arriving lines were sent after the last run
+        self._is_cleared = False  # whether all lines that arrive now were sent after the last run
         self._ear = _Ear()
         self._runaway: Runaway | None = None
 
@@ -222,7 +222,8 @@ class SerialLine:
             if data:
                 heard += data
                 quiet_at = now + _QUIET
-            # Checked after a look at the port, because this computer may pause.
+            # The time is from before the look at the port, because this computer may pause in
+            # between.
             if now > min(end, quiet_at):
                 return bytes(heard)
             time.sleep(_LOOK)
@@ -263,7 +264,8 @@ class SerialLine:
             if (answer := self._answer()) is None:
                 continue
             self._is_cleared = True
-            # Asked twice, because a changed digit of a scale would change every limit.
+            # The bench must describe itself twice, because one wrong digit of a scale would change
+            # every limit.
             if answer == before:
                 self._believe(answer)
                 return
@@ -302,7 +304,8 @@ class SerialLine:
             lines = [line for line in heard.split(b"\n")[:-1] if line.startswith(beginning)]
             if len(lines) > len(answers):
                 answers, end = lines, now + _ANSWER
-            # Compared with a time before the look at the port, because this computer may pause.
+            # The time is from before the look at the port, because this computer may pause in
+            # between.
             elif now > end:
                 break
             else:
@@ -316,7 +319,7 @@ class SerialLine:
         """Let a stock bench send lines for a moment, to count its encoders."""
         # A run of 0.1 s without motion makes a stock bench send lines.
         self.send(Start(wave=Wave.DELTA, frequency=1 / 0.1, amplitude=0))
-        self._in_run, self._is_cleared = False, True  # the motor must be off in this run too
+        self._in_run, self._is_cleared = False, True  # this is no run in which the motor may be on
         heard, end = b"", time.monotonic() + FIRST_LINE
         while not heard and time.monotonic() < end:
             time.sleep(_LOOK)

@@ -34,8 +34,11 @@ from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.plan_words import hold_words
 
 SILENCE = 0.5  # s without a byte during a run, after which the bench counts as gone
-_NEARLY = 100.0  # ms around the planned end: silence before it is the end, later lines are too many
-_STILL = 4  # counts by which a resting cart may flicker; in a valid run a free cart moves more
+# Ms around the planned end; silence that begins earlier is a fault, and so are lines that come
+# later.
+_NEARLY = 100.0
+# Counts; a resting cart may flicker by so many, and in a valid run a free cart moves more.
+_STILL = 4
 _LOOK = 0.003  # s between two looks at the port
 _AFTER_END = 0.02  # s within which the last lines arrive
 
@@ -82,15 +85,15 @@ class Session:
         self._observer = observer
         self._moving = max(carts, line.bench.carts) if line.bench.commands else carts
         self._period = 1e3 * line.bench.period
-        self._zeroed_at = -1  # number of resets of the line when the carts were zeroed at rest
+        self._zeroed_at = -1  # `resets` of the line when the carts were last zeroed at rest
         self._swings_out = False  # the last run moved a cart too far
-        self._free: tuple[int, ...] | None = None  # as a person was last asked to free them
+        self._free: tuple[int, ...] | None = None  # the carts that a person was last asked to free
         self._beat = float("-inf")
         self._latest_beat = 0.0  # s; the longest time without a heartbeat in this run
         self.wish: Wish | None = None
 
     def prepare(self, order: Order) -> str:
-        """Let the right carts be held and free, and wait until they rest; return a problem, or "".
+        """Have the right carts held and released, and wait until all rest; return a problem, or "".
 
         Raises
         ------
@@ -279,7 +282,8 @@ class Session:
             return
         self._line.send(Signal.RESET)
         self._line.drain()
-        self._beat = float("-inf")  # a reset turns the watchdog off
+        # A reset disarms the watchdog, so a heartbeat must follow at once.
+        self._beat = float("-inf")
         self._zeroed_at = self._line.resets
 
     def _by_hand(self) -> str:
@@ -328,7 +332,7 @@ class Session:
     def _start(self, commands: Sequence[Command]) -> None:
         if why := self._by_hand():
             raise HardwareError(why)
-        self._line.clear()  # no line of an earlier run may count for this one
+        self._line.clear()  # discard lines of an earlier run
         self._heartbeat()
         self._latest_beat = 0.0
         self._line.send(*commands)
@@ -359,7 +363,7 @@ class Session:
             try:
                 if always or self._line.knows("s"):
                     self._line.stop()
-            except KeyboardInterrupt:  # pressed twice; the bench is stopped first
+            except KeyboardInterrupt:  # pressed a second time: stop the bench first
                 self._line.stop()
                 raise
         except HardwareError as error:
@@ -382,7 +386,8 @@ class Session:
         end = 1e3 * seconds
         since = last = time.monotonic()
         first: int | None = None  # ms of the first line
-        unread: float | None = None  # time since the last valid line
+        # When lines stopped being valid, in s; None while they are valid.
+        unread: float | None = None
         while True:
             self._heartbeat()
             now = time.monotonic()
@@ -400,7 +405,7 @@ class Session:
                         return watch.stop("the bench went on past the end of the run")
                 else:
                     unread = now if unread is None else unread
-                    if now - unread > 0.25:  # s; the motor may be on without being watched
+                    if now - unread > 0.25:  # s; the motor may be on while nothing is checked
                         return watch.stop("the bench's lines cannot be read, so nothing is watched")
             if why := self._by_hand():  # after the limits, whose messages are more important
                 return why

@@ -14,9 +14,10 @@ from pipeline.bench.live.observer import Anomalies
 from pipeline.bench.protocol.messages import FULL_SCALE, Reading, parse_reading
 from pipeline.bench.protocol.stamps import StampFit, even_period, fit_stamps
 
-# An encoder is stuck if it moved in one window (ms) and stands still in the next, although the
-# motor drives as hard. Fewer duty counts than the second number move no cart. An encoder that never
-# moved is stuck if it is on the driven cart, or if its neighbour moves.
+# An encoder is stuck if it moved in one window (first number, in ms) and stands still in the next,
+# although the motor drives as hard. With less than the second number of duty counts, carts may
+# stand still. An encoder that never moved is stuck if its cart is driven, or if its neighbour
+# moves.
 _WINDOW, _DRIVEN = 1000, 8
 
 
@@ -56,12 +57,13 @@ class Stream:
         self._stamps = array("q")
         self._missing = _MissingSoFar(period)
         self._garbled = 0
-        self._garbled_lines = 0  # two lines that merged count once in `_garbled`, twice here
+        # Lines lost to garbling; two merged lines are one garbled line but two lost ones.
+        self._garbled_lines = 0
         self._late = 0
         self._resets = 0
         self.broken = ""
-        # Smallest difference between arrival and time stamp, in s: during the last second, and
-        # during this one.
+        # The smallest difference between arrival and time stamp, in s: of the last second, and of
+        # this one.
         self._lead, self._new_lead, self._lead_from = float("inf"), float("inf"), float("-inf")
         self._watch = _EncoderWatch(cart for cart in free if cart <= encoders)
 
@@ -181,8 +183,8 @@ class Stream:
         self._keep(held)
         if self.lines > 500:
             went_on = held.ms - self._stamps[-501]
-            # Half of the expected time could be another period; a quarter is a clock that stands
-            # still.
+            # If 500 lines take half of the expected time, the period may be another. If they take a
+            # quarter, the clock stands still.
             if went_on < 0.25 * 500 * self._expected:
                 self._break(f"the bench's clock stands still: 500 lines in {went_on} ms of it")
         return [held]
@@ -199,10 +201,11 @@ class Stream:
 
     def _time(self, reading: Reading, *, since: float, now: float) -> None:
         due = 1e-3 * reading.ms
-        if now - self._lead_from > 1.0:  # s; compare the two clocks again
+        if now - self._lead_from > 1.0:  # s; compare the clocks of bench and computer again
             self._lead, self._new_lead, self._lead_from = self._new_lead, now - due, now
         self._new_lead = min(self._new_lead, now - due)
-        # Lines more than 0.02 s later than the earliest ones were held back somewhere.
+        # A line is late if it comes more than 0.02 s later than the earliest lines of the last
+        # second.
         self._late += since - due > min(self._lead, self._new_lead) + 0.02
 
 
@@ -212,7 +215,7 @@ def _stands_out(before: Reading, held: Reading, after: Reading, *, closed: bool)
         return True
     if held.ms < before.ms:
         return True
-    # A cart that hits an end stop changes its count by at most this much per ms.
+    # A cart that hits an end stop moves by at most so many counts in a ms.
     room = 32 * max(1, after.ms - before.ms)
     signals = [*zip(before.counts, held.counts, after.counts, strict=True)]
     signals.append((before.target, held.target, after.target))
@@ -246,7 +249,8 @@ class _MissingSoFar:
             self._period, self._seen_even = even, True
         else:
             measured = span / count
-            near = abs(measured / self._expected - 1) < 0.005  # a clock may be wrong by this much
+            # Relative error of a clock that is still plausible.
+            near = abs(measured / self._expected - 1) < 0.005
             first = self._period == self._expected
             if near and not self._seen_even and (first or measured < self._period):
                 self._period = measured

@@ -44,7 +44,7 @@ class ShownSession(ABC):
         self.version = self.viewers = 0
         self._lock = threading.Lock()
         self._run = 0
-        # The points of the last 12 s; a page that comes later misses the earlier ones.
+        # The points of the last 12 s. A page that connects later does not get earlier ones.
         self._points: deque[Sequence[float]] = deque(maxlen=2400)
         self._end = 0  # points of this run, including those dropped
         self._counters: Mapping[str, int] = _count(0, Anomalies())
@@ -136,14 +136,16 @@ class LiveState(ShownSession):
         self._partial: dict[str, str] = {}
         self._now: Recording | None = None
         self._phase: Phase = "waiting"
-        self._instruction: tuple[int, str] | None = None  # number and text
+        # Number and text of the current instruction.
+        self._instruction: tuple[int, str] | None = None
         self._asked = 0
         self._stage = ""  # what is being computed
         self._thoughts = 0
         self._thought = ""
         self._remarks: deque[str] = deque(maxlen=20)
         self.version = 1
-        self._last_ms, self._lines = -_APART, 0  # of the current run
+        # In the current run: stamp of the last point, and number of lines.
+        self._last_ms, self._lines = -_APART, 0
 
     # ------------------------------------------------------------- by the acquisition
 

@@ -160,7 +160,8 @@ class _View:
         last, now = batch[-1], time.monotonic()
         self._ms, self._anomalies = last.ms, anomalies
         if len(self._traces) != len(last.counts):
-            self._traces = [deque(maxlen=60) for _ in last.counts]  # characters of a sparkline
+            # Width of a sparkline in characters.
+            self._traces = [deque(maxlen=60) for _ in last.counts]
         for trace, count in zip(self._traces, last.counts, strict=True):
             trace.append(count)
         self._arrived.append((now, len(batch)))

@@ -54,7 +54,7 @@ class CommandReader:
     def feed(self, data: bytes) -> list[Command]:
         """Return the commands that are now complete, in order."""
         *whole, rest = (self._rest + data.decode("latin-1")).split(";")
-        # A longer field is refused, so its beginning is not needed.
+        # if the field is longer, it is refused anyway
         self._rest = rest[-_LONGEST_FIELD - 1 :]
         return [command for field in whole for command in self._take(field.strip(" \t\r\n"))]
 

@@ -144,7 +144,7 @@ class Signal(StrEnum):
 
 Command: TypeAlias = Start | PidGains | StateGains | ChirpEnd | Tone | Hands | Signal
 
-# A bench without `s` is stopped by starting a run without motion and resetting it.
+# A stop for benches without `s`: start a run without motion, then reset.
 STOCK_STOP: tuple[Command, ...] = (Start(wave=Wave.DELTA, frequency=1.0, amplitude=0), Signal.RESET)
 
 
@@ -166,7 +166,7 @@ def encode(command: Command) -> bytes:
         case Hands(held=held, released=released):
             fields = ["h", str(sum(1 << (cart - 1) for cart in held)), str(released)]
         case Signal():
-            # The empty field ends a command that a lost byte left open. Stock benches have no stop.
+            # The empty field before `s` ends a command that a lost byte left open.
             fields = ["", "s"] if command is Signal.STOP else [command.value]
     return "".join(f"{field};" for field in fields).encode("ascii")
 
@@ -292,6 +292,7 @@ def parse_description(line: bytes) -> Description:
 def _scaled(text: str) -> tuple[float, str]:
     """Split text such as "0.00227cm" into number and unit."""
     digits = len(text.rstrip("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ/%"))
-    if not 0.0 < abs(number := float(text[:digits])) < math.inf:  # a limit cannot use it
+    # Such a number makes no useful limit.
+    if not 0.0 < abs(number := float(text[:digits])) < math.inf:
         raise ValueError(repr(text))
     return number, text[digits:]

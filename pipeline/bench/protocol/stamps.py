@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 Stamps = NDArray[np.int64]
 
-OTHER_PERIOD = 0.02  # share of a period; clocks that differ more have another period than stated
+OTHER_PERIOD = 0.02  # share of the stated period; a clock that differs more has another period
 _SLOW = 1.5  # ms; from this period on, every gap shows a lost line
-_MOST_ABSENT = 0.2  # share of the stamps; if more are missing, the clock is slower
-_CLOSEST_TEETH = 20  # stamps from skip to skip of a clock with 1.05 ms; no bench for 1 kHz is worse
+_MOST_ABSENT = 0.2  # share of the stamps; if more are missing, the clock is slower than 1 kHz
+# Stamps between skips of a clock with a period of 1.05 ms; no bench for 1 kHz is slower.
+_CLOSEST_TEETH = 20
 _TOOTH_SLACK = 1  # ms by which a tooth may be off, because stamps are rounded
 _FIRST_TEETH, _SECOND_TEETH = 60, 120  # missing stamps that are tried as first and as second tooth
 
@@ -61,14 +62,15 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
         return StampFit(period=period, missing=missing)
     usual = float(np.median(steps))
     if usual >= _SLOW:
-        # Rounding makes two sizes of gap usual.
+        # Rounding gives usual gaps of two sizes; average both.
         measured = float(steps[steps < usual + _SLOW].mean())
         lost = int((np.round(steps / measured) - 1).clip(min=0).sum())
         return StampFit(period=span / (n - 1 + lost), missing=lost)
     if span + 1 - np.unique(stamps).size > _MOST_ABSENT * span:  # or the clock has jumped
         if stated or period >= 1 / (1 - _MOST_ABSENT):
             return StampFit(period=period, missing=missing)
-        return StampFit(period=span / (n - 1), missing=0)  # not the expected bench
+        # This bench has another period than expected.
+        return StampFit(period=span / (n - 1), missing=0)
     if not 1.0 <= period < 1.0 + 1.0 / _CLOSEST_TEETH:
         return StampFit(period=period, missing=missing)
     seen = np.zeros(span + 1, dtype=np.bool_)
@@ -76,7 +78,7 @@ def fit_stamps(stamps: Stamps, *, period: float, stated: bool = False) -> StampF
     absent = np.flatnonzero(~seen).tolist()
     teeth = _comb(absent)
     chance = (1 + 2 * _TOOTH_SLACK) * len(absent) / span  # probability of a false tooth
-    # By chance, lost lines look like this comb less than once in a hundred runs.
+    # Such a comb forms by chance from lost lines in less than one of a hundred runs.
     if teeth and _FIRST_TEETH * _SECOND_TEETH * chance ** (len(teeth) - 2) < 0.01:
         spacing = (teeth[-1] - teeth[0]) / (len(teeth) - 1)
         return StampFit(period=spacing / (spacing - 1), missing=len(absent) - len(teeth))
@@ -98,7 +100,7 @@ def _other_period(stamps: Stamps, stated: float) -> StampFit | None:
 
     Only pieces without a lost line count; if many lines are lost, there are too few such pieces.
     """
-    long = 200  # lines in a piece; often one is missing if one line in a hundred is lost
+    long = 200  # lines in a piece; if one line in a hundred is lost, most pieces lack some
     pieces = [stamps[i : i + long + 1] for i in range(0, stamps.size - long, long)]
     even = [period for piece in pieces if (period := even_period(piece)) is not None]
     if len(even) < max(0.25 * len(pieces), 1):
@@ -124,8 +126,8 @@ def _comb(absent: Sequence[int]) -> list[int]:
     best: list[int] = []
     for i, first in enumerate(absent[:_FIRST_TEETH]):
         for second in absent[i + 1 : i + 1 + _SECOND_TEETH]:
-            # A comb with closer teeth rarely occurs by chance, because no tooth may be absent. So
-            # the most teeth win.
+            # No tooth may be absent, so a comb with close teeth is rarely found by chance. The comb
+            # with most teeth wins.
             teeth = _follow(first, second, there=there, last=absent[-1])
             best = max(best, teeth, key=len)
     return best

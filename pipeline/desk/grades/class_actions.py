@@ -103,7 +103,7 @@ def _store_upload(ask: Ask, name: str, path: Path) -> Path | None:
     sent = ask.form.get(name)
     if not isinstance(sent, UploadFile) or not sent.filename:
         return None
-    path.write_bytes(sent.file.read())  # small enough, because the size of requests is limited
+    path.write_bytes(sent.file.read())  # the limit on requests keeps it small
     return path
 
 

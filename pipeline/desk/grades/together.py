@@ -23,7 +23,7 @@ from pipeline.grading.words import WORDS, points_text
 from pipeline.words.numbers import count
 from pipeline.words.text import capital, with_symbols
 
-_SAME = "same"  # choice of points: unchanged, only a comment
+_SAME = "same"  # value of the choice to leave points unchanged and only comment
 _DONE = "together"  # part of a page where the result is reported
 
 

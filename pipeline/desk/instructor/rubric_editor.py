@@ -24,7 +24,7 @@ from pipeline.output import write_file
 from pipeline.resources import RUBRICS
 from pipeline.submission.edit import text_digest
 
-_NEW = "new"  # what a form states as the version of a file that does not exist yet
+_NEW = "new"  # version in a form whose file does not exist yet
 
 
 def show(ask: Ask) -> Response:

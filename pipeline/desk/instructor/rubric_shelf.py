@@ -14,7 +14,7 @@ from pipeline.resources import RUBRICS
 _MOST = 40  # files listed
 _LOOKED_AT = 2_000  # TOML files of a folder that are checked
 _MARK = "[[criteria]]"
-_START = 200_000  # characters of a file in which a key of rubrics must occur
+_START = 200_000  # a rubric has one of its keys within this many characters
 
 
 @dataclass(frozen=True, kw_only=True)

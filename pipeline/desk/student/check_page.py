@@ -22,8 +22,8 @@ from pipeline.submission import Submission
 def show(ask: Ask) -> Response:
     """Show the last answer, and what the student can ask next."""
     folder = ask.folder()
-    # The job is read before the answers. If a check ends in between, the page shows it as running
-    # and asks again. The other way round, the page would show it as ended, but with the earlier
+    # Read the job before the answers: if a check ends in between, the page shows it as running and
+    # asks again. In the other order, the page would say that it has ended but show the earlier
     # answers.
     job = ask.desk.jobs.of(folder)
     busy = job is not None and not job.over

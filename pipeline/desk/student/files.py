@@ -28,8 +28,8 @@ from pipeline.submission.load import (
 )
 from pipeline.submission.toml_file import decoded, parse_toml
 
-# Text files that an uploaded zip may contain, and their largest size in bytes. An existing valid
-# one is not overwritten.
+# Text files that an uploaded zip may contain, with their largest size in bytes. They do not
+# overwrite an existing valid file.
 _TEXTS = {NAME: MAX_TOML_BYTES, "notes.md": MAX_NOTES_BYTES}
 _ASIDE = "set-aside"  # folder for recordings that are not part of the submission
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-State = Literal["done", "needs", "old", "none"]  # as the page shows them; none means not yet
+State = Literal["done", "needs", "old", "none"]  # as the page shows them; "none" means not yet
 Stands = tuple[State, str]  # a state, and the word shown for it
 
 

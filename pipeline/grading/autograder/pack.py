@@ -47,7 +47,7 @@ def write_autograder(rubric_file: Path, out: Path) -> tuple[str, ...]:
         for name, content in sorted(_files(text, rubric)):
             info = zipfile.ZipInfo(name, _FIXED_TIME)
             info.external_attr = _PROGRAM if (_SCRIPTS / name).is_file() else _FILE
-            info.create_system = 3  # 3 is Unix; the file modes are those of Unix
+            info.create_system = 3  # Unix, so that the file modes above apply
             archive.writestr(info, content, zipfile.ZIP_DEFLATED)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_file(out, buffer.getvalue())
@@ -60,7 +60,7 @@ def _files(text: str, rubric: Rubric) -> Iterator[tuple[str, bytes]]:
         yield (
             script.name,
             script.read_bytes().replace(b"\r\n", b"\n"),
-        )  # without \r, which bash refuses
+        )  # bash refuses line ends with \r
     yield "python-version", f"{sys.version_info.major}.{sys.version_info.minor}\n".encode()
     head = f"# cartlab {pipeline.__version__} was installed with:"
     yield "requirements.txt", "\n".join([head, *pin_requirements(), ""]).encode()

@@ -14,7 +14,7 @@ from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.output import write_file
 
-_TIME_LIMIT = 420.0  # s; Gradescope stops after 600, which include the start of the container
+_TIME_LIMIT = 420.0  # s; Gradescope stops after 600 s, including the start of the container
 
 
 def grade_upload(root: Path) -> str:

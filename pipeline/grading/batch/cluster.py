@@ -22,7 +22,7 @@ from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import packed, unpacked
 
 _CONNECT_LIMIT = 20  # s
-_AHEAD = 2  # tasks per thread of the cluster: threads never wait, and memory stays small
+_AHEAD = 2  # tasks sent ahead for each thread: threads never wait, and memory use stays small
 _LOOPBACK = ("localhost", "127.0.0.1", "::1")
 
 

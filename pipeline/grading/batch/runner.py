@@ -251,7 +251,8 @@ def _shared(
     """
     batch = [row for row in rows if row.fingerprints]
     names = {prints.submission: prints for prints in batch}
-    # A team may rename its submission, which is then no copy.
+    # Earlier gradings of the same data by the same team under another name are left out: a team may
+    # rename its submission.
     here = {(prints.authors, prints.fingerprints) for prints in batch}
     earlier = [
         prints

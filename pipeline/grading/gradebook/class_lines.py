@@ -5,7 +5,7 @@ from functools import cached_property
 from math import nan
 from typing import TYPE_CHECKING
 
-from typing_extensions import TypedDict  # pydantic cannot use the standard one before Python 3.12
+from typing_extensions import TypedDict  # before Python 3.12, pydantic needs this version
 
 from pipeline.grading.grade import CODES, Code, Grade, GradeOverride, GradeTable, Outcome
 from pipeline.grading.rubric import Rubric

@@ -177,7 +177,7 @@ def _with_comment(criterion: Criterion, why: str) -> Criterion:
 
 
 def _by_hand(criterion: Criterion, points: float, *, why: str) -> Criterion:
-    points = min(points, criterion.out_of)  # was perhaps more then
+    points = min(points, criterion.out_of)  # the criterion may have been worth more
     if points == criterion.points:
         return _with_comment(criterion, why)
     changed = {

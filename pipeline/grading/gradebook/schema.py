@@ -151,7 +151,8 @@ figures = Table(
     Column("svg", Deflated, nullable=False),
 )
 
-# The results of a grading's checks. With them, points by a changed rubric need no new grading.
+# The results of a grading's checks. With them, points under a changed rubric are computed without
+# grading again.
 findings = Table(
     "findings",
     metadata,

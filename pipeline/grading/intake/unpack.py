@@ -22,15 +22,17 @@ from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
 _RATIO_FROM = 1_000_000  # bytes; the ratio of smaller files is not limited
-# Bytes at the end of a zip file that may hold its end record and a comment; read at once.
+# Bytes at the end of a zip file that can contain its end record and a comment. They are read at
+# once.
 _END_OF_ZIP = 66_000
-# The end record of a zip file gives the place of the table of contents at this offset (4.3.16). The
-# second number means that a 64-bit record gives it instead.
+# The end record of a zip file (section 4.3.16) has the place of the table of contents at the first
+# of these offsets. If it has the second number instead, a 64-bit record gives the place.
 _PLACE, _ELSEWHERE = 16, 0xFFFFFFFF
 DEEPEST = 40  # nested folders; a submission needs three
 _AGAIN = ": send or download it once more"
 _UTF8_NAME, _ENCRYPTED = 0x800, 0x1
-# The local header precedes each member (APPNOTE.TXT 4.3.7); the group is the length of its name.
+# Each file in an archive begins with a header (APPNOTE.TXT 4.3.7). The group in the pattern is the
+# length of its name.
 _HEAD = 30  # bytes
 _MEMBER = re.compile(rb"PK\x03\x04.{22}(..)..", re.DOTALL)
 
@@ -123,7 +125,7 @@ def member_names(archive: Path, *, limits: UnpackLimits = HAND_IN) -> list[PureP
     ------
     OSError : this computer cannot read the archive now.
     """
-    if not archive.is_file():  # a pipe would block when read
+    if not archive.is_file():  # reading a pipe would block
         return []
     try:
         with _opened(archive, limits=limits) as opened:
@@ -191,7 +193,8 @@ def _why(error: Exception) -> str:
         said = getattr(error, "strerror", None) or _line(error)
         return f"cannot be unpacked ({said})"
     said = _line(error)
-    more = "" if said == "File is not a zip file" else f" ({said})"  # the same in other words
+    # Details in brackets would only repeat this error.
+    more = "" if said == "File is not a zip file" else f" ({said})"
     return f"not a complete zip archive{more}"
 
 
@@ -208,7 +211,8 @@ class _Bounded(io.BufferedReader):
     def read(self, size: int | None = -1, /) -> bytes:
         if size is not None and size > self._most:
             raise _TooLarge(f"a table of contents of {size:,} bytes")
-        return super().read(size)  # -1 reads the end of the file with its comment
+        # `zipfile` asks for -1 bytes to read the end of the file with its comment.
+        return super().read(size)
 
 
 @contextmanager

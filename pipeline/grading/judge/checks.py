@@ -25,7 +25,7 @@ from pipeline.grading.words import WORDS
 from pipeline.names import read_name
 from pipeline.words.numbers import first_few
 
-_NAMED = 4  # most numbers or laws that one message names
+_NAMED = 4  # largest number of parameters or laws in one message
 
 
 def judge(criterion: asked.Criterion, work: Work) -> Verdict:

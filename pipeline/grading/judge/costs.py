@@ -12,8 +12,8 @@ from pipeline.grading.references.tolerance import exact
 from pipeline.grading.rubric import Rubric, matching
 from pipeline.grading.words import WORDS
 
-# The check that each flag concerns. A flag of parameters concerns the check of its table, which its
-# evidence names.
+# The check that each flag concerns. Flags that are not listed concern the check of a parameter
+# table; their evidence names the table.
 _ABOUT: Mapping[Code, str] = {
     "initial_final_disagree": "initial_final",
     "wrong_state_space": "state_space",
@@ -22,7 +22,7 @@ _ABOUT: Mapping[Code, str] = {
     "missing": "required",
     "data_problem": "data",
 }
-_REDUCED = "data"  # check of recordings; it includes a table that students reduced themselves
+_REDUCED = "data"  # the check of recordings, which includes tables that students reduced themselves
 
 
 def charge(

@@ -21,7 +21,7 @@ from pipeline.names import parameter_names, read_name
 from pipeline.plant.linear.laws import orders
 from pipeline.plant.linear.recovery import recover_from_parameters
 
-MOST_WIDENING = 4  # tolerances; a law that fails even in a box this wide is broken
+MOST_WIDENING = 4  # tolerances; a law that fails even in a box widened by so many is broken
 _PER_TOLERANCE = 2  # steps in which the box is widened by one tolerance
 _REDUNDANT = (2, 3)  # numbers of carts whose parameters are redundant
 

@@ -308,7 +308,7 @@ def _count(name: str, analysis: Analysis) -> float:
     cart = read_name(name).cart or 1
     steps = [r.encoder_step(cart) for r in analysis.records if cart in r.carts and cart in r.free]
     step = float(np.median(steps)) if steps else 0.0
-    return 0.0 if step == 1.0 else step  # positions are in counts
+    return 0.0 if step == 1.0 else step  # a step of exactly 1 means that positions are in counts
 
 
 def _in_counts(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:

@@ -14,8 +14,8 @@ from pipeline.grading.references.tolerance import Typed
 from pipeline.names import read_name
 
 _SLIP, _KNOWN_SLIP = math.log(limits.ONE_IN_OFF), math.log(limits.ONE_IN_KNOWN)
-# With little damping a step peaks at twice its level, so this mistake and peak-to-peak give the
-# same number. For a first estimate, the sentence about the peak of the step is true in both cases.
+# With little damping, a step peaks at twice its level. So reading the peak and reading peak to peak
+# give the same number. In a first estimate, the sentence about the peak is true in both cases.
 _TRUE_ANYWAY: Code = "peak_for_steady_state"
 
 Table = Mapping[str, Decimal]
@@ -93,7 +93,7 @@ def explain(
             for c in covers
             if not best.codes <= c.codes
             and best.explained & c.explained
-            # E-folds; a mistake less likely than this is no rival.
+            # In e-folds: a mistake that is less likely than this is no rival.
             and score[id(c)] > score[id(best)] - 2
         ]
         rival = None
@@ -102,7 +102,7 @@ def explain(
         less = [c for c in rivals if c.codes <= shared]
         if rivals and len(supported) == 1:
             best, rivals = supported[0], []
-        elif less:  # one mistake is certain, the other is not
+        elif less:  # one of two combined mistakes is certain, the other is not
             best, rivals = less[0], []
         if rivals and label == "initial":
             true = [c for c in (best, *rivals) if _TRUE_ANYWAY in c.codes]
@@ -238,8 +238,8 @@ def _score(
     for mistake, names in reversed(cover.fits):
         touched = [n for n in mistake.predicted if n in table] if mistake.whole else names
         predicted |= {n: mistake.predicted[n] for n in touched}
-    # A wrong number without explanation is unlikely, unless a mistake of the whole table explains
-    # it.
+    # A wrong number that no mistake explains is unlikely, except beside a mistake of the whole
+    # table.
     wide = any(m.table_wide for m, _ in cover.fits)
     unexplained = -math.log(limits.ANYWHERE) - (0.0 if wide else _SLIP)
     told = sum(
@@ -272,7 +272,7 @@ def _log_density(typed: Typed, reference: Reference, name: str) -> float:
         usual = limits.USUAL_DAMPING
     elif read.is_by_eye:
         usual = limits.USUAL_BY_EYE
-    # The student's intermediate results probably had the same number of digits.
+    # The student's intermediate result probably had as many digits.
     digits = 10.0 ** (1 - typed.digits) / 4
     usual = math.hypot(usual, digits, reference.std / reference.value)
     outside = max(math.log(low / value), math.log(value / high)) - half

@@ -20,8 +20,8 @@ Of = Literal[
     "all frequencies",  # including those with wide bounds
     "gains",
     "sharp gains",  # those not made uncertain by friction
-    "dampings",  # of all decays together
-    "sharp dampings",  # one at a time, without friction
+    "dampings",  # of all decays at once
+    "sharp dampings",  # of one decay at a time, without friction
     "frequencies of rows",  # of a table that the students reduced themselves, compared with dwells
     "ratios of rows",
     "fitted gains",  # from a fit to such a table, compared with steps and decays
@@ -84,7 +84,7 @@ def _reduced(code: Code, said: str, factor: float, *, of: Of) -> Factor:
 
 FACTORS = (
     _frequency("hertz", 1 / TURN),
-    # Needs a second number, which may be precise.
+    # Needs a second number, which may be one with close bounds.
     _frequency("hertz", 1 / TURN, of="all frequencies", least=2),
     _frequency("hertz_twice", TURN),
     # A team that reads peak to peak does so for every cart. For one cart alone, only a precise
@@ -102,7 +102,8 @@ FACTORS = (
         whole=True,
         from_time_records=True,
     ),
-    # Only the decrement is wrong, and there is no friction: taken over half a period, or over two.
+    # A decrement over half a period, or over two. It must be the only wrong number, without
+    # friction.
     _decrement("half_decrement", 0.5),
     _decrement("twice_decrement", 2.0),
     # A column with the heading Hz contains rad/s, or vice versa.

@@ -10,7 +10,7 @@ from pipeline.plant.linear import step_response
 from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import discretise
 
-_SAMPLE_TIME = 0.00884  # s; default: that of the ECP controller
+_SAMPLE_TIME = 0.00884  # s; the ECP controller's, used if the design states none
 _HORIZON = 6.0  # simulated time, as a multiple of the required settling time
 _MOST_SAMPLES = 60_000
 _BLOWN_UP = 1e6  # a response this many times the reference counts as diverged
@@ -57,7 +57,8 @@ def loop_numbers(
         poles = np.asarray(np.log(z) / T, dtype=np.complex128)
         stable = bool(np.abs(z).max() < 1)
         samples = int(_HORIZON * settling / T) + 2
-        stride = math.ceil(samples / _MOST_SAMPLES)  # fast controllers: only every so many samples
+        # Fast controllers need only every `stride`-th sample.
+        stride = math.ceil(samples / _MOST_SAMPLES)
         count = math.ceil(samples / stride)
         y = _step(*_together(loop, gamma / static[row], stride), row=row, count=count)
     overshoot, settles = np.inf, np.nan

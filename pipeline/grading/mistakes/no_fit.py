@@ -31,7 +31,7 @@ def copied_final(reported: Reported, *, references: References) -> list[str]:
     chance = 1.0
     for name in same:
         chance *= _coincidence(reported.final[name], references.final.get(name), name)
-    return same if chance < 3e-3 else []  # a fit reproduces so many numbers only rarely
+    return same if chance < 3e-3 else []  # a fit reproduces so many numbers only by rare chance
 
 
 def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> float:
@@ -55,7 +55,8 @@ def _coincidence(typed: Decimal, reference: Reference | None, name: str) -> floa
             if off == 0:
                 return 1.0
         measured = not damping and not read_name(name).is_by_eye
-        # A larger error shows a mistake, which may be in both tables. A poor fit has a smaller one.
+        # A larger error points to a mistake, perhaps the same one in both tables, not to a poor
+        # fit.
         if not measured or off <= 0.2:
             surprise = min(0.5 * (off / apart) ** 2, 3.0)
     # A difference of two normal errors has the density 1/√(4π) at zero.

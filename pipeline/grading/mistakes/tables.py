@@ -198,7 +198,8 @@ def _judge(
         mistakes = [m for m in mistakes if _may_be_final(m, reported)]
         if len(suspect) >= min(2, analysis.bench.n):
             mistakes += transient_fits(analysis, table, known)
-    if any(law.is_of_gains for law in laws):  # an obvious contradiction comes before a guess
+    # An obvious contradiction is reported rather than a guess.
+    if any(law.is_of_gains for law in laws):
         mistakes = [m for m in mistakes if m.whole or not _is_of_gains(m)]
     return _Judged(
         label=label,

@@ -18,7 +18,8 @@ KEY_FILE = "anonymous-key.csv"
 _PREFIX = "anon-"
 _SHORTEST = 6  # characters: rarely too few, even for a thousand submissions
 STRANGER = "another submission"
-_ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)  # at the beginning of a reason
+# Name of an archive at the beginning of a reason.
+_ARCHIVE = re.compile(r"^.*?\.zip\W?: ", re.IGNORECASE)
 
 
 def pseudonyms(first_keys: Mapping[str, str]) -> dict[str, str]:

@@ -274,7 +274,7 @@ def _called(name: str) -> str:
 def _unit(name: str, units: Units | None) -> str:
     """Return the unit of a parameter, the prefilter, or an entry of A or B; "" without a unit."""
     if entry := _ENTRY.fullmatch(name):
-        if int(entry[2]) % 2:  # row for a position's derivative, whose entries are 0 or 1
+        if int(entry[2]) % 2:  # a row for the derivative of a position: its entries are 0 or 1
             return ""
         if entry[1] == "A":
             return "1/s" if int(entry[3]) % 2 == 0 else "1/s²"
@@ -290,7 +290,7 @@ def _value(name: str, value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, Real):
         number = round(float(value), _FINEST) if name.endswith(_SHARE) else float(value)
-        # Numbers have four digits. A number that was typed with fewer is shown as typed.
+        # Numbers are rounded to four digits; one that was typed with fewer is shown as typed.
         return min(significant(number), typeset(f"{number:.6g}"), key=len)
     return clean(value)[:200] if isinstance(value, str) else NOTHING
 

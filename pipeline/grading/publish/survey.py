@@ -131,7 +131,7 @@ def _read(
 
 
 def _average(scores: "pd.Series") -> float:
-    # Whole numbers round 2.125 up to 2.13; its binary value might not.
+    # In whole numbers, 2.125 is rounded up to 2.13; as a float it might be rounded down.
     return int(200 * scores.sum() + len(scores)) // (2 * len(scores)) / 100 if len(scores) else nan
 
 

@@ -250,9 +250,9 @@ def _final(
             spread = limits.READ_BY_EYE if row.initial.source == "frequency_response" else 1.0
             measured += [row.initial.value / spread, row.initial.value * spread]
     told = fitted is not None and not (read_name(row.name).is_damping and _undamped(analysis))
-    # Dampings from decays count in any case, because they depend on no unit, sign or clock. Dry
-    # friction adds to dampings, more in dwells than in decays, and with few dwells the fit explains
-    # them anyway.
+    # Readings that disagree with the fit are left out, except dampings: they depend on no unit,
+    # sign or clock. Dry friction adds to dampings, more in dwells than in decays, and a fit to few
+    # dwells looks good in spite of it.
     if fitted and told and not read_name(row.name).is_damping and is_explained(analysis):
         measured = [value for value in measured if _agrees(value, fitted)]
     read = row.initial.source if row.initial and not read_off else "log_decrement"

@@ -17,20 +17,21 @@ from scipy.fft import next_fast_len
 
 from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
 
-LEAST_OVERLAP = 80  # samples with noise in both recordings
+LEAST_OVERLAP = 80  # smallest number of samples in which both recordings have noise
 LEAST_SLOPE = 0.5
 _LEAST_SIGMAS = 4.5
 _SPREAD = 2.5  # standard deviations by which the slope of a copy may differ from one
-# Samples needed for each recording of others that is used to explain a recording.
+# Each recording that is used to explain another one needs this many samples.
 _SAMPLES_EACH = 10
-_RIDGE = 1e-6  # share of a recording's power; needed if the others are copies of each other
+# Share of a recording's power; without it, copies among the others would make this singular.
+_RIDGE = 1e-6
 _LEAST_PART = 1e-9  # share of a recording's power that the others must leave unexplained
 # Smallest noise from which the scale between two recordings is estimated.
 _LEAST_NOISE = 0.5 * STEPS_PER_SIGMA
 # Residuals are stored as whole steps, so each may be wrong by half a step.
 _SAME_STEPS, _SAME_PART = 1.0, 0.003
 _EQUAL_PART = 0.5  # share of the shorter recording that must be equal
-_DIFFERENT_STEPS = 4  # encoder steps between readings that count as different
+_DIFFERENT_STEPS = 4  # encoder steps; readings closer than this count as equal
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -24,7 +24,8 @@ PASSED = 0.6  # share of the band
 _TAPS, _WINDOW = 41, 7.0
 MARGIN = _TAPS // 2  # samples lost at each end of a recording
 
-STEPS_PER_SIGMA = 100.0  # fine enough to keep a sensor's noise next to much larger knocks
+# Fine enough to keep a sensor's noise in a recording with much larger knocks.
+STEPS_PER_SIGMA = 100.0
 _STORED = np.dtype("<i2")
 _MOST_STEPS = np.iinfo(_STORED).max
 # Standard deviations; a larger residual is a sudden change of the motion (a step, a stop), not
@@ -41,8 +42,9 @@ _MOST_ANCHORS = 12  # anchors from the motion of one recording
 _NOISE_ANCHORS, _APART = 12, 5
 _FEWEST_SAMPLES = 60
 _EVERY = 8  # the motion is stored at every 8th sample
-_MOST_SAMPLES = 8192  # of one recording; more samples do not make the comparison surer
-_MOST_VALUES = 2_000_000  # of one submission: sixty recordings of four carts with this many samples
+_MOST_SAMPLES = 8192  # samples stored of one recording; more do not make the comparison surer
+# Largest number of values stored for a submission: sixty recordings of four carts.
+_MOST_VALUES = 2_000_000
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -32,29 +32,32 @@ _WIDTH = 512  # samples around an anchor that the first comparison uses
 _BEFORE = 128  # those of them that precede the anchor
 # The best anchors of each recording, with which all others are compared.
 _FIRST_IN_MOTION, _FIRST_IN_NOISE = 2, 1
-# Levels of noise in the first comparison; finer ones would show rounding.
+# Levels into which noise is rounded in the first comparison; finer levels would show rounding.
 _PER_SIGMA, _LEVELS = 1.5, 5.0
 _BLOCK = 2048  # anchors compared in one matrix product
 _WORTH_A_LOOK = 3.2  # sigmas in the first comparison; chance reaches this once in a thousand
 # These limits let the further work grow with the number of recordings, not with its square. With
 # 4,000 recordings of one kind, chance gives this many candidates. Two honest teams with 20
 # recordings each need a tenth of the limit on comparisons.
-_MOST_ALIKE = 16  # candidates per anchor, most similar first; the lab's own recordings are added
-_MOST_COMPARED = 10  # times the number of recordings of one kind in two submissions
-_COUNTS = 4.5  # sigmas of a recording that counts together with others
-# Sigmas of one that counts alone; chance reaches 6.1 in 1e9 comparisons, a class of 200.
+# Most similar candidates kept for each anchor; recordings of the lab are kept in addition.
+_MOST_ALIKE = 16
+_MOST_COMPARED = 10  # comparisons of two submissions, as a multiple of their recordings of one kind
+_COUNTS = 4.5  # sigmas that a recording needs to count together with others
+# Sigmas that a single recording needs. In a class of 200 (1e9 comparisons) chance reaches 6.1.
 _ALONE = 6.5
-_TOGETHER = 7.5  # sigmas of several: the root of their summed squares
+# Sigmas that several recordings need together: the root of the sum of their squares.
+_TOGETHER = 7.5
 # Suppose two honest runs have the same motion and encoder zero, and noise of 1/25 count. Then one
 # reading in 22 is rounded differently, so 22 equal readings have a probability of 1/e.
 _TO_A_ROUNDING = 22
 _MOST_ALIGNED = 60  # recordings of other teams that are aligned
 _MOST_OTHERS = 24  # aligned recordings that are used to explain a recording
 _FEWEST_TEAMS = 3  # teams from which these recordings must come
-# Share of the other teams that is left out, the most similar; they may have the same copy.
+# Share of the other teams that is left out. They are the most similar; they may have the same copy.
 _COPIES = 1 / 3
-_MOST_IN_PART = 1  # tolerated pairs with partly equal noise: two knocks may coincide once
-_MATCHES_TO_IN_PART = 10  # tolerated is also one such pair for each 10 pairs with fully equal noise
+_MOST_IN_PART = 1  # pairs with partly equal noise that are tolerated: two knocks may coincide once
+# For each 10 pairs with fully equal noise, one more pair with partly equal noise is tolerated.
+_MATCHES_TO_IN_PART = 10
 
 
 @dataclass(frozen=True, kw_only=True)

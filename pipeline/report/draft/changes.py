@@ -73,7 +73,7 @@ class Change:
         if self.before is None or self.after is None:
             return self.before is not self.after
         old, new = self.before.value, self.after.value
-        # The file has ten digits, and two processors agree to this share of a number.
+        # Numbers in the file have ten digits. Two computers may differ by this share of a number.
         return abs(new - old) > 1e-8 * max(abs(old), abs(new))
 
 
@@ -221,7 +221,7 @@ def _number_row(change: Change) -> list[Cell]:
         cell(change.what, "quiet"),
         cell(unit_text(clean(known.unit if known else "")) or "1"),
         *(cell(with_error(n.value, n.std) if n else NOTHING) for n in drafts),
-        # A change of less than one standard error is shown as no change.
+        # A change of less than one standard error is shown in a quiet colour.
         cell(_moved(change), "quiet" if sigmas is not None and abs(sigmas) < 1.0 else ""),
     ]
 

@@ -261,7 +261,7 @@ def spectrum_figure(traces: Sequence[Trace], *, position_unit: str, added: str =
             pooled[i] += np.abs(spectrum / window.sum()) ** 2
     motion, before, after = np.sqrt(pooled)
     total = np.cumsum(motion**2)
-    # Up to 1.5 times the frequency below which nearly all of the motion lies.
+    # Show frequencies up to 1.5 times the one below which nearly all of the motion lies.
     end = 1.5 * f[np.searchsorted(total, 0.995 * total[-1])]
     shown = (f > 0) & (f <= max(end, 8 * f[1]))
     step = max(1, int(np.count_nonzero(shown) / 600))

@@ -162,7 +162,7 @@ def reported_decay_figure(
     figure = decay_figure([decay], records=[record], position_unit=position_unit)
     (ax,) = figure.axes
     omega, zeta = reported
-    # A factor of ten leaves room for hertz and rad/s confused either way.
+    # Draw it even if hertz and rad/s were confused, which is a factor of 6.3.
     if 0 <= zeta < 1 and 0 < omega < 10.0 * decay.omega_n:
         t = np.linspace(decay.peak_t[0], decay.fit_t[-1], 2000)
         rest = (decay.envelope_upper[-1] + decay.envelope_lower[-1]) / 2

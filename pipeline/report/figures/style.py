@@ -25,7 +25,7 @@ from pipeline.words.text import clean
 
 WIDTH = 5.2  # inches: as wide as the text of a page, three quarters of this on a phone
 MEASURED = "#222222"
-MODEL = "#0072b2"  # blue and vermillion of Okabe and Ito, which also differ in grey
+MODEL = "#0072b2"  # the blue and vermillion of Okabe and Ito; they also differ in grey
 SECOND = "#d55e00"
 THIRD = "#009e73"
 QUIET = "#8a8a8a"
@@ -43,7 +43,7 @@ SECOND_LINE: Look = {"color": SECOND, "ls": "--", "lw": 1.0}
 
 _LIFT = 0.22  # inches from the titles of panels to a legend above
 _STYLE: dict[Any, Any] = {
-    "font.family": ["DejaVu Sans"],  # part of matplotlib, so the PDF has it too
+    "font.family": ["DejaVu Sans"],  # this font comes with matplotlib, so the PDF has it too
     "font.size": 8.5,
     "axes.titlesize": 8.5,
     "axes.labelsize": 8.5,
@@ -54,7 +54,7 @@ _STYLE: dict[Any, Any] = {
     "axes.linewidth": 0.7,
     "axes.edgecolor": "#444444",
     "lines.linewidth": 1.2,
-    "text.parse_math": False,  # a dollar sign in a student's text is no formula
+    "text.parse_math": False,  # a dollar sign in a student's text does not begin a formula
     "svg.fonttype": "none",
     "figure.facecolor": "none",
     "savefig.facecolor": "none",
@@ -129,7 +129,7 @@ def small_multiples(
     figure, axes = panels(*[height] * rows, columns=columns, share_y=share_y, titled=True)
     for spare in axes[len(titles) :]:
         figure.delaxes(spare)
-    # 60 characters fill the whole width.
+    # The titles of a row together have room for 60 characters.
     for ax, title in zip(axes, _short(titles, most=60 // columns), strict=False):
         ax.set_title(title, loc="left", y=1.0)
     return figure, axes[: len(titles)]

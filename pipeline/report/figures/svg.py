@@ -17,7 +17,7 @@ from pipeline.arrays import Array
 from pipeline.report.figures.ticks import TAGS, draw_ticks
 
 _POINTS = 72.0  # units of the drawing per inch
-_SAME = 1e-6  # of the size of the figure
+_SAME = 1e-6  # share of the size of the figure; closer positions are equal
 
 # Ids that matplotlib gives to groups. Nothing refers to them, and on a page they would not be
 # unique.
@@ -111,7 +111,7 @@ def packed_time(values: Array) -> str:
     if values.size < 2:
         return _packed(values)
     even = np.linspace(values[0], values[-1], values.size)
-    # A sample that is off by less than this share of the span looks evenly spaced.
+    # A sample that deviates by less than this share of the span still looks evenly spaced.
     if np.max(np.abs(values - even)) > 1e-5 * abs(even[-1] - even[0]):
         return _packed(values)
     return f"{float(values[0]):.9g} {float(values[-1]):.9g}"

@@ -102,7 +102,8 @@ def tick_labels(ticks: Array) -> list[str]:
         return []
     step = np.min(np.diff(ticks)) if ticks.size > 1 else abs(ticks[0]) or 1.0
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
-    if decimals > 4 or np.abs(ticks).max() >= 1e6:  # powers of ten are clearer then
+    # Numbers like these are clearer as powers of ten.
+    if decimals > 4 or np.abs(ticks).max() >= 1e6:
         texts = [f"{tick + 0.0:.3g}" for tick in ticks]
     elif decimals and np.ptp(np.diff(ticks)) > 0.5 * step:  # ticks of a logarithmic axis
         texts = [f"{tick:g}" for tick in ticks]

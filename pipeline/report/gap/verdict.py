@@ -79,8 +79,8 @@ def scope_blocks(gap: Gap, *, position: str, drive: str) -> list[Block]:
     """Return what a sufficient linear model covers, and how large a hidden effect could be."""
     repeats = AS_REPEATS * (gap.repeatability or 0.0)
     noise = float(np.sqrt(AT_FLOOR)) * gap.noise_floor
-    # A search begins above both. The square of a hidden effect's error adds to the square of the
-    # noise.
+    # The search for effects begins only when the error exceeds both. Errors of noise and of a
+    # hidden effect add as squares.
     hidden = float(np.sqrt(max(noise, repeats) ** 2 - gap.noise_floor**2))
     lost = WORDS.text("lost_in_repeats" if repeats > noise else "lost_in_noise")
     blocks: list[Block] = [
@@ -227,7 +227,7 @@ def contenders(gap: Gap) -> tuple[FoundEffect, Rival | None]:
         (rival.confidence, i, found, rival)
         for i, found in enumerate(gap.effects)
         for rival in found.rivals
-        if rival.nrmse_after <= 1.15 * gap.final  # as good as the chosen one
+        if rival.nrmse_after <= 1.15 * gap.final  # nearly as good as the chosen one
         and rival.effect.grows_from != found.effect.key
     ]
     if not close:
@@ -269,7 +269,7 @@ def _sizes_there(found: FoundEffect, *, several: bool) -> str:
 
 def _size(value: NamedValue) -> str:
     unit = unit_text(clean(value.unit))
-    # A smaller error is only in the table.
+    # The text leaves out a very small standard error, which is in the table.
     exact = value.std is not None and value.std < 1e-3 * abs(value.value)
     text = significant(value.value) if exact else with_error(value.value, value.std)
     return text + (f" {unit}" if unit else "")

@@ -15,7 +15,8 @@ from pipeline.report.plots.spectrum import amplitude_spectrum, thin_lines
 from pipeline.words.text import clean
 
 MOST_WHOLE = 4_000  # samples of a run that is shown completely
-# Stretches of a longer run; each keeps its ends and the extremes of every signal.
+# A longer run is divided into so many stretches; each keeps its ends and the extremes of its
+# signals.
 _STRETCHES = 1_000
 _LEVELS = 65_534  # levels of a number; the one below them all marks a missing number
 _SMALLEST = 1e-12  # share of the largest amplitude

@@ -8,7 +8,7 @@ keeping a broken table whole. The version with less white space is used.
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-_GAP = 28.0  # points between the end of a block and the next block, such as a heading
+_GAP = 28.0  # points between the end of a block and a block that follows it
 _WHITE = 0.3  # share of a page; less white space is accepted
 _LEAST = 0.75  # smallest scale of a figure; its labels are then still 6 points high
 _MOST_TRIES = 8  # layouts tried; each takes a quarter of the time of the first one

@@ -41,7 +41,7 @@ _LAST = ("fit_explains_data", "step", "decay")
 _AT_THE_TOP = ("input_sign", "position_unit", "input_unit")  # problems that make every number wrong
 # The summary already shows the messages of these groups.
 _TOLD_ELSEWHERE = (*_AT_THE_TOP, "fit_identified")
-_ALIKE = ("initial_final", "step", "decay")  # for these, one message represents all
+_ALIKE = ("initial_final", "step", "decay")  # of these groups, one message represents all
 
 
 def next_steps(analysis: Analysis) -> Items:
@@ -145,7 +145,8 @@ def _advice(analysis: Analysis) -> Iterator[Spans]:
     to_run = design is not None and not any(r.kind == "closed_loop" for r in analysis.records)
     if to_run:
         yield say("next_run")
-    # Other advice comes only when the carts are identified and no recording must be fixed.
+    # Advice on missing recordings comes only when the carts are identified and no recording must be
+    # fixed.
     if fit is not None and not asked & {"data", "record"}:
         run = {Stage.HARDWARE_CHECK} if to_run else frozenset[Stage]()
         lacking = [skip for skip in analysis.skipped if skip.stage not in run]

@@ -24,7 +24,7 @@ from pipeline.words.spans import Span, plain
 from pipeline.words.text import clean, rich
 
 _WORDS = phrases("questions")
-_MOST = 6  # a report with more questions would be a questionnaire
+_MOST = 6  # a report with more questions would turn into a questionnaire
 _LISTED = 4  # runs that a question lists
 
 
@@ -106,7 +106,7 @@ def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
         else:
             key = "gain" if name.is_gain else "frequency"
         yield _of_row(row, analysis, key)
-        return  # the largest change represents the others
+        return  # ask only about the largest change
 
 
 def _of_row(row: ParameterRow, analysis: Analysis, key: Kind, **values: str) -> Asked:
@@ -181,7 +181,7 @@ def _misfit(analysis: Analysis) -> Iterator[Asked]:
     fit = analysis.fit
     if fit is None or fit.method != "bode_fit" or fit.explains_data:
         return
-    found: list[tuple[float, int, float]] = []  # standard errors, cart, rad/s
+    found: list[tuple[float, int, float]] = []  # (standard errors, cart, rad/s)
     for response in analysis.frequency_responses:
         residual = np.abs(fit.standardised.get(str(response.cart), np.zeros(0)))
         if residual.size and residual.size == response.omega.size:

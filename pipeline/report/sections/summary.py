@@ -172,7 +172,7 @@ def _number_tile(name: str, final: Estimate, *, unit: str, is_sure: bool, error:
         told = _WORDS.text(error, share=f"{significant(100 * share, digits=1)} %")
         unit = f"{unit}, {told}" if unit else told
     else:
-        # With an error of 1 % or more, two digits of the error leave four digits of the value.
+        # If the error is 1 % or more, giving it with two digits leaves the value about four.
         value = with_error(final.value, final.std, digits=2 if share >= 0.01 else 1)
     return Tile(label=spans(name_span(name)), value=spans(value), note=spans(unit))
 

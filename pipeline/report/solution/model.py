@@ -23,7 +23,7 @@ from pipeline.words.spans import spans
 from pipeline.words.text import rich
 
 _WORDS = phrases("solution")
-_MOST_ADDENDS = 3  # terms of a sum whose products are written with numbers
+_MOST_ADDENDS = 3  # a longer sum is not written out with numbers for each product
 _A_LINE = 7  # terms of a sum in one line
 
 
@@ -167,7 +167,8 @@ def worked(equations: Sequence[Equation], values: Mapping[str, float]) -> list[B
         result = value_term(evaluate(equation.right, values))
         if len(terms) == 1 and "-" not in equation.right:
             put_in = row(shown_with(equation.right, values), "≈", result)
-            # The square of a frequency in the table has no other name.
+            # If left and right are the same symbol, such as the square of a frequency in the table,
+            # show it once.
             short.append(row(left, "=", *(() if left == right else (right, row("="))), put_in))
             continue
         blocks += [_together(short)] if short else []
