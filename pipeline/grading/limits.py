@@ -61,7 +61,7 @@ SHARP = 1.05  # high over low: the largest ratio for a reference without frictio
 # How far honest numbers lie outside their bounds: the median of the logarithm (Cauchy
 # distribution).
 USUAL_GAIN, USUAL_FREQUENCY, USUAL_BY_EYE, USUAL_DAMPING = 0.01, 0.004, 0.06, 0.2
-ANYWHERE = 3.0  # width of the distribution of an unexplained wrong number, in e-folds
+ANYWHERE = 3.0  # e-folds; an unexplained wrong number may lie anywhere in so wide a range
 # One number in 20 is simply wrong; one table in 10 has a known mistake.
 ONE_IN_OFF, ONE_IN_KNOWN = 20, 10
 ONE_OF_SEVERAL = 5  # a team that miscounts one decay miscounts all of them, except one team in 5

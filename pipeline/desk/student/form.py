@@ -486,7 +486,7 @@ def _set(document: Any, parts: Sequence[str], item: Any) -> None:
     if part not in document:
         if item is None:
             return
-        above = bool(rest[1:])  # [reported.final] needs no [reported]
+        above = bool(rest[1:])  # a table [reported.final] needs no heading [reported] above it
         in_one_line = part in ("input", "position", "controller", "columns")
         document[part] = tomlkit.inline_table() if in_one_line else tomlkit.table(above)
     _set(document[part], rest, item)
