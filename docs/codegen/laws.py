@@ -1,4 +1,4 @@
-"""From the laws of the effects to the source of what simulates them, with all derivatives.
+"""Write source code that simulates the effects' laws, with all derivatives.
 
 Every law is differentiated symbolically, and printed for the compiler twice: in the parameters that
 the simulator's tables hold, and in the coordinates of a model that follows (`Growth`).
@@ -145,9 +145,9 @@ def columns_source(catalogue: Sequence[Effect]) -> str:
     for place, what in (("cart", "a cart"), ("spring", "a spring"), ("input", "the drive")):
         out.append(f'\n\nclass {_TABLES[place]}(IntEnum):\n    """The row of {what}."""\n')
         out += [f"    {name} = {number}" for number, name in enumerate(own[place])]
-    out.append("\n\n# What holds a cart at rest; a factor on it differs from run to run.")
+    out.append("\n\n# Dry friction, which may differ by a factor from run to run.")
     out.append(f"DRY = ({', '.join(dry)})")
-    out.append("# Values, where they are not 0, that change nothing.")
+    out.append("# Values without effect, for columns in which 0 has an effect.")
     out.append(f"NEUTRAL = {neutral!r}")
     return "\n".join(out) + "\n"
 
@@ -165,7 +165,7 @@ _SIMULATED = (
 def laws_source(catalogue: Sequence[Effect]) -> str:
     """Return the source of the laws."""
     out = [
-        _HEAD.format("The laws of the effects: what the compiled simulators know of them."),
+        _HEAD.format("The laws of the effects, for the compiled simulators."),
         "from math import cos, exp, inf, pi, sin\n",
         "from pipeline.plant.nonlinear.columns import Cart, Drive, Spring",
         "from pipeline.plant.nonlinear.simulator.compiler import inlined, jit\n",
@@ -240,7 +240,7 @@ def _matrix(catalogue: Iterable[Effect], place: str) -> Iterator[str]:
     row, by = ("i", (x, v)) if place == "cart" else ("j", (d, rate))
     sign = -1 if place == "cart" else 1
     yield f"\n@inlined\ndef {place}_matrix({place}, {row}):"
-    yield f'    """Return what linear laws add to the stiffness and damping of a {place}."""'
+    yield f'    """Return the stiffness and damping that linear laws add to a {place}."""'
     yield "    stiffness = damping = 0.0"
     for effect in catalogue:
         if effect.place == place and _is_linear(effect):
@@ -266,10 +266,11 @@ def _friction(catalogue: Iterable[Effect]) -> Iterator[str]:
             by_v = in_table(derivative(moving, v), effect)
             slope += [gate, f"        slope += {code(by_v)}"]
     yield "\n@inlined\ndef sliding(cart, i, u):"
-    yield '    """Return the dry friction on cart i that is the same at any speed."""'
+    yield '    """Return the part of the dry friction that does not depend on the speed."""'
     yield f"    return {' + '.join(constant)}\n"
     yield "\n@inlined\ndef dropping(cart, i, v, u):"
-    yield '    """Return the dry friction that changes with the speed."""\n    size = 0.0'
+    yield '    """Return the part of the dry friction that changes with the speed."""'
+    yield "    size = 0.0"
     yield from dropping
     yield "    return size\n"
     yield "\n@inlined\ndef drop_slope(cart, i, v, u):"
@@ -302,13 +303,13 @@ def settling(effect: Effect) -> tuple[Expr, Expr, Expr]:
 def _hysteresis(catalogue: Iterable[Effect]) -> Iterator[str]:
     mine = [effect for effect in catalogue if isinstance(effect.law, HysteresisLaw)]
     yield "\n@inlined\ndef settling(cart, i, v):"
-    yield '    """Return the most that hysteresis holds, where its state tends to, how fast."""'
+    yield '    """Return the largest force of hysteresis, the limit and rate (1/s) of its state."""'
     for effect in mine:
         values = ", ".join(code(in_table(one, effect)) for one in settling(effect))
         yield f"    if {_gate(effect)}:\n        return {values}"
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef settling_slopes(cart, i, v):"
-    yield '    """Return the derivatives by the velocity of where the state tends to, how fast."""'
+    yield '    """Return the derivatives by the velocity of the limit and rate of the state."""'
     for effect in mine:
         slopes = (derivative(one, v) for one in settling(effect)[1:])
         values = ", ".join(code(in_table(one, effect)) for one in slopes)
@@ -331,18 +332,18 @@ def _contacts(catalogue: Iterable[Effect]) -> Iterator[str]:
         mine = stops if effect.place == "cart" else slacks
         mine.append(f"    if {_gate(effect)}:\n        return {values}")
     yield "\n@inlined\ndef stop_of(cart, i):"
-    yield '    """Return stiffness, damping and (signed) position of what stops cart i."""'
+    yield '    """Return stiffness, damping and (signed) position of the end stop of cart i."""'
     yield from stops
     yield "    return 0.0, 0.0, 0.0\n"
     yield "\n@inlined\ndef slack_of(spring, j):"
-    yield '    """Return what spring j has more, past which stretch, and how by its stiffness."""'
+    yield '    """Return extra stiffness of spring j, its stretch, and the slope by k."""'
     yield from slacks
     yield "    return 0.0, 0.0, 0.0\n"
 
 
 def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
     yield "\n@inlined\ndef arriving(drive, u):"
-    yield '    """Return what dead zone, saturation and the like leave of an input."""'
+    yield '    """Return the input after dead zone, saturation and similar laws."""'
     for effect in catalogue:
         if isinstance(effect.law, InputLaw):
             yield f"    if {_gate(effect)}:"
@@ -351,9 +352,9 @@ def _input(catalogue: Iterable[Effect]) -> Iterator[str]:
 
 
 def _steps(catalogue: Iterable[Effect]) -> Iterator[str]:
-    yield "\nON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # where smooth forces are: a sum of these\n"
+    yield "\nON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # places of smooth forces, to be added\n"
     yield "\n@jit\ndef reach_of(cart, spring, drive):"
-    yield '    """Return the longest step for the laws, in s, and where there are smooth forces."""'
+    yield '    """Return the longest step for the laws, in s, and places of smooth forces."""'
     yield "    longest, smooth = inf, 0"
     loops = {
         "cart": "    for i in range(cart.shape[0]):",
@@ -394,7 +395,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     shapes = [_coefficients(effect, catalogue) for effect in catalogue]
     yield '\nclass Kind(IntEnum):\n    """The effects, in the order of the catalogue."""\n'
     yield from (f"    {e.key.upper()} = {i}" for i, e in enumerate(catalogue))
-    yield "\n\n# By kind: which coordinates vanish with the effect; the others are its shape."
+    yield "\n\n# By kind, the coordinates that vanish with the effect; the others are its shape."
     yield f"COEFFICIENTS = {tuple(shapes)!r}"
     on_spring = [e.key for e in catalogue if e.place == "spring"]
     friction = [e.key for e in catalogue if isinstance(e.law, FrictionLaw)]
@@ -402,12 +403,12 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
     for name, keys in (("ON_SPRING", on_spring), ("FRICTION", friction), ("HYSTERESIS", bristles)):
         yield f"{name} = ({''.join(f'Kind.{key.upper()}, ' for key in keys)})"
     sizes = [(isinstance(e.law, HysteresisLaw), len(e.grown.coordinates)) for e in catalogue]
-    yield "# How many numbers `terms` or `settle` fills, at most."
+    yield "# Most numbers that `terms` or `settle` fill in."
     yield f"TERMS = {max(5 + 3 * size if bristle else 4 + size for bristle, size in sizes)}\n"
     yield "\n@jit\ndef terms(kind, p, o, x, v, k, u, on, out):"
-    yield '    """Fill `out` with the law of a kind, its coordinates from p[o], and derivatives.\n'
-    yield "    By position, velocity and input, then by each coordinate. `x` and `v` are those of a"
-    yield "    cart or of a spring's stretch, `k` its stiffness."
+    yield '    """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].\n'
+    yield "    The derivatives are by position, velocity and input, then by each coordinate."
+    yield "    `x` and `v` are those of a cart or of a spring's stretch, `k` is its stiffness."
     yield '    """'
     branch = "if"
     for effect in catalogue:
@@ -417,7 +418,7 @@ def _followed(catalogue: Sequence[Effect]) -> Iterator[str]:
         branch = "elif"
         yield from _terms_of(effect, catalogue)
     yield "\n\n@jit\ndef settle(kind, p, o, v, out):"
-    yield '    """Fill `out` with `settling`, its slopes, and its three by each coordinate."""'
+    yield '    """Fill `out` with `settling`, its slopes, and derivatives by coordinate."""'
     branch = "if"
     for effect in catalogue:
         if isinstance(effect.law, HysteresisLaw):

@@ -1,1 +1,1 @@
-"""The carts: linear, under feedback, and with effects that the linear model lacks."""
+"""Models of the carts: linear, under feedback, and with effects that the linear model lacks."""

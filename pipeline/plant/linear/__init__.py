@@ -1,1 +1,1 @@
-"""The chain of carts: its equations, the maps to and from named parameters, exact simulation."""
+"""The chain of carts: equations, maps to and from named parameters, exact simulation."""

@@ -1,12 +1,14 @@
-"""The linear plant: n carts in a chain of springs, the motor's force on cart 1.
+"""The linear plant: n carts in a chain of springs, with the motor's force on cart 1.
 
-    m_i x_i'' + c_i x_i' + k_i (x_i - x_{i-1}) + k_{i+1} (x_i - x_{i+1}) = u on cart 1, 0 elsewhere
+The equation of motion of cart i is
 
-with x_0 = x_{n+1} = 0 (the walls). The input gain is one, so masses, dampings and stiffnesses
-are in input units (V s²/cm, V s/cm, V/cm) and nothing needs weighing.
+    m_i x_i'' + c_i x_i' + k_i (x_i - x_{i-1}) + k_{i+1} (x_i - x_{i+1}) = u on cart 1, 0 elsewhere.
 
-Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, and Three Degree
-of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
+The walls are x_0 = x_{n+1} = 0. The input gain is 1, so masses, dampings and stiffnesses are in
+input units (V s²/cm, V s/cm, V/cm), and no cart must be weighed.
+
+Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, and Three Degree of
+Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
 """
 
 from collections.abc import Sequence
@@ -21,12 +23,12 @@ from pipeline.json_files import result, written
 from pipeline.names import parameter_names
 
 if TYPE_CHECKING:
-    import control  # half a second: imported where it is used
+    import control  # takes half a second, so it is imported on use
 
 
 @result(eq=False)
 class Chain:
-    """Carts and springs; the input gain is one, so all are in input units."""
+    """Masses, dampings and stiffnesses of a chain; all are in input units, as the gain is 1."""
 
     m: Array = written("masses (n), cart 1 first, input unit s² per position unit; all > 0")
     c: Array = written("viscous dampings (n), cart 1 first, input unit s per position unit")
@@ -43,21 +45,22 @@ class Chain:
 
     @property
     def n(self) -> int:
-        """Number of carts."""
+        """The number of carts."""
         return self.m.size
 
     # ---------------------------------------------------------------- matrices
 
     @cached_property
     def stiffness(self) -> Array:
-        """K, (n, n): the restoring force is K x."""
+        """The stiffness matrix K (n, n); the restoring force is K x."""
         k = self.k
         return np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
 
     def matrices(self, *, free: Sequence[int] | None = None) -> tuple[Array, Array, Array, Array]:
-        """Return M, C, K (f, f) and the force vector (f,) of the free carts, the others held.
+        """Return M, C, K (f, f) and the force vector (f,) of the free carts, with the others held.
 
-        A held cart is a wall, so its row and column are removed. Holding cart 1 leaves no input.
+        A held cart is a wall, so its row and column are removed. If cart 1 is held, there is no
+        input.
         """
         rows = self._rows(free)
         force = np.array([1.0 if row == 0 else 0.0 for row in rows])
@@ -86,9 +89,10 @@ class Chain:
         return A, B, C, np.zeros((f, 1))
 
     def to_control(self, *, free: Sequence[int] | None = None) -> "control.StateSpace":
-        """Return the free carts as python-control's system, the others held.
+        """Return the free carts as a python-control system, with the others held.
 
-        States `x1, v1, x2, v2, …`, input `u`, outputs `x1, x2, …`, numbered as the carts are.
+        It has states `x1, v1, x2, v2, …`, input `u` and outputs `x1, x2, …`. The numbers are those
+        of the carts.
         """
         import control
 
@@ -111,16 +115,16 @@ class Chain:
 
     @cached_property
     def poles(self) -> ComplexArray:
-        """The 2n poles, as `eigvals` of A gives them (unsorted)."""
+        """The 2n poles, unsorted."""
         return np.linalg.eigvals(self.state_space()[0]).astype(np.complex128)
 
     def static_gains(self) -> Array:
-        """K_i (n,), position unit per input unit.
+        """Return the static gains K_i (n,), position unit per input unit.
 
         Raises
         ------
-        DataError : no spring holds the carts, so a constant force has no rest position; or the
-            springs' stiffnesses differ too much for the numbers.
+        DataError : no spring holds the carts, so a constant force has no rest position. Or the
+            stiffnesses differ by too many orders of magnitude.
         """
         if not self.is_tied:
             raise DataError("no spring ties the carts to a wall: there is no static gain")
@@ -140,7 +144,7 @@ class Chain:
         return bool(np.all(from_left | from_right))
 
     def frequency_response(self, omega: Array) -> ComplexArray:
-        """Return X_i/U at `omega` (n_w,), rad/s; shape (n, n_w), position unit per input unit.
+        """Return X_i/U (n, n_w) at `omega` (n_w,), rad/s, in position unit per input unit.
 
         At a pole without damping the response is infinite.
         """
@@ -162,20 +166,20 @@ class Chain:
 
     @property
     def omega_carts(self) -> Array:
-        """omega_i (n,), rad/s: each cart alone, the others held."""
+        """omega_i (n,), rad/s, of each cart with the others held."""
         return np.sqrt((self.k[:-1] + self.k[1:]) / self.m)
 
     @property
     def zeta_carts(self) -> Array:
-        """zeta_i (n,): each cart alone, the others held; infinite if no spring holds it."""
+        """zeta_i (n,) of each cart with the others held; infinite if no spring holds the cart."""
         with np.errstate(divide="ignore"):
             return self.c / (2 * self.m * self.omega_carts)
 
     def tails(self) -> list[Array]:
-        """Return T_1 … T_{n+1}, monic in falling powers: T_i belongs to carts i to n alone.
+        """Return polynomials T_1 … T_{n+1}, monic in falling powers; T_i belongs to carts i to n.
 
-        T_1 is the common denominator; X_i/U is K_i T_{i+1}(s)/T_{i+1}(0) over T_1(s)/T_1(0).
-        T_i = P_i T_{i+1} - kappa_{i+1} T_{i+2}, kappa_j = k_j² / (m_{j-1} m_j).
+        T_1 is the common denominator. X_i/U is K_i T_{i+1}(s)/T_{i+1}(0) over T_1(s)/T_1(0). With
+        kappa_j = k_j² / (m_{j-1} m_j), T_i = P_i T_{i+1} - kappa_{i+1} T_{i+2}.
         """
         P = [
             np.array([1.0, self.c[i] / self.m[i], (self.k[i] + self.k[i + 1]) / self.m[i]])
@@ -195,7 +199,7 @@ class Chain:
         return np.roots(self.tails()[cart]).astype(np.complex128)
 
     def transfer_function(self, cart: int) -> tuple[Array, Array]:
-        """Return numerator and denominator of X_cart/U, in falling powers; the latter is monic."""
+        """Return numerator and monic denominator of X_cart/U, in falling powers."""
         tails = self.tails()
         reach = np.prod(self.k[1:cart] / self.m[1:cart]) / self.m[0]
         return reach * tails[cart], tails[0]
@@ -203,12 +207,13 @@ class Chain:
     def parameters(self) -> dict[str, float]:
         """Return the named parameters of this chain, in the order of the paper's Tables 1-3.
 
-        `K, omega_n, zeta` for one cart (`mass, damping` if it has no spring); two and three carts
-        as in Tables 2 and 3; more carts as for two, with further letters and numbers.
+        One cart has `K, omega_n, zeta` (`mass, damping` if it has no spring). Two and three carts
+        have the parameters of Tables 2 and 3, more carts those of Table 2 with further letters and
+        numbers.
 
         Raises
         ------
-        DataError : several carts without a spring to a wall have no static gains.
+        DataError : there are several carts and no spring to a wall, so static gains do not exist.
         """
         if self.n == 1 and self.k.sum() == 0:
             return {"mass": float(self.m[0]), "damping": float(self.c[0])}
@@ -227,8 +232,8 @@ class Chain:
 def quadratic_factors(roots: ComplexArray) -> tuple[Array, Array]:
     """Return omega and zeta of s² + 2 zeta omega s + omega² for pairs of roots, omega ascending.
 
-    Complex roots pair with their conjugates; real roots pair by size, so that an overdamped
-    factor has zeta > 1.
+    Complex roots are paired with their conjugates, real roots by size. So an overdamped factor has
+    zeta > 1.
     """
     roots = np.asarray(roots, dtype=np.complex128)
     is_real = np.abs(roots.imag) <= 1e-9 * np.abs(roots)

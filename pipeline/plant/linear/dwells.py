@@ -1,4 +1,4 @@
-"""Sine dwells on a chain: their frequencies, the length of the transient, and the reach."""
+"""Sine dwells on a chain: their frequencies, the length of the transient, and the motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain, quadratic_factors
 from pipeline.plant.linear.simulate import simulate_linear
 
-SETTLED = 7.0  # time constants: a transient of 1 cm is down to half a count
-SETTLED_DWELL = 9.0  # … to a tenth of one: at a resonance it hides in the amplitude
+SETTLED = 7.0  # time constants, after which a transient of 1 cm is half a count
+SETTLED_DWELL = 9.0  # after which it is a tenth; at a resonance it hides in the amplitude
 
 
 def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> list[float]:
-    """Return about `n` frequencies in Hz, ascending: closer at resonances and nulls.
+    """Return about `n` frequencies in Hz, ascending, with more of them at resonances and nulls.
 
-    Half of them are spread evenly over the range, as in a first look. The others bracket each
-    feature: on it, and half a bandwidth to each side. Those of `among` are always included.
+    Half of them are spread evenly over the range, as for a first look. The others are at each
+    resonance and null, and half a bandwidth to each side. Those in `among` are always included.
     """
     features = [quadratic_factors(chain.poles)]
     features += [quadratic_factors(chain.zeros(cart)) for cart in range(1, chain.n)]
@@ -37,23 +37,23 @@ def dwell_frequencies(chain: Chain, *, n: int, among: Sequence[float] = ()) -> l
 
 
 def settling_wait(chain: Chain, *, time_constants: float) -> float:
-    """Return how long a student waits for the transient, s."""
+    """Return how long a student waits for the end of the transient, s."""
     slowest = float(np.min(-chain.poles.real))
     if slowest <= 1e-9 * np.abs(chain.poles).max():  # zero except for rounding
         raise DataError("the carts never settle: a session needs damping and a spring to a wall")
-    # No student waits longer, however small the damping.
+    # No student waits more than 12 s, however small the damping.
     return min(time_constants / slowest, 12.0)
 
 
 def steady_time(hertz: float) -> float:
-    """Return how long a dwell goes on after the transient, s."""
-    # Enough to see that six cycles no longer change; or seconds, at high frequencies.
+    """Return how long a dwell continues after the transient, s."""
+    # Long enough to see that the last cycles no longer change; at high frequencies, 1.4 s.
     return max(6.5 / hertz, 1.4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reach:
-    """The largest motion of any cart under an input of size one, in position units.
+    """The largest motion of any cart per unit of input, in position units.
 
     Attributes
     ----------
@@ -66,6 +66,6 @@ class Reach:
 
 
 def reach(chain: Chain, t: Array, *, shape: Array, wait: float) -> Reach:
-    """Move the carts from rest by an input of `shape` (n,); its transient lasts `wait` s."""
+    """Return the motion from rest under an input of `shape` (n,); the transient lasts `wait` s."""
     unit = np.abs(simulate_linear(chain, t, shape))
     return Reach(steady=float(np.max(unit[:, t >= wait])), furthest=float(np.max(unit)))

@@ -1,7 +1,7 @@
-"""The order of gains, resonances and nulls of a real chain of carts.
+"""The order of gains, resonances and nulls in a real chain of carts.
 
-Holding carts raises every frequency, so resonances and nulls interlace (Cauchy): exactly without
-damping; with heavy damping they may not.
+Holding carts raises every frequency. So resonances and nulls interlace (Cauchy), exactly without
+damping. With heavy damping they may not.
 """
 
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _INNER = "carts 2 and 3 alone lie between the nulls of cart 1"
 
 
 class Bracket(NamedTuple):
-    """Of three frequencies by name, `middle` lies between the others."""
+    """Three frequencies by name, of which `middle` lies between the others."""
 
     low: str
     middle: str
@@ -41,9 +41,9 @@ def brackets(n: int) -> list[Bracket]:
 
 
 def orders(names: Sequence[str]) -> list[tuple[str, str, str]]:
-    """Return (lesser, greater, why) for every order that the named parameters obey.
+    """Return (lesser, greater, why) for every order that the named parameters must obey.
 
-    The names may come in any order, and some of a chain's may be missing.
+    The names may have any order, and some of a chain's names may be missing.
     """
     names = sorted(names)
     gains = [name for name in names if read_name(name).is_gain and read_name(name).cart]

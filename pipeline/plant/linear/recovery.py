@@ -1,7 +1,7 @@
-"""The map back: from gains and polynomials, or named parameters, to masses, dampings, springs.
+"""Compute masses, dampings and springs from gains and polynomials, or from named parameters.
 
-Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, and Three Degree
-of Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
+Reference: R. D. Throne, "Frequency Domain System Identification of One, Two, and Three Degree of
+Freedom Systems in an Introductory Controls Class", Proc. ASEE Annual Conference, 2005.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +20,12 @@ class Recovered:
 
     Attributes
     ----------
-    m, c : (n,), k : (n + 1,), as in `Chain`, but as found: a measured table may imply a negative
-        spring, which must be visible.
-    damping_terms, stiffness_terms : (n,) 2 zeta_i omega_i and omega_i² of each cart alone.
-    couplings : (n - 1,) k² over both masses, of the springs between the carts.
-    routes : the redundancies R1, R2, …: two ways to compute one number.
+    m, c, k : (n,), (n,) and (n + 1,), as in `Chain`. A measured table may imply a negative spring,
+        which stays visible here.
+    damping_terms : (n,) 2 zeta_i omega_i of each cart. The others are held.
+    stiffness_terms : (n,) omega_i² of each cart. The others are held.
+    couplings : (n - 1,) for each spring between carts, k² over the product of both masses.
+    routes : the redundancies R1, R2, …. Each is one number computed in two ways.
     """
 
     m: Array
@@ -37,28 +38,27 @@ class Recovered:
 
     @property
     def residuals(self) -> dict[str, float]:
-        """The redundancies of a single chain, each as relative difference."""
+        """The redundancies of a single chain, each as a relative difference."""
         return {name: _relative_difference(*map(float, two)) for name, two in self.routes.items()}
 
     def chain(self) -> Chain:
-        """Return the chain, as found (stiffnesses may be negative)."""
+        """Return the chain as computed; stiffnesses may be negative."""
         return Chain(m=self.m, c=self.c, k=self.k)
 
 
 def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
-    """Recover masses, dampings and springs from static gains and the polynomials T_1 … T_n.
+    """Compute masses, dampings and springs from static gains and the polynomials T_1 … T_n.
 
     `gains` is (n,); `tails` are monic, in falling powers, T_i of degree 2 (n - i + 1). Further axes
-    hold further chains. Each number is computed by the best-conditioned route, and the redundancies
-    are returned. The s¹ coefficients serve as checks only, as rounding grows some 15 times along
-    them.
+    hold further chains. Each number is computed in the best-conditioned way. The s¹ coefficients
+    serve only as checks, because rounding grows some 15 times through them.
     """
     n, others = len(gains), tails[0].shape[1:]
     T = [*tails, np.ones((1, *others))]
     g, square, ratio = np.zeros((3, n, *others))  # ratio: k_i / m_i
     kappa = np.zeros((n, *others))  # kappa[i] couples carts i and i + 1 (counted from 1)
     routes: list[tuple[Array, Array]] = []
-    for i in range(n - 1, -1, -1):  # from the far end, where the transfer function has no zeros
+    for i in range(n - 1, -1, -1):  # the far end comes first, since it has no zeros
         whole, rest = T[i], T[i + 1]
         g[i] = whole[1] - (rest[1] if len(rest) > 1 else 0.0)
         square[i] = whole[2] - (rest[2] + g[i] * rest[1] if len(rest) > 1 else 0.0)
@@ -67,7 +67,7 @@ def recover_chain(gains: Array, tails: Sequence[Array]) -> Recovered:
             kappa[i + 1] = (square[i] * rest[-1] - whole[-1]) / beyond[-1]
             rebuilt = _product([np.stack([np.ones(others), g[i], square[i]]), rest])
             rebuilt[-len(beyond) :] -= kappa[i + 1] * beyond
-            # The coefficients that no step above has used are the redundancies.
+            # Coefficients that no step above has used are the redundancies.
             routes += [(rebuilt[j], whole[j]) for j in range(3, len(whole) - 1)]
         if i > 0:
             ratio[i] = gains[i] / gains[i - 1] * whole[-1] / rest[-1]
@@ -97,10 +97,10 @@ def _relative_difference(a: float, b: float) -> float:
 
 
 def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequence[Array]]:
-    """Return the static gains (n,) and T_1 … T_n of named parameters of 1 to 3 carts.
+    """Return the static gains (n,) and T_1 … T_n from named parameters of 1 to 3 carts.
 
-    `values` uses the names of `Chain.parameters`; the recomputed ones (omega_1, …) are not read,
-    except the last cart's, which is the zero of the cart before it.
+    `values` uses the names of `Chain.parameters`. The carts' own frequencies (omega_1, …) are not
+    used, except for that of the last cart, which is the zero of the cart before it.
     """
     if "omega_n" in values:
         return np.array([values["K"]]), [_quadratic(values, "n", zeta="zeta")]
@@ -111,7 +111,7 @@ def transfer_functions(values: Mapping[str, float | Array]) -> tuple[Array, Sequ
 
 
 def _product(polynomials: Sequence[Array]) -> Array:
-    """Return the product of polynomials, coefficients along the first axis."""
+    """Return the product of polynomials, with coefficients along the first axis."""
     result: Array = polynomials[0]
     for other in polynomials[1:]:
         if result.ndim == 1:
@@ -130,9 +130,9 @@ def _quadratic(values: Mapping[str, float | Array], suffix: str, zeta: str | Non
 
 
 def recover_from_parameters(values: Mapping[str, float | Array]) -> Recovered:
-    """Recover the chain from named parameters (1 to 3 carts), with the redundancies.
+    """Compute the chain from named parameters (1 to 3 carts), with the redundancies.
 
     Two carts have 8 transfer-function parameters for 7 physical ones (R1); three have 15 for 10 (R1
-    to R5). For a table of a real chain they are zero.
+    to R5). For a table of a real chain the redundancies are zero.
     """
     return recover_chain(*transfer_functions(values))

@@ -1,4 +1,4 @@
-"""Simulate a chain: exactly, for an input held between samples, at any sample times."""
+"""Simulate a chain exactly, for an input held between samples, at any sample times."""
 
 from collections.abc import Sequence
 from math import isqrt
@@ -26,10 +26,10 @@ def simulate_linear(
 
     Parameters
     ----------
-    t : (n,) s, strictly increasing, not necessarily uniform.
-    u : (n,) input; between t[i] and t[i + 1] it is u[i] ("zero_order") or the smooth signal
-        through the samples ("band_limited", Lanczos interpolation).
-    x0 : (2f,) initial state (x1, v1, x2, v2, …) of the free carts; default at rest.
+    t : (n,) s, strictly increasing. The intervals may differ.
+    u : (n,) input. With "zero_order" it is u[i] between t[i] and t[i + 1]. With "band_limited" it
+        is the smooth signal through the samples (Lanczos interpolation).
+    x0 : (2f,) initial state (x1, v1, x2, v2, …) of the free carts. By default at rest.
 
     Returns
     -------
@@ -45,11 +45,11 @@ def simulate_linear(
 
 
 def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool = False) -> Array:
-    """Propagate x' = A x + B u over the samples; returns the states (n_states, n).
+    """Propagate x' = A x + B u over the samples; return the states (n_states, n).
 
-    The input is held from sample to sample, or runs straight between them (`linear`). Exact by
-    the matrix exponential of the augmented system (Van Loan, IEEE Trans. Automatic Control 23,
-    1978), one for each distinct interval.
+    The input is held from sample to sample or, with `linear`, interpolated linearly. The result is
+    exact. It uses the matrix exponential of the augmented system (Van Loan, IEEE Trans. Automatic
+    Control 23, 1978), one for each distinct interval.
     """
     n_states = A.shape[0]
     n_augmented = n_states + (2 if linear else 1)
@@ -58,7 +58,8 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
     augmented[:n_states, n_states] = B[:, 0]
     if linear:
         augmented[n_states, n_states + 1] = 1.0
-    # Sample times carry rounding at 1e-16 relative; intervals equal to 1e-12 s are one.
+    # Sample times have relative rounding errors of 1e-16; intervals that agree to 1e-12 s are
+    # equal.
     steps, which = np.unique(np.round(np.diff(t), 12), return_inverse=True)
     phi = expm(augmented * steps[:, None, None])
     transition, drive = phi[:, :n_states, :n_states], phi[:, :n_states, n_states]
@@ -75,10 +76,10 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
 
 
 def _by_blocks(transition: Array, forced: Array, x: Array) -> Array:
-    """Return the states (n, n_states) that follow x, the next being transition @ x + forced[i].
+    """Return the states (n, n_states) after x; each next one is transition @ x + forced[i].
 
-    Their sum over time is split: blocks are run from rest, all at once, then joined. That takes 2
-    √n steps of the interpreter instead of n.
+    Blocks are computed from rest, all at once, and then joined. That takes 2 √n steps of the Python
+    interpreter instead of n.
     """
     n, n_states = forced.shape
     length = isqrt(n)

@@ -1,4 +1,4 @@
-"""The two measures of a step response: overshoot and settling time."""
+"""Measures of a step response: overshoot and settling time."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def settling_time(
 ) -> Array:
     """Return when `y` (..., n) enters the 2 % band for good, in s after t[0]; NaN if never.
 
-    `noise` widens the band where a measured signal's own scatter is larger than 2 %.
+    `noise` widens the band if a measured signal scatters by more than 2 %.
     """
     change = np.asarray(level, dtype=np.float64) - before
     band = np.maximum(SETTLING_BAND * np.abs(change), noise)

@@ -1,1 +1,1 @@
-"""The chain under sampled feedback: gains, the loop simulated, margins, robustness."""
+"""The chain under sampled feedback: gains, simulation, margins, robustness."""

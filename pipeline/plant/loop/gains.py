@@ -1,4 +1,4 @@
-"""Gains of sampled state feedback: the least of a quadratic cost, or with given poles."""
+"""Gains of sampled state feedback: with the least quadratic cost, or with given poles."""
 
 import numpy as np
 from scipy.linalg import hessenberg
@@ -9,8 +9,8 @@ from pipeline.arrays import Array, ComplexArray
 def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
     """Return the gains (…, n) that minimise the sum of x'Qx + u² for each Q of (…, n, n).
 
-    The doubling algorithm: after i steps H is the cost of the next 2^i samples. Many weights at
-    once cost little more than one.
+    This is the doubling algorithm: after i steps, H is the cost of the next 2^i samples. Many
+    weights at once take little more time than one.
 
     Raises
     ------
@@ -21,7 +21,7 @@ def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
     eye = np.eye(gamma.size)
     A, H = np.broadcast_to(phi, weights.shape), weights
     G = np.broadcast_to(np.outer(gamma, gamma), weights.shape)
-    for _ in range(60):  # no loop remembers its start for 2^60 samples
+    for _ in range(60):  # after 2^60 samples, no loop depends on its start
         W, A_transposed = np.linalg.inv(eye + G @ H), np.swapaxes(A, -1, -2)
         more = A_transposed @ H @ W @ A
         G, A, H = G + A @ W @ G @ A_transposed, A @ W @ A, H + more
@@ -34,8 +34,8 @@ def lqr_gains(phi: Array, gamma: Array, weights: Array) -> Array:
 def place_poles(phi: Array, gamma: Array, poles: ComplexArray) -> Array:
     """Return the gains (…, n) that give phi - gamma G the `poles` (…, n), in conjugate pairs.
 
-    In Hessenberg form the input reaches one state after the other, so the last row of the
-    wanted polynomial of phi alone fixes the gains: no controllability matrix to invert.
+    In Hessenberg form, the input reaches one state after the other. So the last row of the wanted
+    polynomial of phi gives the gains, and no controllability matrix must be inverted.
 
     Reference: B. N. Datta, Linear Algebra Appl. 88 (1987) 207-226.
     """

@@ -1,7 +1,7 @@
-"""The designed loop as a system of python-control, and its distance from instability.
+"""The designed loop as a python-control system, and its distance from instability.
 
-The loop is that of `sampled_loop`: gains on the state predicted for the moment the input acts, the
-observer's prediction, one sample of delay.
+The loop is that of `sampled_loop`. The gains multiply the state that the observer predicts for the
+moment at which the input acts; the delay is one sample.
 """
 
 from collections.abc import Callable
@@ -17,10 +17,10 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.sampled_loop import StateFeedback, broken_loop, discretise
 
 if TYPE_CHECKING:
-    import control  # half a second: imported where it is used
+    import control  # takes half a second, so it is imported on use
 
-_SLOWER = 1e-2  # times the slowest pole: the lower end of the band
-_NEAREST, _AROUND = 1e-6, 30  # of a mode's frequency, the least distance looked at, and how many
+_SLOWER = 1e-2  # times the slowest pole; the band begins there
+_NEAREST, _AROUND = 1e-6, 30  # least distance from a mode's frequency, relative; how many
 
 
 @result()
@@ -31,12 +31,12 @@ class Margins:
     """
 
     gain: float | None = written(
-        "factor on the loop's gain, the nearest to 1 (below 1: the least gain it needs); null "
-        "where none makes it unstable"
+        "factor on the loop's gain that makes it unstable, the nearest to 1 (below 1: the least "
+        "gain it needs); null if there is no such factor"
     )
     phase_deg: float | None = written(
-        "of lag, or of lead where below zero, the nearest to 0; null where the loop's gain is 1 "
-        "nowhere"
+        "lag that makes the loop unstable, or lead if negative, the nearest to 0; null if the "
+        "loop's gain is never 1"
     )
     modulus: Number = written(
         "least distance of the Nyquist curve from -1, one over the peak of the sensitivity"
@@ -50,8 +50,9 @@ def closed_loop(
 ) -> "control.StateSpace":
     """Return the loop from the set point `r` to the positions, sampled every `sample_time` s.
 
-    The states are those of the carts and the acting input `u`: it was computed a sample ago, which
-    gives the pole at z = 0. The observer knows the plant, so its poles do not appear.
+    Its states are those of the carts and the acting input `u`. The input was computed one sample
+    earlier, which gives the pole at z = 0. The observer knows the plant, so its poles do not
+    appear.
     """
     import control
 
@@ -78,7 +79,7 @@ def stability_margins(
 
     Raises
     ------
-    DataError : a mode of the carts is undamped, such as one whose damping a fit held at zero.
+    DataError : a mode of the carts is undamped, for example because a fit held its damping at zero.
     """
     A, B, C = broken_loop(chain, controller, sample_time=sample_time)
     opened, closed = np.linalg.eigvals(A), np.linalg.eigvals(A - np.outer(B, C))
@@ -94,8 +95,8 @@ def stability_margins(
         return (C @ np.linalg.solve(shifted, B[:, None]))[:, 0].astype(np.complex128)
 
     at_180 = _crossings(lambda omega: response(omega).imag, omega)
-    # At both ends of the band the response is real, and if negative it crosses -180° too; carts
-    # without a spring to a wall have no lower end.
+    # At both ends of the band the response is real, and if negative, it crosses -180° there too.
+    # Without a spring to a wall, the band has no lower end.
     at_180 = np.append(at_180, [0.0, np.pi / sample_time] if chain.is_tied else np.pi / sample_time)
     real = response(at_180).real
     at_180, gain = at_180[real < 0], -1 / real[real < 0]
@@ -112,7 +113,7 @@ def stability_margins(
 
 
 def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
-    """Return where a real curve passes zero; `omega` is so dense that it does once between two."""
+    """Return where a real curve crosses zero; `omega` must separate the crossings."""
     sign = np.sign(curve(omega))
     between = np.flatnonzero(sign[1:] * sign[:-1] < 0)
 
@@ -124,7 +125,7 @@ def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
 
 
 def _least(curve: Callable[[Array], Array], omega: Array) -> float:
-    """Return the least value of a curve around the frequency where it is least."""
+    """Return the least value of a curve, searched around the frequency where it is least."""
     omega = np.unique(omega)
     values = curve(omega)
     i = int(values.argmin())
@@ -134,12 +135,12 @@ def _least(curve: Callable[[Array], Array], omega: Array) -> float:
 
 
 def _frequencies(z: ComplexArray, *, sample_time: float) -> Array:
-    """Return frequencies up to Nyquist's, rad/s, denser near a pole."""
+    """Return frequencies up to the Nyquist frequency, rad/s, denser near a pole."""
     nyquist = np.pi / sample_time
-    s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # the others turn nothing quickly
+    s = np.log(z[np.abs(z) > np.exp(-np.pi)]) / sample_time  # other poles change nothing quickly
     slowest = np.abs(s[np.abs(s) > _NEAREST * nyquist]).min(initial=nyquist)
     lowest = min(_SLOWER * slowest, _SLOWER * nyquist)
-    # This many a decade, plus those of each mode.
+    # 60 frequencies per decade, plus those of each mode.
     count = int(60 * np.log10(nyquist / lowest))
     band = np.geomspace(lowest, nyquist, count, endpoint=False)
     modes = s[s.imag > 0]

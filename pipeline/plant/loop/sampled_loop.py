@@ -1,27 +1,29 @@
 """Simulate the plant under a sampled controller, exactly between the samples.
 
-The controller's clock ticks every `sample_time`. At tick k, in this order:
+The controller's clock ticks every `sample_time`. At tick k it does the following, in this order.
 
-1. every free cart's encoder is read: y = x + rest, rounded to `encoder_step`;
-2. the effort is computed from y and the reference (below), then clipped to ± `input_limit`;
-3. with `delay` 1 it acts from tick k + 1 to k + 2 (the computer needs its sample to compute),
-   with `delay` 0 from tick k to k + 1. Before the first effort the input is zero.
+1. Read every free cart's encoder: y = x + rest, rounded to `encoder_step`.
+2. Compute the effort from y and the reference (see below), then clip it to ± `input_limit`.
+3. Apply the effort. With `delay` 1 it acts from tick k + 1 to k + 2, as the computer needs its
+   sample to compute. With `delay` 0 it acts from tick k to k + 1. Before the first effort the input
+   is zero.
 
-State feedback: effort = prefilter r - gains · [x1, v1, x2, v2, …]. Positions are the readings;
-velocities come from an alpha-beta observer with alpha 1: with the prediction made at the last tick,
+**State feedback.** The effort is prefilter r - gains · [x1, v1, x2, v2, …]. Positions are the
+readings. Velocities come from an alpha-beta observer with alpha 1. It uses the prediction that was
+made at the last tick:
 
-    v = v_predicted + (VELOCITY_CORRECTION / sample_time) (y - x_predicted)
+    v = v_predicted + (VELOCITY_CORRECTION / sample_time) (y - x_predicted).
 
-and the prediction for the next tick is exact with a `model` (and the input that acts meanwhile),
-or x + sample_time v at constant v without one; then v is the filtered difference of the readings.
-With `delay` 1 the gains multiply the prediction: the state at the moment the effort begins to act.
-So the delay takes no further gain, and the poles of the delayed loop are those of the loop
-without delay and one at z = 0. The observer starts at the first reading, at rest.
+With a `model`, the prediction for the next tick is exact and includes the acting input. Without a
+model it is x + sample_time v at constant v, and v is the filtered difference of the readings. With
+`delay` 1 the gains multiply the prediction, which is the state at the moment when the effort begins
+to act. So the delay needs no further gain. The poles of the delayed loop are those of the loop
+without delay, and one more at z = 0. The observer starts at the first reading, at rest.
 
-PID: effort = scale (kp e + ki ∫e + kd de/dt), e = r - y of one cart, in the units of the readings.
-∫e is the sum of e sample_time up to this tick, de/dt the difference from the last tick over
-sample_time. Before the first tick e is zero, so a reference that is on at the first tick causes a
-kick.
+**PID.** The effort is scale (kp e + ki ∫e + kd de/dt) with e = r - y of one cart. The error e is in
+the units of the readings. The integral is the sum of e sample_time up to this tick. The derivative
+is the difference from the last tick over sample_time. Before the first tick e is zero. So a
+reference that is on at the first tick causes a kick.
 """
 
 from collections.abc import Sequence
@@ -35,20 +37,20 @@ from pipeline.arrays import Array, frozen_array
 from pipeline.errors import DataError
 from pipeline.plant.linear.chain import Chain
 
-# Share of the prediction error at a tick that corrects the velocity. A half keeps three quarters of
-# the encoder's rounding noise out of v and forgets a wrong start in a few ticks.
+# Share of the prediction error that corrects the velocity at a tick. One half keeps three quarters
+# of the encoder's rounding noise out of v, and removes a wrong start in a few ticks.
 VELOCITY_CORRECTION = 0.5
-MOST_TICKS = 200_000  # of a run: over three minutes at 1 kHz, and some seconds to simulate
+MOST_TICKS = 200_000  # ticks of a run. Over three minutes at 1 kHz, and some seconds to simulate
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateFeedback:
-    """Effort = prefilter r - gains [x1, v1, x2, v2, …].
+    """State feedback: effort = prefilter r - gains [x1, v1, x2, v2, …].
 
     Attributes
     ----------
     gains : (2f,) for the f free carts, input unit per position unit and per (position unit/s).
-    model : the plant the observer predicts with; None: it predicts at constant velocity.
+    model : the plant that the observer predicts with. Without one it predicts at constant velocity.
     """
 
     gains: Array
@@ -61,7 +63,7 @@ class StateFeedback:
 
 @dataclass(frozen=True, kw_only=True)
 class Pid:
-    """Effort = scale (kp e + ki ∫e + kd de/dt), e = r - y of one cart."""
+    """PID control of one cart: effort = scale (kp e + ki ∫e + kd de/dt), e = r - y."""
 
     kp: float = 0.0
     ki: float = 0.0
@@ -80,8 +82,8 @@ class LoopRun:
     Attributes
     ----------
     t : (n,) s.
-    x : (f, n) readings of the free carts, rest included, before the encoder rounds them.
-    u : (n,) effort that acts from each t on, clipped: what a bench logs as its input.
+    x : (f, n) readings of the free carts. They include the rest, but not the encoder's rounding.
+    u : (n,) effort that acts from each t on. Clipped, as a bench logs its input.
     """
 
     t: Array
@@ -90,7 +92,7 @@ class LoopRun:
 
 
 class MovingPlant(Protocol):
-    """A plant that may replace the chain in a loop: it advances by a sample and keeps its state."""
+    """A plant that may replace the chain in a loop; it keeps its own state."""
 
     @property
     def state(self) -> Array:
@@ -108,13 +110,13 @@ class LoopSetup:
 
     Attributes
     ----------
-    sample_time : s, of the controller; default the mean interval of the run.
+    sample_time : s, of the controller. By default the mean interval of the run.
     delay : ticks from reading to acting, 1 or 0.
-    input_limit : the effort is clipped to ± this.
-    drive : force on cart 1 per effort; not 1 if a log has another sign or scale.
-    encoder_step : what the controller's readings are rounded to, one number or (f,).
-    rest : readings of the carts at rest without input, one number or (f,).
-    free : the carts that move; default all.
+    input_limit : the effort is clipped to ± this limit.
+    drive : force on cart 1 per effort. Different from 1 if a log has another sign or scale.
+    encoder_step : step to which the controller's readings are rounded. One number or (f,).
+    rest : readings of the carts at rest without input. One number or (f,).
+    free : the carts that move. By default all.
     """
 
     sample_time: float | None = None
@@ -126,7 +128,7 @@ class LoopSetup:
     free: Sequence[int] | None = None
 
     def read(self, x: Array) -> Array:
-        """Return what the controller sees of the positions (f,)."""
+        """Return the readings that the controller gets for the positions (f,)."""
         y, step = x + self.rest, self.encoder_step
         if step is None:
             return y
@@ -149,10 +151,10 @@ def simulate_loop(
 
     Parameters
     ----------
-    t : (n,) s, ascending; where the run is wanted. It begins at t[0].
-    reference : set point, in the units of the readings; one number or (n,) at `t`.
-    start : (2f,) state (x1, v1, x2, v2, …) at t[0], about the rest; default at rest. Or a plant
-        that replaces the chain, in its present state.
+    t : (n,) s, ascending. The times of the result; the run begins at t[0].
+    reference : set point, in the units of the readings. One number, or (n,) at `t`.
+    start : (2f,) state (x1, v1, x2, v2, …) at t[0], relative to the rest. By default at rest. It
+        may also be a plant in its present state, which replaces the chain.
 
     Raises
     ------
@@ -208,10 +210,10 @@ def check_ticks(duration: float, sample_time: float) -> None:
 def replay(
     controller: Controller, *, t: Array, y: Array, reference: Array, free: Sequence[int]
 ) -> Array:
-    """Return the effort (n,) the controller asks for at each reading of a recorded run.
+    """Return the effort (n,) that the controller computes at each reading of a recorded run.
 
-    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted: this is the
-    response of the stated law to the actual motion, for comparison with the logged input.
+    `y` (f, n) are the readings of the `free` carts. Nothing is clipped or predicted. The result is
+    the response of the stated law to the actual motion, for comparison with the logged input.
     """
     T = float(t[-1] - t[0]) / (t.size - 1)
     law = _law(controller, free=tuple(free), sample_time=T, y0=y[:, 0])
@@ -240,8 +242,9 @@ def broken_loop(
 ) -> tuple[Array, Array, Array]:
     """Return A (4n + 1)², B and C (4n + 1,) of the loop cut where the effort drives cart 1.
 
-    From a force on cart 1 to minus the effort, tick to tick; the state is (x, prediction, acting
-    effort). All carts free, one tick of delay, nothing clipped or rounded, no reference.
+    They describe the step from tick to tick, from a force on cart 1 to minus the effort. The state
+    is (x, prediction, acting effort). All carts are free, the delay is one tick, nothing is clipped
+    or rounded, and the reference is zero.
     """
     free = tuple(range(1, chain.n + 1))
     size = 2 * chain.n
@@ -257,7 +260,7 @@ def broken_loop(
 
 
 def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) -> Array:
-    """Return the map of (x, prediction, acting effort), (4n + 1)², from tick to tick.
+    """Return the map (4n + 1)² of (x, prediction, acting effort) from tick to tick.
 
     The loop is stable if and only if all eigenvalues lie inside the unit circle.
     """
@@ -265,11 +268,11 @@ def loop_matrix(chain: Chain, controller: StateFeedback, *, sample_time: float) 
     return A - np.outer(B, C)
 
 
-# ------------------------------------------------------------------- inside
+# ------------------------------------------------------------------- private parts
 
 
 class _Law(Protocol):
-    """A controller's memory: it gets each reading, returns the effort, and learns what acts."""
+    """The memory of a controller: it takes readings, returns efforts, and notes which acted."""
 
     def measure(self, y: Array) -> None: ...
     def predict(self, applied: float) -> None: ...
@@ -341,7 +344,7 @@ def _prediction(
 
 
 def _hermite(at: Array, x: Array, slope: Array) -> Array:
-    """Interpolate (f, n) values with known slopes at 0, 1, 2, …: exact there, O(h⁴) between."""
+    """Interpolate values (f, n) with known slopes at 0, 1, 2, …; exact there, O(h⁴) between."""
     index = np.clip(np.floor(at).astype(int), 0, x.shape[1] - 2)
     s = at - index
     left, right = x[:, index], x[:, index + 1]

@@ -9,12 +9,12 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.plant.loop.robustness import stays_stable
 from pipeline.plant.loop.sampled_loop import StateFeedback, discretise
 
-RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most: 12 samples a period
+RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most; about 12 samples in a period
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledPlant:
-    """The sampled plant, free of units: x over 1, v over `rate`, u over `stiffness`."""
+    """The sampled plant without units: x in 1, v in `rate`, u in `stiffness`."""
 
     chain: Chain
     cart: int
@@ -32,7 +32,8 @@ class SampledPlant:
         speeds = np.maximum(np.abs(chain.poles), 4 / settling)
         rate = float(np.exp(np.log(speeds).mean()))
         if sample_time is None:
-            # That of the laboratory's controller; 25 samples to settle.
+            # The laboratory controller's sample time, or shorter for 25 samples until the loop
+            # settles.
             sample_time = min(0.00884, RADIANS_PER_SAMPLE / speeds.max(), settling / 25)
         tied = chain.k[0] > 0 or chain.k[-1] > 0
         stiffness = 1 / chain.static_gains()[0] if tied else chain.m.sum() * rate**2
@@ -52,11 +53,11 @@ class SampledPlant:
 
     @property
     def row(self) -> int:
-        """Which state is the position of the cart."""
+        """The index of the state that is the position of the cart."""
         return 2 * (self.cart - 1)
 
     def to_units(self, gains: Array) -> Array:
-        """Return gains (…, 2n) in input unit per position unit, and per its rate."""
+        """Return gains (…, 2n) in input unit per position unit and per (position unit/s)."""
         return gains * self.stiffness / np.tile([1.0, self.rate], self.chain.n)
 
     def cost_to_units(self, weights: Array) -> Array:
@@ -65,7 +66,7 @@ class SampledPlant:
         return self.stiffness * weights / np.outer(unit, unit)
 
     def stays_stable(self, gains: Array) -> bool:
-        """Whether the loop tolerates the usual errors of the chain; gains in units."""
+        """Whether the loop tolerates the usual errors of the chain; the gains have units."""
         controller = StateFeedback(gains=gains, prefilter=1.0, model=self.chain)
         return stays_stable(self.chain, controller, sample_time=self.sample_time)
 
@@ -75,7 +76,7 @@ def energy_weights(plant: SampledPlant, weights: Array) -> Array:
     chain, n = plant.chain, plant.chain.n
     stiffness = chain.stiffness / plant.stiffness
     if chain.k[0] == chain.k[-1] == 0:
-        # Nothing holds the carts as a whole: weight their mean displacement as a spring would.
+        # Without a spring to a wall, the mean displacement gets a weight as from a spring.
         stiffness = stiffness + np.ones((n, n)) / n**2
     potential, kinetic = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2 * n))
     potential[0::2, 0::2] = stiffness

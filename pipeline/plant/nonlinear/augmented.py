@@ -1,6 +1,6 @@
 """Simulate the chain with effects: whole runs at once, or sample by sample under a controller.
 
-The results are sensor readings, which include a sensor's own scale. Importing this module compiles
+The results are sensor readings, so a sensor's own scale is included. Importing this module compiles
 code that the linear chain never needs.
 """
 
@@ -38,8 +38,8 @@ def simulate_augmented(
     Parameters
     ----------
     t, u : (n,) s and input, held from sample to sample.
-    free : the carts free to move; default all. The others are held at zero.
-    x0 : (n_carts,) positions at the start; default the rest positions.
+    free : the carts free to move. By default all; the others are held at zero.
+    x0 : (n_carts,) positions at the start. By default the rest positions.
 
     Returns
     -------
@@ -47,20 +47,20 @@ def simulate_augmented(
 
     Raises
     ------
-    DataError : the carts diverge.
+    DataError : the simulation diverges.
     """
     n = model.chain.n
     free = _all(n) if free is None else free
     x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
-    # In smaller steps than usual, since others are judged by this.
+    # The steps are smaller than usual, since other results are judged by this one.
     return _simulate(model.tables(), t, u, free=free, x0=x0, refine=4.0)
 
 
 def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) -> Array:
-    """Return where the carts rest without input and without dry friction, (n_carts,).
+    """Return the positions (n_carts,) at which the carts rest without input and dry friction.
 
-    They are released at zero with dampings so large that they creep to their rest. Carts without a
-    spring to a wall rest anywhere, so at zero.
+    The carts are released at zero, with such large dampings that they creep to their rest. Carts
+    without a spring to a wall can rest anywhere, so they stay at zero.
     """
     tables, n = model.tables(), model.chain.n
     cart = tables.cart
@@ -72,7 +72,7 @@ def rest_positions(model: AugmentedChain, *, free: Sequence[int] | None = None) 
     stiffness, m = model.chain.stiffness, model.chain.m
     cart[:, Cart.DAMPING] = 2.0 * np.sqrt(np.diag(stiffness) * m)
     slowest = np.sqrt(np.linalg.eigvals(stiffness / m[:, None]).real.min())
-    # After 40 periods of the slowest motion, heavily damped, the start is forgotten.
+    # After 40 periods of the slowest motion, with heavy damping, the start has no influence.
     t = np.array([0.0, 40.0 * 2 * np.pi / slowest])
     free = _all(n) if free is None else free
     return _simulate(tables, t, np.zeros(2), free=free, x0=np.zeros(n), refine=1.0)[:, -1]
@@ -94,7 +94,7 @@ def _all(n: int) -> tuple[int, ...]:
 
 
 def compile_simulator() -> None:
-    """Run the simulator once, so that it is compiled: ten seconds, unless it is stored."""
+    """Run the simulator once to compile it; this takes ten seconds, unless it is stored."""
     chain = Chain(m=np.ones(1), c=np.ones(1), k=np.array([1.0, 0.0]))
     simulate_augmented(AugmentedChain(chain=chain), np.array([0.0, 0.01]), np.zeros(2))
 
@@ -102,14 +102,14 @@ def compile_simulator() -> None:
 class SteppedBench:
     """A bench that advances by one interval at a time and keeps all of its state.
 
-    Friction, contacts, hidden masses, the delay line and the drive's lag carry over between calls.
-    A hand may carry a cart, release it, or push it.
+    Friction, contacts, hidden masses, the delay line and the drive's lag keep their state between
+    calls. A hand may move a cart, release it, or push it.
     """
 
     def __init__(
         self, model: AugmentedChain, *, free: Sequence[int] | None = None, x0: Array | None = None
     ) -> None:
-        """Put the bench at rest at `x0` (n_carts,), by default its rest positions."""
+        """Put the bench at rest at `x0` (n_carts,), by default at its rest positions."""
         n = model.chain.n
         free = _all(n) if free is None else sorted(set(free))
         x0 = rest_positions(model, free=free) if x0 is None else np.asarray(x0, dtype=np.float64)
@@ -144,7 +144,7 @@ class SteppedBench:
 
     @property
     def readings(self) -> Array:
-        """The readings of all carts' sensors, (n_carts,)."""
+        """The readings (n_carts,) of all carts' sensors."""
         return self._tables.cart[:, Cart.SENSOR_GAIN_GAIN] * self._state[kernel.X, : self._n]
 
     @property
@@ -155,7 +155,7 @@ class SteppedBench:
 
     @property
     def shortest_step(self) -> float:
-        """The longest substep allowed where it is stiffest, s."""
+        """The longest substep allowed where the bench is stiffest, s."""
         return min(self._step, self._push.contact_step)
 
     # ------------------------------------------------------------------ its motion
@@ -163,11 +163,11 @@ class SteppedBench:
     def step(self, u: float, *, following: float, interval: float) -> None:
         """Advance by `interval` s under the input `u`; `following` is the next input.
 
-        The next input is needed if a drive leads its log (a negative delay).
+        The next input is needed if the motor acts before its logged input (a negative delay).
 
         Raises
         ------
-        DataError : the carts diverge, or the drive leads by more than the interval.
+        DataError : the simulation diverges, or the motor acts earlier by more than the interval.
         """
         if -self._tables.drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
             raise DataError("in a closed loop the input cannot lead its log by over one sample")
@@ -188,8 +188,11 @@ class SteppedBench:
             raise DataError(_RUN_AWAY)
 
     def carry(self, cart: int, *, to: float, interval: float) -> None:
-        """Move one cart by hand to a position in `interval` s, the other free carts held."""
-        # No force moves a carried cart, yet its friction is felt.
+        """Move one cart by hand to a position within `interval` s.
+
+        The other free carts are held.
+        """
+        # No force moves a carried cart, but its friction acts on the hand.
         self._state[kernel.INV, self._rows] = 1e-30
         self._state[kernel.V, self._rows] = 0.0
         self._state[kernel.V, cart - 1] = (to - self._state[kernel.X, cart - 1]) / interval
@@ -209,10 +212,10 @@ class SteppedBench:
         """Add a constant force on one cart, until it is removed."""
         self._state[kernel.FIX, cart - 1] += force
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ private parts
 
     def _force(self, start: float, end: float, upcoming: tuple[float, float]) -> float:
-        """Return the mean of the delayed and lagged input from start to end, exactly."""
+        """Return the exact mean of the delayed and lagged input from start to end."""
         if self._lagged == 0.0 and upcoming[1] == 0.0 and not any(u for _, u in self._inputs):
             return 0.0
         delay = float(self._tables.drive[Drive.INPUT_DELAY_DELAY])
@@ -237,7 +240,7 @@ class SteppedBench:
         return s[kernel.FORCE] - self._bodies.K @ s[kernel.X]
 
     def _close_contacts(self) -> None:
-        """Put contacts that are closed from the start into the matrices."""
+        """Add contacts that are closed from the start to the matrices."""
         bodies = self._bodies
         for e, which in enumerate(bodies.switches):
             if guard(which, False, self._tables, bodies.s, 0.0) > 0.0:

@@ -55,12 +55,12 @@ class Drive(IntEnum):
     COGGING_PHASE = 11
 
 
-# What holds a cart at rest; a factor on it differs from run to run.
+# Dry friction, which may differ by a factor from run to run.
 DRY = (
     Cart.COULOMB_FRICTION_FORCE,
     Cart.STICTION_STATIC_FORCE,
     Cart.PRESLIDING_FRICTION_FORCE,
     Cart.LOAD_FRICTION_COEFFICIENT,
 )
-# Values, where they are not 0, that change nothing.
+# Values without effect, for columns in which 0 has an effect.
 NEUTRAL = {"SENSOR_GAIN_GAIN": 1.0}

@@ -1,12 +1,12 @@
 """The chain with its effects as an ordinary differential equation, for python-control.
 
-It is written from the effects' own laws. The simulator switches at exact instants; here it is a
-right-hand side that any solver may integrate, and two things are approximate:
+It is written from the effects' own laws. The simulator switches at exact instants, whereas any
+solver may integrate the right-hand side given here. Two things are approximate:
 
-- Dry friction, which is set-valued at rest, brakes a slow cart like a damper that would stop it in
-  `stop` s, up to the friction's size. A held cart creeps by force / mass * stop.
+- Dry friction is set-valued at rest. Here it brakes a slow cart like a damper that would stop it in
+  `stop` s, up to the friction's size. A held cart creeps at force / mass * stop.
 - A delay is a Padé approximation of the fourth order, good up to a frequency of about 4 / delay
-  (rad/s); C. Moler, C. Van Loan, SIAM Review 45 (2003), 3-49, section 3, for the exponential.
+  (rad/s). See C. Moler, C. Van Loan, SIAM Review 45 (2003), 3-49, section 3, for the exponential.
 
 Without effects it is the linear chain.
 """
@@ -34,7 +34,7 @@ from pipeline.plant.nonlinear.effects.law import (
 if TYPE_CHECKING:
     import control
 
-STOP_TIME = 1e-4  # s, the default of the parameter `stop`
+STOP_TIME = 1e-4  # s. Default of the parameter `stop`
 _PADE_ORDER = 4
 
 _FUNCTIONS: dict[str, Any] = {
@@ -73,8 +73,9 @@ class EquationsOfMotion:
 
     Attributes
     ----------
-    states : names: x1, v1, x2, …, then those of the effects: `z1` of a bristle, `x1_hidden` and
-        `v1_hidden` of a hidden mass, `x_motor` and `v_motor` behind a play, `u_lag`, `u_delay_1`, …
+    states : names. First x1, v1, x2, …, then those of the effects: `z1` of a bristle, `x1_hidden`
+        and `v1_hidden` of a hidden mass, `x_motor` and `v_motor` with a play, `u_lag`, `u_delay_1`,
+        ….
     """
 
     def __init__(self, model: AugmentedChain) -> None:
@@ -82,7 +83,7 @@ class EquationsOfMotion:
 
         Raises
         ------
-        DataError : the drive leads its log, which no state-space system can.
+        DataError : the motor acts before its logged input; no state model can do that.
         """
         chain, terms = model.chain, model.terms
         self.n = n = chain.n
@@ -109,7 +110,7 @@ class EquationsOfMotion:
             for term in terms
             if isinstance(term.effect.law, FrictionLaw)
         ]
-        # The dead zone shapes the input of the drive first.
+        # The dead zone comes first in the input of the drive.
         inputs = [term for term in terms if isinstance(term.effect.law, InputLaw)]
         inputs.sort(key=lambda term: term.effect.key)
         self._inputs = [
@@ -142,7 +143,8 @@ class EquationsOfMotion:
                 own = [f"x{i}_hidden", f"v{i}_hidden"]
             case "play":
                 own = ["x_motor", "v_motor"]
-                # Without the motor's mass a play leaves cart 1 at least a fiftieth.
+                # With a play, cart 1 keeps at least a fiftieth of its mass without the motor's
+                # mass.
                 self._m[0] = max(self._m[0] - term.values[1], 0.02 * self._m[0])
             case "lag":
                 own = ["u_lag"]
@@ -223,7 +225,7 @@ class EquationsOfMotion:
         return out
 
     def _arriving(self, state: Array, command: float, out: Array) -> float:
-        """Return the force that arrives from the drive; fill the rates of its states."""
+        """Return the force of the drive on its body; fill the rates of the drive's states."""
         u = command
         for law in self._inputs:
             u = law(u=u)
@@ -258,7 +260,7 @@ class EquationsOfMotion:
         return reach
 
     def to_control(self) -> "control.NonlinearIOSystem":
-        """Return python-control's system: input `u`, outputs `x1`, … as the sensors read them.
+        """Return the python-control system: input `u`, outputs `x1`, … as the sensors read them.
 
         Its parameter `stop` is the time in s in which dry friction stops a slow cart.
         """
@@ -284,7 +286,7 @@ class EquationsOfMotion:
 
 def _pade(delay: float) -> tuple[Array, Array, Array, float]:
     """Return A, b, c and d of the Padé approximation of exp(-s delay)."""
-    from scipy.signal import tf2ss  # half a second: imported where it is used
+    from scipy.signal import tf2ss  # takes half a second, so it is imported on use
 
     q = np.arange(_PADE_ORDER, -1, -1)
     order = _PADE_ORDER

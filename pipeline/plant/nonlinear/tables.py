@@ -1,6 +1,7 @@
-"""What the simulator reads: three tables of numbers for the carts, the springs and the drive.
+"""The input of the simulator: three tables of numbers for carts, springs and drive.
 
-An effect fills columns of one row; the neutral values of all columns are the linear chain.
+An effect fills columns of one row. With neutral values in all columns the model is the linear
+chain.
 """
 
 from enum import IntEnum

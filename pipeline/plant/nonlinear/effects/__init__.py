@@ -1,6 +1,6 @@
 """The catalogue of effects: behaviour of a bench beyond the linear chain.
 
-To add one: write an `Effect` in a file here, list it below, and run `python -m docs.codegen`.
+To add an effect: write an `Effect` in a file here, list it below, and run `python -m docs.codegen`.
 """
 
 import re
@@ -71,11 +71,11 @@ __all__ = [
 
 
 def find_effect(key: str) -> Effect:
-    """Return the effect of that name.
+    """Return the effect with a given name.
 
     Raises
     ------
-    ConfigError : no such effect; the message has the names that share a word, or the nearest.
+    ConfigError : there is no such effect; the message suggests similar names.
     """
     for effect in CATALOGUE:
         if effect.key == key:
@@ -91,7 +91,7 @@ def find_effect(key: str) -> Effect:
 def _with_words(typed: str) -> list[str]:
     """Return the effects with all the typed words in their name, else in their title.
 
-    In the order of the catalogue, which begins with the most common.
+    They are in the order of the catalogue, which begins with the most common.
     """
     words = set(_WORD.findall(typed[:60].lower()))  # no name is longer
     for names in (attrgetter("key"), attrgetter("title")):

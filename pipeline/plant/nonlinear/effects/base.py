@@ -35,9 +35,11 @@ class PlaceScales:
 
     Attributes
     ----------
-    position, velocity : the largest of the cart, or of the spring's stretch.
-    input : the largest input; sample_time in s.
-    mass, damping, stiffness : of the cart (all its springs), or of the spring and its carts.
+    position, velocity : the largest of the cart, or of the spring's stretch. In position units and
+        seconds.
+    input : the largest input.
+    sample_time : s.
+    mass, damping, stiffness : of the cart (with all its springs), or of the spring and its carts.
     """
 
     position: float
@@ -55,15 +57,17 @@ class EffectParameter:
 
     Attributes
     ----------
-    unit : in terms of "position", "input" and "s"; "" for a pure number.
-    scale : its typical size at a place, an expression in the fields of `PlaceScales`; starts and
+    unit : in terms of "position", "input" and "s". Empty for a pure number.
+    scale : its typical size at a place, an expression in the fields of `PlaceScales`. Starts and
         steps are multiples of it.
-    typical : the multiple of `scale` that makes the effect clearly visible.
-    signed : may be of either sign. A sign that picks a side (`side`) never changes.
-    neutral : the value that gives the base model (if one exists).
+    typical : the multiple of `scale` that makes the effect clearly visible. Used to hide it.
+    signed : whether the parameter may change its sign in a fit.
+    side : whether its sign selects a side. Such a sign never changes.
+    neutral : the value that gives the base model. None if no value does.
     lower, upper : bounds of the magnitude, in multiples of `scale`.
     reach : the largest step of its logarithm in a fit.
-    reported : False for a detail of the contact that the data need but no user asks for.
+    reported : False for a detail of a contact. The data need such a detail, but users do not ask
+        for it.
     """
 
     name: str
@@ -85,7 +89,7 @@ class EffectParameter:
         return evaluate(self.scale, vars(scales))
 
     def unit_text(self, *, position: str, input: str) -> str:
-        """Return the unit with the submission's own units in it."""
+        """Return the unit in terms of the submission's own units."""
         return self.unit.replace("position", position).replace("input", input)
 
 
@@ -95,20 +99,23 @@ class Effect:
 
     Attributes
     ----------
-    key : its name in files; `sentence` explains it to a student.
-    law : in the symbols of the parameters; growth : its coordinates in a fit from zero, if they
-        differ.
-    fingerprint : its signs in the data; deciding_run: the experiment that settles it.
-    axis : the quantity against which the force (or reading) shows it.
+    key : its name in files.
+    sentence : its explanation for a student.
+    law : its law, in the symbols of the parameters.
+    growth : its coordinates in a fit from zero. None if these are its parameters.
+    fingerprint : its signs in the data.
+    deciding_run : the experiment that confirms it or rules it out.
+    axis : the quantity against which it shows. The force (or reading) depends on it.
     between_carts : True if on a spring to a wall it would be part of the linear chain.
-    fewest_carts : with fewer it is part of the linear chain.
-    family : effects of one family exclude each other at one place; on several carts they are one.
+    fewest_carts : with fewer carts it is part of the linear chain.
+    family : effects of one family exclude each other at one place. On several carts they count as
+        one.
     grows_from : the simpler effect whose fit is the start of this one's.
-    only_rest : shows only in the rest positions, like an encoder's zero, and is found from them.
+    only_rest : True if only rest positions show it, as for an encoder zero. It is found from them.
     equivalent : effects that the data cannot distinguish from it, and why.
-    same_as, same_below : the key of an effect that provably cannot be distinguished from it while
-        its first parameter is below this many sample times.
-    genuine : False if the values have degenerated into another law.
+    same_as, same_below : the key of an effect that provably cannot be distinguished from it. This
+        holds while its first parameter is below so many sample times.
+    genuine : a function of the values. It returns False if they amount to another law.
     """
 
     written_as: ClassVar[str] = "key"
@@ -141,12 +148,12 @@ class Effect:
 
     @property
     def contact(self) -> bool:
-        """Whether it has a contact, with details that no user asks for."""
+        """Whether it has a contact, with details that users do not ask for."""
         return not all(p.reported for p in self.parameters)
 
     @property
     def formula(self) -> Math:
-        """The law, without details of the contact."""
+        """The law as mathematics, without details of the contact."""
         unseen = {p.symbol for p in self.parameters if not p.reported}
         return formula_of(self.law, place=self.place, unseen=unseen)
 
@@ -163,7 +170,7 @@ class Effect:
 
     @property
     def has_play(self) -> bool:
-        """Whether the motor may leave cart 1."""
+        """Whether the motor may lose contact with cart 1."""
         return self.is_built("play")
 
     @property
@@ -191,12 +198,12 @@ class Effect:
         return bool({"u", "on"} & names_in(text)) or self.place == "input"
 
     def is_built(self, *kinds: str) -> bool:
-        """Whether its law is built into the simulators."""
+        """Whether its law is one of these kinds that are built into the simulators."""
         return isinstance(self.law, BuiltLaw) and self.law.kind in kinds
 
     @property
     def own(self) -> tuple[EffectParameter, ...]:
-        """The parameters without those shared with the friction inside it."""
+        """The parameters, without those shared with the friction that it contains."""
         if not (isinstance(self.law, FrictionLaw) and self.law.beyond):
             return self.parameters
         mine = {*self.grown.coordinates, *self.grown.parameters}
@@ -204,10 +211,7 @@ class Effect:
 
     @property
     def grown(self) -> Growth:
-        """The coordinates in which the law grows from zero.
-
-        Its parameters, unless others are given.
-        """
+        """The coordinates in which the law grows from zero; by default its parameters."""
         symbols = tuple(p.symbol for p in self.parameters)
         return self.growth or Growth(symbols, signed=self.parameters[0].signed)
 
@@ -218,13 +222,13 @@ class Effect:
         return f"{owner}_{parameter.name}".upper()
 
     def columns(self, values: Mapping[str, float]) -> dict[IntEnum, float]:
-        """Return the entries of given parameter values in the simulator's tables."""
+        """Return the entries in the simulator's tables for given parameter values."""
         table = TABLES[self.place]
         by_name = {p.name: table[self.column_name(p)] for p in self.parameters}
         return {by_name[name]: value for name, value in values.items()}
 
     def grown_values(self, coordinates: Mapping[str, float]) -> dict[str, float]:
-        """Return the parameters for given coordinates (and shared parameters), by symbol."""
+        """Return the parameters by symbol, for given coordinates (and shared parameters)."""
         values = {p.name: coordinates[p.symbol] for p in self.own if p.symbol in coordinates}
         for p in self.own:
             if p.symbol in self.grown.parameters:
@@ -238,7 +242,7 @@ class Effect:
     def places(self, springs: Sequence[bool]) -> tuple[int, ...]:
         """Return its possible places on a bench: cart or spring numbers, or 0 for the input.
 
-        The two wall springs of a single cart only act through their sum, so one represents both.
+        The two wall springs of a single cart act only through their sum, so one represents both.
         """
         n = len(springs) - 1
         if n < self.fewest_carts:
@@ -253,7 +257,7 @@ class Effect:
         return present[:1] if n == 1 else present
 
     def where(self, place: int) -> dict[str, int]:
-        """Return the place as it is written to files: {"cart": 2}, {"spring": 1} or {}."""
+        """Return the place in the form used in files: {"cart": 2}, {"spring": 1} or {}."""
         return {} if self.place == "input" else {self.place: place}
 
     def fill(self, tables: Tables, place: int, values: Sequence[float]) -> None:
@@ -280,7 +284,7 @@ class EffectTerm:
     @property
     @computed()
     def where(self) -> dict[str, int]:
-        """{"cart": 1} or {"spring": 2}; empty: the input."""
+        """The place: {"cart": 1} or {"spring": 2}; empty for the input."""
         return self.effect.where(self.place)
 
     @property
@@ -293,7 +297,7 @@ class EffectTerm:
     def from_written(
         cls, *, effect: Effect, where: Mapping[str, int], parameters: Mapping[str, float]
     ) -> "EffectTerm":
-        """Return the effect that a file holds; a `KeyError` if it lacks a parameter."""
+        """Return the effect stored in a file; a `KeyError` if it lacks a parameter."""
         values = tuple(parameters[name] for name in effect.names)
         return cls(effect=effect, place=next(iter(where.values()), 0), values=values)
 
@@ -329,7 +333,7 @@ def chain_scales(
 ) -> PlaceScales:
     """Return the typical sizes at a place.
 
-    `largest` are position and velocity (n + 1,) of each cart or spring stretch; default 1.
+    `largest` are position and velocity (n + 1,) of each cart or spring stretch, by default 1.
     """
     position, velocity = np.ones((2, chain.n + 1)) if largest is None else largest
     i = max(at - 1, 0)

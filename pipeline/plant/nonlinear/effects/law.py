@@ -1,11 +1,11 @@
-"""The law of an effect, written once: expressions in Python's syntax, over symbols.
+"""The law of an effect, written once as expressions in Python's syntax.
 
-Quantities on a cart (cart 1, for the input): `x`, `v`. On a spring: its stretch `d`, `rate` and
-stiffness `k`. Everywhere: `u`, the force that arrives from the drive; `on`, 1 while the drive is
-powered and 0 otherwise; `z`, a state of the law's own. All other names are symbols of parameters.
-The functions are abs, sign, exp, sin, cos, min, max, clip.
+On a cart (cart 1, for the input) the symbols are `x` and `v`. On a spring they are its stretch `d`,
+`rate` and stiffness `k`. Everywhere, `u` is the force of the drive on its body, `on` is 1 while the
+drive is powered and 0 otherwise, and `z` is a state of the law's own. All other names are symbols
+of parameters. The functions are abs, sign, exp, sin, cos, min, max, clip.
 
-`python -m docs.codegen` generates compiled code, with all derivatives.
+`python -m docs.codegen` generates compiled code from the laws, with all derivatives.
 """
 
 import ast
@@ -35,7 +35,8 @@ class ForceLaw:
     Attributes
     ----------
     step : the longest step in s over which the force may be held.
-    on_motor : for an input: it acts on the motor, not on cart 1, if there is play between them.
+    on_motor : for an input, whether the force acts on the motor if there is play. Otherwise it acts
+        on cart 1.
     """
 
     force: str
@@ -46,11 +47,11 @@ class ForceLaw:
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Dry friction: its size while the cart slides; at rest it holds up to the same force.
+    """Dry friction: `size` while the cart slides; at rest it holds up to the same force.
 
     Attributes
     ----------
-    at_rest : the largest force that it holds, if that differs.
+    at_rest : the largest force that it holds, if different.
     beyond : key of the friction that it contains, whose parameters it shares.
     """
 
@@ -63,7 +64,7 @@ class FrictionLaw:
 
 @dataclass(frozen=True)
 class HysteresisLaw:
-    """Dry friction with its own state `z`, from -1 to 1: force and rate are linear in it."""
+    """Dry friction with its own state `z`, from -1 to 1; force and rate are linear in it."""
 
     force: str
     _: KW_ONLY
@@ -73,9 +74,9 @@ class HysteresisLaw:
 
 @dataclass(frozen=True)
 class ContactLaw:
-    """A force past a position (or stretch), whose sign is the side; it may only push, or also pull.
+    """A force past a position (or stretch) whose sign is the side; it may push, or also pull.
 
-    The simulators switch it at the exact instant.
+    The simulators switch it on and off at the exact instant.
     """
 
     force: str
@@ -87,7 +88,7 @@ class ContactLaw:
 
 @dataclass(frozen=True)
 class InputLaw:
-    """The part of the input `u` that arrives."""
+    """The part of the input `u` that arrives at the body."""
 
     arrives: str
     step: float = inf
@@ -111,10 +112,10 @@ class Growth:
 
     Attributes
     ----------
-    coordinates : symbols; those of parameters are these parameters.
-    parameters : the other parameters, by symbol: expressions in the coordinates, with `hypot` and
-        `atan2`, the spring's stiffness `k` and the parameters that are shared.
-    signed : the first one may be of either sign.
+    coordinates : symbols. A parameter's symbol stands for that parameter.
+    parameters : the other parameters, by symbol. They are expressions in the coordinates, with
+        `hypot` and `atan2`, the spring's stiffness `k` and the shared parameters.
+    signed : whether the first coordinate may have either sign.
     """
 
     coordinates: tuple[str, ...]
@@ -129,7 +130,7 @@ def evaluate(text: str, values: Mapping[str, float]) -> float:
 
 
 def names_in(text: str) -> set[str]:
-    """Return the names that an expression has, functions too."""
+    """Return the names in an expression, including functions."""
     return {node.id for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Name)}
 
 
@@ -158,11 +159,11 @@ def formula_of(law: Law, *, place: str, unseen: set[str]) -> Math:
             return row("f", "=", *slides, ",", WIDE_SPACE, *held)
 
 
-_SUM, _PRODUCT, _POWER, _ATOM = range(4)  # the precedence of an operation
+_SUM, _PRODUCT, _POWER, _ATOM = range(4)  # precedence of an operation
 
 
 class _Formula:
-    """Turns expressions into terms side by side."""
+    """Turns expressions into terms in a row."""
 
     def __init__(self, *, place: str, unseen: set[str]) -> None:
         on_cart_1 = {"x": sub("x", "1"), "v": sub("v", "1")} if place == "input" else {}

@@ -1,1 +1,1 @@
-"""The compiled simulator, with derivatives integrated beside the state."""
+"""The compiled simulator; derivatives are integrated with the state."""

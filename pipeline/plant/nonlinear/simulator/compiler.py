@@ -1,8 +1,8 @@
-"""The compiler, and where the functions that it compiled are kept.
+"""Compile functions with numba, and choose the folder for the compiled code.
 
-numba looks only at a function's own file to see whether what it kept is out of date, but a function
-holds the code and constants of other files too. So the folder is named after the content of all
-files that may be in it: any change leads to another folder, and the old one is removed.
+numba looks only at a function's own file to see whether stored code is out of date. But a function
+also contains code and constants from other files. So the folder is named after the content of all
+files that may matter. After any change the folder is another one, and the old one is removed.
 """
 
 import hashlib
@@ -20,9 +20,10 @@ from numba.core import config, event
 
 ROOM = Path(__file__).parent
 _PACKAGE = ROOM.parents[2]
-_settings: Any = config  # whose attributes are made when it is loaded
+_settings: Any = config  # its attributes appear when it is loaded
 _OPTIONS: dict[str, Any] = {
-    # Nothing here makes an array, so none needs counting, which took a quarter of a search's time.
+    # Without arrays made here, reference counts are not needed; they took a quarter of a search's
+    # time.
     "_nrt": False,
     "nogil": True,
     "fastmath": {"contract", "reassoc", "arcp", "nsz"},
@@ -31,14 +32,14 @@ _OPTIONS: dict[str, Any] = {
 
 
 def jit(function: Callable[..., Any]) -> Any:
-    """Compile a function when it is first called; later processes load the result."""
+    """Compile a function at its first call; later processes load the result."""
     return _compiled(function)
 
 
 def inlined(function: Callable[..., Any]) -> Any:
-    """Compile a function into those that call it.
+    """Compile a function into the functions that call it.
 
-    In the machine's code, where it is fast; in Python it would be typed at every call.
+    It is inlined in machine code. Inlining in Python would repeat the type analysis at every call.
     """
     return _compiled(function, forceinline=True)
 
@@ -54,10 +55,10 @@ def _compiled(function: Callable[..., Any], **more: Any) -> Any:
 
 @cache
 def kept_in(room: Path) -> Path | None:
-    """Return the folder for the compiled functions of a room; None, if no folder can be written.
+    """Return the folder for the compiled functions of a room; None if no folder is writable.
 
-    It is in the package's own `__pycache__` or, where that cannot be written, in the user's cache.
-    `NUMBA_CACHE_DIR` comes first.
+    It is in the package's own `__pycache__` or, if that is not writable, in the user's cache.
+    `NUMBA_CACHE_DIR` has priority.
     """
     name = f"{room.name}-{content_of(room)}"
     for root in _roots():
@@ -73,13 +74,13 @@ def kept_in(room: Path) -> Path | None:
 
 
 def is_compiled() -> bool:
-    """Return whether this Python's simulator is kept already."""
+    """Return whether compiled code for this Python is stored already."""
     folder, python = kept_in(ROOM), f"py{sys.version_info.major}{sys.version_info.minor}"
     return folder is not None and any(folder.rglob(f"kernel._simulate*.{python}*.nbc"))
 
 
 def content_of(room: Path) -> str:
-    """Return a name for the content of all files that the compiled functions of a room may hold."""
+    """Return a name for the content of all files that a room's compiled functions may contain."""
     digest = hashlib.sha256()
     for path in sorted({*shared_files(), *room.glob("*.py")}):
         digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
@@ -87,12 +88,12 @@ def content_of(room: Path) -> str:
 
 
 def shared_files() -> list[Path]:
-    """Return the files that any compiled function may hold: this room, and the tables' columns."""
+    """Return the files that any compiled function may contain: this room, and the columns."""
     return [*ROOM.glob("*.py"), ROOM.parent / "columns.py", ROOM.parent / "tables.py"]
 
 
 def _roots() -> Iterator[Callable[[], Path]]:
-    mine = hashlib.sha256(os.fsencode(_PACKAGE)).hexdigest()[:16]  # of several installations
+    mine = hashlib.sha256(os.fsencode(_PACKAGE)).hexdigest()[:16]  # one of several installations
     if _settings.CACHE_DIR:
         yield lambda: Path(_settings.CACHE_DIR) / f"cartlab-{mine}"
     yield lambda: _PACKAGE / "__pycache__" / "compiled"

@@ -12,7 +12,7 @@ from pipeline.plant.nonlinear.simulator.state import (
 
 @jit
 def position(s, i, h):
-    """Return where a body is, h from now, by its Taylor series."""
+    """Return the position of a body after a time h, by its Taylor series."""
     return s[X, i] + h * (
         s[V, i]
         + h
@@ -28,7 +28,7 @@ def position(s, i, h):
 
 @jit
 def velocity(s, i, h):
-    """Return how fast a body is, h from now, by its Taylor series."""
+    """Return the velocity of a body after a time h, by its Taylor series."""
     return s[V, i] + h * (
         s[D2, i]
         + h / 2.0 * (s[D3, i] + h / 3.0 * (s[D4, i] + h / 4.0 * (s[D5, i] + h / 5.0 * s[D6, i])))
@@ -37,10 +37,10 @@ def velocity(s, i, h):
 
 @jit
 def contact(which, tables):
-    """Return body, the other one or -1 (a wall), side, stiffness, damping and reach of a contact.
+    """Return body, other body (-1 for a wall), side, stiffness, damping and reach of a contact.
 
-    Contacts 0 to n - 1 are end stops, 2n + 1 and 2n + 2 the two sides of the gap between cart 1 and
-    the motor, body n.
+    Contacts 0 to n - 1 are end stops. Contacts 2n + 1 and 2n + 2 are the two sides of the gap
+    between cart 1 and the motor, which is body n.
     """
     n = tables.cart.shape[0]
     if which < n:
@@ -53,10 +53,10 @@ def contact(which, tables):
 
 @jit
 def guard(which, active, tables, s, h):
-    """Return how far past its switch a contact or slack is, h from now; positive means it switches.
+    """Return how far a switch is past its switching point after a time h; it switches if > 0.
 
-    Switches n to 2n are springs, the others contacts, which begin when the bodies meet and push,
-    and end when the push ends.
+    Switches n to 2n are springs past a stretch, the others contacts. A contact begins when the
+    bodies meet and push, and ends when the push ends.
     """
     n = tables.cart.shape[0]
     if n <= which <= 2 * n:
@@ -77,7 +77,7 @@ def guard(which, active, tables, s, h):
 
 @jit
 def switch(which, sign, tables, s, K, C):
-    """Put a contact or slack into the linear matrices (sign 1) or take it out (sign -1)."""
+    """Add a contact or slack spring to the linear matrices (sign 1) or remove it (sign -1)."""
     n = tables.cart.shape[0]
     if n <= which <= 2 * n:
         j = which - n

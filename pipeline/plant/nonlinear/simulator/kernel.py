@@ -1,18 +1,18 @@
 """Simulate carts with dry friction, contact, slack and an imperfect drive: compiled, by events.
 
 Every substep integrates the linear part (springs, dampers, hidden masses) by a Taylor series of
-sixth order, so the linear chain is exact to rounding. Nonlinear forces are held at their value in
+sixth order. So the linear chain is exact to rounding. Nonlinear forces are held at their value in
 the middle of the step. Dry friction is set-valued. A cart that stops inside a step stops at the
-root of its velocity polynomial. From rest it either sticks (and then truly does not move) or slides
-on. There is no tanh and no threshold velocity.
+root of its velocity polynomial. From rest it either sticks, and then does not move at all, or
+slides on. There is no tanh and no threshold velocity.
 
 Three tables define the simulation, with one row for each cart, each spring, and the drive. An
-effect fills columns of them (`plant.nonlinear.effects`); the neutral values of all columns give the
+effect fills columns of them (`plant.nonlinear.effects`). The neutral values of all columns give the
 linear chain.
 
-Reference: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., sec.
-VIII.2; for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit,
-Automatica 30 (1994), section 4.
+Reference: E. Hairer, C. Lubich, G. Wanner, "Geometric Numerical Integration", 2nd ed., sec. VIII.2;
+for the friction events B. Armstrong-Hélouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994),
+section 4.
 """
 
 from collections.abc import Sequence
@@ -38,19 +38,25 @@ from pipeline.plant.nonlinear.simulator.state import (
     ACC, FIX, FORCE, INV, MID_V, MID_X, ROWS, V, X, Z, Bodies, Push, pair, tie,
 )  # fmt: skip
 
-_SERIES_REACH = 0.2  # omega h: the series of sixth order then leaves 1e-8 after seconds
+_SERIES_REACH = 0.2  # omega h; the error of the sixth-order series is then 1e-8 after seconds
 _CONTACT_REACH = 0.4  # omega h inside a contact
-_INSTANT = 1e-9  # s; closer times count as one
-_BLOWN_UP = 1e9  # positions beyond this are a diverged model
+_INSTANT = 1e-9  # s; events closer than this count as simultaneous
+_BLOWN_UP = 1e9  # position at which the simulation has diverged
 
 
 class Excitation(NamedTuple):
-    """The excitation of a bench in one run.
+    """The input and the other given quantities of one run.
 
-    `t` (samples,) are its times; `knots` and `command` (k,) the input, held from knot to knot, and
-    `held` (3, k) room for what arrives of it and its integrals. `free` (n,) tells which carts move,
-    `guided` (n, samples) how the others do. `shots` (shots + 1,) has the first sample of each piece
-    that starts afresh, and the number of samples. `refine` divides the step.
+    Attributes
+    ----------
+    t : (samples,) times.
+    knots, command : (k,) the input, held from knot to knot.
+    held : (3, k) work array. It holds the input after the drive's laws, and its integrals.
+    free : (n,) which carts move.
+    guided : (n, samples) motion of the other carts. Zero by default.
+    shots : (shots + 1,) the first sample of each piece with its own start. The last entry is the
+        number of samples.
+    refine : divisor of the step.
     """
 
     t: Array
@@ -66,9 +72,12 @@ class Excitation(NamedTuple):
 class StartState(NamedTuple):
     """The start state of the bodies of one run.
 
-    `x` and `v` (shots, n) are those of the carts at the start of each shot; or (shots, 2 n), where
-    those of their hidden masses relative to them follow, which the first shot takes and the later
-    ones carry over. `scatter` (n,) is a factor on all dry friction of a cart.
+    Attributes
+    ----------
+    x, v : (shots, n) position and velocity of the carts at the start of each shot. With (shots, 2
+        n), the hidden masses follow, relative to their carts. Only the first shot uses these; the
+        later ones continue.
+    scatter : (n,) factor on all dry friction of a cart.
     """
 
     x: Array
@@ -87,8 +96,9 @@ def describe_run(
 ) -> Excitation:
     """Return a run in the simulator's form, with arrays of any kind copied.
 
-    `t` (samples,), `command` (k,), held from knot to knot, by default from sample to sample; `free`
-    (n,) which carts move; without `guided` (n, samples) the others stand still at zero. One shot.
+    `command` (k,) is held from knot to knot, by default from sample to sample. `free` (n,) says
+    which carts move. Without `guided` (n, samples) the others stand still at zero. By default there
+    is one shot.
     """
     t, free = _plain(t, np.float64), _plain(free, np.bool_)
     command = _plain(command, np.float64)
@@ -105,9 +115,9 @@ def describe_run(
 
 
 def _plain(array: Any, dtype: Any) -> Any:
-    """Return an array of the one kind the compiled function takes: whole, and writable.
+    """Return a contiguous and writable array, the only kind that the compiled function takes.
 
-    Numba would compile again, for ten seconds, for read-only or strided arrays.
+    For other arrays numba would compile again, which takes ten seconds.
     """
     array = np.asarray(array)
     fits = array.dtype == dtype and array.flags.carray
@@ -116,9 +126,9 @@ def _plain(array: Any, dtype: Any) -> Any:
 
 @jit
 def _assemble(tables, free, s, K, C, parent, switches):
-    """Fill the linear matrices and the parameters of switches.
+    """Fill the linear matrices and the numbers of the switches.
 
-    Returns how many bodies there are, the motor's row or -1, and how many switches.
+    Return the number of bodies, the motor's row (or -1), and the number of switches.
     """
     cart, spring, drive = tables.cart, tables.spring, tables.drive
     n = cart.shape[0]
@@ -162,7 +172,7 @@ def _assemble(tables, free, s, K, C, parent, switches):
 
 
 def assemble(tables: Tables, free: NDArray[np.bool_]) -> Bodies:
-    """Return the bodies of one bench at rest at zero, no contact closed."""
+    """Return the bodies of one bench, at rest at zero and with all contacts open."""
     n = len(tables.cart)
     size = 2 * n + 1
     s, K, C = np.zeros((ROWS, size)), np.zeros((size, size)), np.zeros((size, size))
@@ -188,7 +198,7 @@ def _integral(run, time, at):
 
 @jit
 def _edge(run, delay, now, end, at):
-    """Return when, between `now` and `end`, the delayed input first jumps; else `end`."""
+    """Return when the delayed input first jumps between `now` and `end`; else `end`."""
     knots, held = run.knots, run.held
     while at < knots.size - 1 and knots[at + 1] + delay < end - _INSTANT:
         at += 1
@@ -199,11 +209,12 @@ def _edge(run, delay, now, end, at):
 
 @inlined
 def _steps(tables, bodies, refine):
-    """Return the longest step, and the longest inside a contact, s; the size of dry friction, of …
+    """Return longest step (s), longest step in a contact (s), friction sizes and smooth places.
 
-    … its presliding part, and where there are smooth forces.
+    The friction sizes are those of sliding and of presliding friction. The last value says where
+    there are smooth forces.
     """
-    # Sums, from which flags are made: numba would compile a function for every constant flag.
+    # These are sums, later used as flags: numba would compile a function for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
     s, n, N, motor = bodies.s, bodies.n, bodies.N, bodies.motor
     for i in range(N):
@@ -223,7 +234,7 @@ def _steps(tables, bodies, refine):
             heavier = max(s[INV, j] if j < n else 0.0, s[INV, j - 1] if j > 0 else 0.0)
             fastest += extra * heavier
     reach, smooth = reach_of(tables.cart, tables.spring, tables.drive)
-    # Springs, dampers and dry friction are exact at any step: 4.5 ms, at the most.
+    # Springs, dampers and dry friction are exact for any step, so the limit is 4.5 ms.
     longest = min(4.5e-3, reach, _SERIES_REACH / sqrt(fastest + 1e-12))
     if motor >= 0:
         contact = max(
@@ -237,12 +248,12 @@ def _steps(tables, bodies, refine):
 
 @inlined
 def _start_shot(bodies, run, start, lanes, shot):
-    """Put the bodies where a shot starts."""
+    """Put the bodies at the start of a shot."""
     s, n, N, motor, parent = bodies.s, bodies.n, bodies.N, bodies.motor, bodies.parent
     restart(bodies, lanes, shot, run.free)
     for i in range(n):
         if run.free[i]:
-            # Hidden masses and the motor keep their place relative to their cart.
+            # Hidden masses and the motor keep their position relative to their cart.
             for j in range(n, N):
                 if (parent[j] == i) or (j == motor and i == 0):
                     s[X, j] += start.x[shot, i] - s[X, i]
@@ -258,7 +269,7 @@ def _start_shot(bodies, run, start, lanes, shot):
 
 @inlined
 def _bend(tables, bodies, lanes, scatter, u, smooth):
-    """Bend the presliding friction as far as it holds what acts on the carts at the start."""
+    """Bend the presliding friction as far as it balances the forces on the carts at the start."""
     s, n, N = bodies.s, bodies.n, bodies.N
     for i in range(N):
         s[MID_X, i], s[MID_V, i], s[FORCE, i] = s[X, i], s[V, i], s[FIX, i]
@@ -278,9 +289,9 @@ def _bend(tables, bodies, lanes, scatter, u, smooth):
 
 @jit
 def _simulate(tables, bodies, run, start, lanes, y, dy):
-    """Fill y (n, samples) with the readings of one run; False where the model diverged.
+    """Fill y (n, samples) with the readings of one run, and dy (lanes, n, samples).
 
-    And dy (lanes, n, samples) with their derivatives.
+    dy are the derivatives of the readings. Return False if the simulation diverges.
     """
     s, n = bodies.s, bodies.n
     t, knots, held, free, guided = run.t, run.knots, run.held, run.free, run.guided
@@ -303,7 +314,7 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
         first, end = run.shots[shot], run.shots[shot + 1]
         _start_shot(bodies, run, start, lanes, shot)
         for e in range(bodies.switches.size):
-            # The state is new: a contact may be open or closed from the start.
+            # A contact may be open or closed at the start.
             if guard(bodies.switches[e], bodies.active[e], tables, s, 0.0) > 0.0:
                 bodies.active[e] = not bodies.active[e]
                 sign = 1.0 if bodies.active[e] else -1.0
@@ -331,15 +342,16 @@ def _simulate(tables, bodies, run, start, lanes, y, dy):
                 upon = t[sample] + (sub + 1) * whole
                 h = whole
                 if (dry and s[V, driven] == 0.0) or now > upon - whole + _INSTANT:
-                    # A cart held by friction feels all of it until the input jumps.
+                    # A cart held by friction feels the actual input, so the step ends at the next
+                    # jump of the input.
                     h = _edge(run, delay, now, upon, at) - now
                 upto, upto2, at = _integral(run, now + h - delay, at)
                 mean = (upto - past) / h
-                # What comes early in the step moves the body further than its mean would.
+                # Input early in the step moves the body further than its mean would.
                 early = upto2 - past2 - 0.5 * h * (past + upto)
                 past, past2 = upto, upto2
                 if tau > 0.0:
-                    # Exact for the straight line that has the mean and the moment of the input.
+                    # Exact for a straight line with the mean and the moment of the input.
                     slope = -12.0 * early / h**3
                     decay = exp(-h / tau)
                     fading = lagged - mean + slope * (0.5 * h + tau)
@@ -374,13 +386,15 @@ def simulate(
 
     Parameters
     ----------
-    variants : b of them, each with what acts in it, and how it starts.
-    of : (2, lanes) by what: a kind of `sensitivity`, and a cart or spring, from 0.
+    variants : b of them, each with its tables and its start.
+    of : (2, lanes) the variable of each derivative. It is a kind of `sensitivity`, and a cart or
+        spring from 0.
 
     Returns
     -------
-    (b, n, samples) readings, encoder zero excluded; NaN where a variant diverged. And
-    (lanes, n, samples) derivatives of the first variant's.
+    (b, n, samples) readings without encoder zero. NaN if a variant diverged. Also (lanes, n,
+        samples)
+    derivatives of the first variant's readings.
     """
     of = _plain(of, np.int64)
     run = run._replace(held=np.zeros_like(run.held))  # threads may share a run

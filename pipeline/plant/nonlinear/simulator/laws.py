@@ -1,4 +1,4 @@
-"""The laws of the effects: what the compiled simulators know of them.
+"""The laws of the effects, for the compiled simulators.
 
 Made by `python -m docs.codegen` from the laws of the effects.
 """
@@ -93,14 +93,14 @@ def motor_slopes(drive, x, v, u, on):
 
 @inlined
 def cart_matrix(cart, i):
-    """Return what linear laws add to the stiffness and damping of a cart."""
+    """Return the stiffness and damping that linear laws add to a cart."""
     stiffness = damping = 0.0
     return stiffness, damping
 
 
 @inlined
 def spring_matrix(spring, j):
-    """Return what linear laws add to the stiffness and damping of a spring."""
+    """Return the stiffness and damping that linear laws add to a spring."""
     stiffness = damping = 0.0
     damping += spring[j, Spring.COUPLING_DAMPER_COEFFICIENT]
     return stiffness, damping
@@ -108,13 +108,13 @@ def spring_matrix(spring, j):
 
 @inlined
 def sliding(cart, i, u):
-    """Return the dry friction on cart i that is the same at any speed."""
+    """Return the part of the dry friction that does not depend on the speed."""
     return cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.LOAD_FRICTION_COEFFICIENT] * abs(u)
 
 
 @inlined
 def dropping(cart, i, v, u):
-    """Return the dry friction that changes with the speed."""
+    """Return the part of the dry friction that changes with the speed."""
     size = 0.0
     if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:
         size += (-cart[i, Cart.COULOMB_FRICTION_FORCE] + cart[i, Cart.STICTION_STATIC_FORCE]) * exp(
@@ -140,7 +140,7 @@ def drop_slope(cart, i, v, u):
 
 @inlined
 def settling(cart, i, v):
-    """Return the most that hysteresis holds, where its state tends to, how fast."""
+    """Return the largest force of hysteresis, the limit and rate (1/s) of its state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return (
             cart[i, Cart.PRESLIDING_FRICTION_FORCE],
@@ -152,7 +152,7 @@ def settling(cart, i, v):
 
 @inlined
 def settling_slopes(cart, i, v):
-    """Return the derivatives by the velocity of where the state tends to, how fast."""
+    """Return the derivatives by the velocity of the limit and rate of the state."""
     if cart[i, Cart.PRESLIDING_FRICTION_FORCE] != 0.0:
         return 0, (1.0 if v > 0.0 else -1.0) / cart[i, Cart.PRESLIDING_FRICTION_DISTANCE]
     return 0.0, 0.0
@@ -160,7 +160,7 @@ def settling_slopes(cart, i, v):
 
 @inlined
 def stop_of(cart, i):
-    """Return stiffness, damping and (signed) position of what stops cart i."""
+    """Return stiffness, damping and (signed) position of the end stop of cart i."""
     if cart[i, Cart.END_STOP_STIFFNESS] != 0.0:
         return (
             cart[i, Cart.END_STOP_STIFFNESS],
@@ -172,7 +172,7 @@ def stop_of(cart, i):
 
 @inlined
 def slack_of(spring, j):
-    """Return what spring j has more, past which stretch, and how by its stiffness."""
+    """Return extra stiffness of spring j, its stretch, and the slope by k."""
     if spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] != 0.0:
         return (
             spring[j, Spring.SLACK_SPRING_STIFFNESS_CHANGE] * spring[j, Spring.STIFFNESS],
@@ -184,7 +184,7 @@ def slack_of(spring, j):
 
 @inlined
 def arriving(drive, u):
-    """Return what dead zone, saturation and the like leave of an input."""
+    """Return the input after dead zone, saturation and similar laws."""
     if drive[Drive.DEAD_ZONE_WIDTH] != 0.0:
         u = (1.0 if u > 0.0 else -1.0) * max(0, -drive[Drive.DEAD_ZONE_WIDTH] + abs(u))
     if drive[Drive.SATURATION_LIMIT] != 0.0:
@@ -192,12 +192,12 @@ def arriving(drive, u):
     return u
 
 
-ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # where smooth forces are: a sum of these
+ON_CARTS, ON_SPRINGS, ON_DRIVE = 1, 2, 4  # places of smooth forces, to be added
 
 
 @jit
 def reach_of(cart, spring, drive):
-    """Return the longest step for the laws, in s, and where there are smooth forces."""
+    """Return the longest step for the laws, in s, and places of smooth forces."""
     longest, smooth = inf, 0
     for i in range(cart.shape[0]):
         if cart[i, Cart.STICTION_STATIC_FORCE] > cart[i, Cart.COULOMB_FRICTION_FORCE]:

@@ -1,13 +1,13 @@
-"""How the motion answers to parameters and start: sensitivities carried beside the state.
+"""Derivatives of the motion by parameters and start, integrated with the state.
 
-A small change of a parameter acts like a small force on the same linear system: a change of mass
-like the force -a per unit, of damping -v, of a spring its stretch, of friction the friction
-itself. So each sensitivity is a motion of its own: every step takes it on by the matrix
-exponential of the carts' own equations, with half of the small forces' impulse before and half
-after. Where dry friction lets a cart stop or a contact switches, the instant moves with the
-parameter, and the velocity's sensitivity jumps with the acceleration (a saltation).
+A small change of a parameter acts like a small force on the same linear system. Per unit of change,
+this force is -a for a mass, -v for a damping, the stretch for a spring, and the friction itself for
+friction. So each derivative is a motion of its own. In every step it is advanced by the matrix
+exponential of the carts' own equations. Half of the small force's impulse comes before, half after.
 
-Impulses are right to second order in the step: 1e-3 of a derivative, which only steers a fit.
+If dry friction stops a cart or a contact switches, the instant depends on the parameter. There the
+derivative of the velocity jumps with the acceleration (a saltation). Impulses are accurate to
+second order in the step. A derivative is then accurate to 1e-3, which is enough to guide a fit.
 
 Reference: I. A. Hiskens, M. A. Pai, IEEE Trans. Circuits and Systems I 47 (2000), 204-220.
 """
@@ -31,19 +31,23 @@ from pipeline.plant.nonlinear.simulator.state import (
     TURNED, V, X, Z, stretch,
 )  # fmt: skip
 
-# The variable of a lane's derivative: the table's own number, of a cart or a spring; the
-# factor on a cart's dry friction; or its start (from n on, that of the hidden mass on it).
+# Kinds of variables for derivatives: an entry of the tables, for a cart or spring; the factor on a
+# cart's dry friction; or a cart's start. From n on, the start is that of the hidden mass on a cart.
 BY_MASS, BY_DAMPING, BY_STIFFNESS, BY_FRICTION, BY_POSITION, BY_VELOCITY = range(6)
-_BLOCK = 4  # lanes that a processor takes at once: the last axis
+_BLOCK = 4  # lanes that a processor computes at once, along the last axis
 
 
 class Lanes(NamedTuple):
-    """Sensitivities of N bodies, and room to work in.
+    """Derivatives (lanes) of the state of N bodies, with work arrays.
 
-    `of` (2, lanes) tells by what each is, and of which cart or spring, from 0. The rows of `T`
-    (5 N + 2, blocks, 4) are N positions, N velocities, N presliding states; when the event comes
-    that is now; a force; 2 N to work in. `phi` (2 N + 1, 2 N) takes positions and velocities on;
-    its last row keeps the step and the inverse masses it is for. `work` is room to make it in.
+    Attributes
+    ----------
+    of : (2, lanes) the kind of variable of each lane, and its cart or spring (from 0).
+    T : (5 N + 2, blocks, 4) rows. N positions, N velocities and N presliding states come first.
+        Then the time of the current event, a force, and 2 N rows of work space.
+    phi : (2 N + 1, 2 N) matrix that advances positions and velocities. Its last row holds the step
+        and the inverse masses that it is valid for.
+    work : (7, N) work space to compute `phi`.
     """
 
     of: NDArray[np.int64]
@@ -53,10 +57,10 @@ class Lanes(NamedTuple):
 
 
 def make_lanes(of: NDArray[np.int64], N: int) -> Lanes:
-    """Return the lanes `of` (2, lanes: by what, of which) for N bodies, in whole blocks."""
+    """Return the lanes `of` (2, lanes: kind and place) for N bodies, in whole blocks."""
     wanted = of.shape[1]
     blocks = (wanted + _BLOCK - 1) // _BLOCK
-    padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # by nothing: it fills a block
+    padded = np.full((2, blocks * _BLOCK), BY_VELOCITY + 1)  # no kind: fills the last block
     padded[:, :wanted] = of
     T, phi = np.zeros((5 * N + 2, blocks, _BLOCK)), np.full((2 * N + 1, 2 * N), -1.0)
     return Lanes(padded, T, phi, np.empty((7, N)))
@@ -64,7 +68,7 @@ def make_lanes(of: NDArray[np.int64], N: int) -> Lanes:
 
 @jit
 def _add(T, row, factor, other):
-    """Add a multiple of another row to one."""
+    """Add a multiple of another row to a row."""
     for block in range(T.shape[1]):
         for q in range(_BLOCK):
             T[row, block, q] += factor * T[other, block, q]
@@ -72,9 +76,9 @@ def _add(T, row, factor, other):
 
 @jit
 def carry(tables, bodies, push, lanes, whole, step):
-    """Move the sensitivities on by `step`, before the state moves.
+    """Advance the derivatives by `step`, before the state moves.
 
-    Forces were taken in the middle of the `whole` step.
+    Forces are those in the middle of the `whole` step.
     """
     s, n, N, cart = bodies.s, bodies.n, bodies.N, tables.cart
     T, phi, of = lanes.T, lanes.phi, lanes.of
@@ -157,7 +161,7 @@ def _exponential(bodies, lanes, step):
 def _force(kind, at, s, n, spring):
     """Return the force that a unit change of a parameter adds, in the middle of the step.
 
-    On its cart; of a spring, what draws both its ends together.
+    It acts on the parameter's cart. For a spring, it draws both ends together.
     """
     if kind == BY_MASS:
         return -s[HALF_A, at]
@@ -174,7 +178,7 @@ def _force(kind, at, s, n, spring):
 
 @jit
 def _kick(tables, bodies, push, lanes, whole, span):
-    """Give the lanes the impulse of `span` s of their forces and of the nonlinear slopes."""
+    """Give the lanes the impulse of their forces and of the nonlinear slopes over `span` s."""
     s, n, N, driven, T, of = bodies.s, bodies.n, bodies.N, bodies.driven, lanes.T, lanes.of
     cart, drive, scatter = tables.cart, tables.drive, push.scatter
     u, on, smooth = push.u, push.on, push.smooth
@@ -215,14 +219,14 @@ def _kick(tables, bodies, push, lanes, whole, span):
 
 @jit
 def _settled(cart, i, s, target, decay, span):
-    """Return what the presliding state of cart i is, `span` s later, by the velocity."""
+    """Return the derivative by velocity of cart i's presliding state after `span` s."""
     by_target, by_pace = settling_slopes(cart, i, s[MID_V, i])
     return by_target * (1.0 - decay) - (s[Z, i] - target) * decay * span * by_pace
 
 
 @jit
 def _bend(T, bodies, body, by, span, by_x, by_v):
-    """Give the lanes of a body the impulse of a force with slopes by the state of one."""
+    """Give the lanes of a body the impulse of a force that depends on another body's state."""
     s, N = bodies.s, bodies.N
     if by_x != 0.0:
         _add(T, N + body, s[GRIP, body] * span * by_x, by)
@@ -232,7 +236,7 @@ def _bend(T, bodies, body, by, span, by_x, by_v):
 
 @jit
 def stop(T, s, N, i):
-    """Note that dry friction brings body i to a stop now: when, per lane."""
+    """For each lane, note the time at which dry friction stops body i."""
     before = s[ACC, i]
     _add(T, 3 * N, -1.0, 3 * N)
     if before != 0.0:
@@ -242,9 +246,10 @@ def stop(T, s, N, i):
 
 @jit
 def meet(T, bodies, body, other, stiffness, damping):
-    """Note that a contact of a body, with another or (-1) a wall, begins or ends now: when.
+    """For each lane, note the time at which a contact of a body begins or ends.
 
-    It ends where its push, of stiffness and damping, does; it begins (damping 0) where they touch.
+    `other` is the other body, or -1 for a wall. A contact ends when its push, given by stiffness
+    and damping, ends. It begins (with damping 0) when the bodies touch.
     """
     s, N = bodies.s, bodies.N
     rate = stiffness * s[V, body] + damping * s[ACC, body]
@@ -262,7 +267,7 @@ def meet(T, bodies, body, other, stiffness, damping):
 
 @jit
 def restart(bodies, lanes, shot, free):
-    """Restart the sensitivities where a shot begins."""
+    """Restart the derivatives at the beginning of a shot."""
     n, N, motor, parent, T, of = (
         bodies.n, bodies.N, bodies.motor, bodies.parent, lanes.T, lanes.of
     )  # fmt: skip
@@ -283,7 +288,7 @@ def restart(bodies, lanes, shot, free):
 
 @jit
 def bend_presliding(bodies, lanes, i, most, scatter):
-    """Start the presliding state of cart i where the others' sensitivities bend it."""
+    """Set the derivatives of cart i's presliding state at the start from those of the forces."""
     s, n, N, T, of = bodies.s, bodies.n, bodies.N, lanes.T, lanes.of
     for lane in range(of.shape[1]):
         kind, at, block, q = of[0, lane], of[1, lane], lane // _BLOCK, lane % _BLOCK

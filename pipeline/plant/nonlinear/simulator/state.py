@@ -1,6 +1,6 @@
-"""What the compiled functions share: the structures they take.
+"""Structures that the compiled functions share.
 
-Structures are tuples with names, which numba compiles to what their fields alone would be.
+They are named tuples, which numba compiles to separate fields.
 """
 
 from typing import NamedTuple
@@ -10,24 +10,34 @@ from numpy.typing import NDArray
 from pipeline.arrays import Array
 from pipeline.plant.nonlinear.simulator.compiler import jit
 
-# Rows of the state table: position, velocity, presliding state, last acceleration, inverse mass,
-# state in the middle of the step, force, time derivatives 2 to 6 of the position, and the dry
-# friction's direction, the inverse mass it leaves (0 for a cart that sticks), and the decay of the
-# presliding state over half a step; constant forces of closed contacts; the dry friction force;
-# the acceleration before an event, and whether one has just changed it; which springs are past
-# their stretch; position, velocity and acceleration in the middle of what the step has become.
+# Rows of the state table.
+# - X to INV. Position, velocity, presliding state, last acceleration and inverse mass.
+# - MID_X to FORCE. Position and velocity in the middle of the step, and the force.
+# - D2 to D6. Time derivatives 2 to 6 of the position.
+# - SIDE to FIX. Direction of dry friction, inverse mass with it (0 for a cart that sticks), decay
+# of the presliding state over half a step, constant forces of closed contacts.
+# - RUB to PAST. Dry friction force, acceleration before an event, whether an event has just changed
+# it, which springs are past their stretch.
+# - HALF_X to HALF_A. Position, velocity and acceleration in the middle of the step, which an event
+# may have shortened.
 X, V, Z, ACC, INV, MID_X, MID_V, FORCE, D2, D3, D4, D5, D6, SIDE, GRIP, DECAY, FIX = range(17)
 RUB, BEFORE, TURNED, PAST, HALF_X, HALF_V, HALF_A = range(17, 24)
 ROWS = 24
 
 
 class Bodies(NamedTuple):
-    """Carts, motor and hidden masses: the linear part of the plant, and the state of all that acts.
+    """Carts, motor and hidden masses: the linear part of the plant, and its state.
 
-    `n` are the carts, `N` all bodies; `motor` is the motor's row or -1, `driven` that of the body
-    which the input pushes. `parent` has the carts of hidden masses, or -1. `s` is the table of the
-    state; `K` and `C` are the linear matrices, closed contacts included. `switches` are the numbers
-    of the contacts and slack springs there are, see `guard`, `active` which are closed.
+    Attributes
+    ----------
+    n, N : number of carts, and of all bodies.
+    motor : the motor's row, or -1.
+    driven : row of the body on which the input acts.
+    parent : for each hidden mass, its cart. Otherwise -1.
+    s : the table of the state.
+    K, C : the linear matrices. Closed contacts are included.
+    switches : numbers of the existing contacts and slack springs. See `guard`.
+    active : which of them are closed.
     """
 
     n: int
@@ -43,11 +53,16 @@ class Bodies(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What acts on the bodies during a step of `h` s.
+    """The forces and options of a step of `h` s.
 
-    `u` is the input that arrives, its mean over the step; `on` whether the drive is powered;
-    `scatter` (n,) a factor on all dry friction of a cart. `dry` tells whether there is any,
-    `smooth` where there are smooth forces, `contact_step` how long a step may be inside a contact.
+    Attributes
+    ----------
+    u : mean input that arrives during the step.
+    on : whether the drive is powered. 1 or 0.
+    scatter : (n,) factor on all dry friction of a cart.
+    dry : whether there is dry friction.
+    smooth : where there are smooth forces. See `reach_of`.
+    contact_step : longest step inside a contact.
     """
 
     u: float
@@ -61,7 +76,7 @@ class Push(NamedTuple):
 
 @jit
 def tie(M, j, n, value):
-    """Add `value` between both ends of spring j (0 to n) of n carts to a symmetric matrix."""
+    """Add `value` for a spring j (0 to n) of n carts to a symmetric matrix."""
     if j < n:
         M[j, j] += value
     if j > 0:
@@ -83,5 +98,5 @@ def pair(M, i, j, value):
 
 @jit
 def stretch(s, row, j, n):
-    """Return by how much spring j of n carts is stretched, by a row of the state table."""
+    """Return the stretch of spring j of n carts, from a row of the state table."""
     return (s[row, j] if j < n else 0.0) - (s[row, j - 1] if j > 0 else 0.0)

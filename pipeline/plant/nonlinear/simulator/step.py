@@ -23,7 +23,7 @@ _MOST_EVENTS = 12  # in one substep; more would be chatter
 
 @inlined
 def smooth_forces(tables, bodies, u, on, smooth):
-    """Add the forces that are neither linear nor dry, at the state in the middle of the step."""
+    """Add the forces that are neither linear nor dry, for the state in the middle of the step."""
     s, n, driven, drive = bodies.s, bodies.n, bodies.driven, tables.drive
     if smooth & ON_CARTS:
         for i in range(n):
@@ -42,7 +42,7 @@ def smooth_forces(tables, bodies, u, on, smooth):
 
 @inlined
 def rub(cart, bodies, push, step):
-    """Add dry friction to the forces; a cart that it holds gets no inverse mass."""
+    """Add dry friction to the forces; a cart that it holds gets inverse mass 0."""
     s, n, scatter, u = bodies.s, bodies.n, push.scatter, push.u
     for i in range(n):
         s[RUB, i] = 0.0
@@ -51,7 +51,7 @@ def rub(cart, bodies, push, step):
             s[DECAY, i] = exp(-0.5 * pace * step)
             s[RUB, i] -= most * (target + (s[Z, i] - target) * s[DECAY, i])
     for i in range(n):
-        # side: the direction the cart slides in, 0 where nothing dry acts on it.
+        # The direction in which the cart slides; 0 without dry friction.
         s[SIDE, i] = 0.0
         if s[INV, i] == 0.0:
             continue
@@ -99,14 +99,14 @@ def taylor(s, K, C, N):
 
 @inlined
 def first_stop(s, n, step, none):
-    """Return when, within the step, the first sliding cart stops, and which: or `none`."""
+    """Return when the first sliding cart stops within the step, and which one (else `none`)."""
     stopping = none
     for i in range(n):
         if s[SIDE, i] == 0.0:
             continue
         end = velocity(s, i, step)
         if s[SIDE, i] * end < 0.0 and s[V, i] != 0.0:
-            # The root of the velocity: false position, made safe by its bracket.
+            # Root of the velocity by false position, which always keeps a bracket.
             low, high, v_low, v_high = 0.0, step, s[V, i], end
             for _ in range(4):
                 guess = low + (high - low) * v_low / (v_low - v_high)
@@ -122,7 +122,7 @@ def first_stop(s, n, step, none):
 
 @inlined
 def first_switch(tables, bodies, step, none):
-    """Return when, within the step, the first contact or slack switches, and which: or `none`."""
+    """Return when the first contact or slack switches within the step, and which (else `none`)."""
     switching, switches, active, s = none, bodies.switches, bodies.active, bodies.s
     for e in range(switches.size):
         end = guard(switches[e], active[e], tables, s, step)
@@ -130,7 +130,7 @@ def first_switch(tables, bodies, step, none):
             low, high = 0.0, step
             g_low = guard(switches[e], active[e], tables, s, 0.0)
             g_low, g_high = min(g_low, -1e-300), end
-            # The root by the Illinois method, taken on its far side.
+            # Root by the Illinois method; the end after the root is taken.
             for _ in range(8):
                 guess = low + (high - low) * g_low / (g_low - g_high)
                 value = guard(switches[e], active[e], tables, s, guess)
@@ -145,15 +145,15 @@ def first_switch(tables, bodies, step, none):
 
 @inlined
 def advance(tables, bodies, push, lanes):
-    """Advance x, v and the presliding state z by a step, from friction event to friction event.
+    """Advance x, v and the presliding state z by a step, from event to event.
 
-    Sensitivities go along, see `make_lanes`.
+    Derivatives are advanced too, see `make_lanes`.
     """
     s, K, C, n, N = bodies.s, bodies.K, bodies.C, bodies.n, bodies.N
     switches, active = bodies.switches, bodies.active
     left = push.h
     events = 0
-    none = N + switches.size  # no body's number, and no switch's
+    none = N + switches.size  # no body and no switch has this number
     while left > 1e-12:
         step = left
         for e in range(switches.size):
@@ -170,7 +170,7 @@ def advance(tables, bodies, push, lanes):
         s[FORCE, bodies.driven] += push.u
         if push.dry:
             rub(tables.cart, bodies, push, step)
-        # The usual sizes as constants: the compiler then unrolls the loops.
+        # With the usual sizes as constants, the compiler unrolls the loops.
         if N == 1:
             taylor(s, K, C, np.int64(1))
         elif N == 2:
@@ -212,7 +212,7 @@ def advance(tables, bodies, push, lanes):
                 meet(lanes.T, bodies, body, other, k, ends * c)
             active[switching] = not active[switching]
             sign = 1.0 if active[switching] else -1.0
-            lanes.phi[2 * N, 0] = -1.0  # its matrix is no longer that of the carts
+            lanes.phi[2 * N, 0] = -1.0  # the carts have other equations from here
             switch(which, sign, tables, s, K, C)
             events += 1
         left -= step

@@ -33,7 +33,7 @@ class Kind(IntEnum):
     EXTRA_MODE = 18
 
 
-# By kind: which coordinates vanish with the effect; the others are its shape.
+# By kind, the coordinates that vanish with the effect; the others are its shape.
 COEFFICIENTS = (
     (0,),
     (0,),
@@ -66,16 +66,16 @@ FRICTION = (
     Kind.LOAD_FRICTION,
 )
 HYSTERESIS = (Kind.PRESLIDING_FRICTION,)
-# How many numbers `terms` or `settle` fills, at most.
+# Most numbers that `terms` or `settle` fill in.
 TERMS = 11
 
 
 @jit
 def terms(kind, p, o, x, v, k, u, on, out):
-    """Fill `out` with the law of a kind, its coordinates from p[o], and derivatives.
+    """Fill `out` with the law of a kind and derivatives; coordinates start at p[o].
 
-    By position, velocity and input, then by each coordinate. `x` and `v` are those of a
-    cart or of a spring's stretch, `k` its stiffness.
+    The derivatives are by position, velocity and input, then by each coordinate.
+    `x` and `v` are those of a cart or of a spring's stretch, `k` is its stiffness.
     """
     if kind == Kind.COULOMB_FRICTION:
         out[0] = p[o]
@@ -176,7 +176,7 @@ def terms(kind, p, o, x, v, k, u, on, out):
 
 @jit
 def settle(kind, p, o, v, out):
-    """Fill `out` with `settling`, its slopes, and its three by each coordinate."""
+    """Fill `out` with `settling`, its slopes, and derivatives by coordinate."""
     if kind == Kind.PRESLIDING_FRICTION:
         out[0] = p[o]
         out[1] = 1.0 if v > 0.0 else -1.0
