@@ -1,1 +1,1 @@
-"""Simulated benches: one value that writes a submission, or answers as a bench on a line."""
+"""Simulated benches, which write submissions or answer on a serial line."""

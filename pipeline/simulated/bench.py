@@ -14,24 +14,24 @@ from pipeline.plant.nonlinear.effects import AugmentedChain, EffectTerm
 from pipeline.plant.nonlinear.tables import Cart
 from pipeline.results import Kind
 
-# The ECP 210: its servo loop and its encoder.
+# The servo loop and the encoder of the ECP 210.
 SAMPLE_TIME = 0.00884  # s
 COUNT = 0.00227  # cm
 
-# A hand trembles by hundredths of a millimetre at these rates; it is not a clamp.
+# A hand trembles by hundredths of a millimetre at these rates, so it does not hold like a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])
-_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance at which the cart is held
-_SHORTEST_STEP = 1e-5  # s of the simulator: a session then takes half an hour to simulate
+_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance from rest, while held
+_SHORTEST_STEP = 1e-5  # s of simulator time. With it, a session takes half an hour to simulate
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReleasingHand:
-    """A hand that holds one cart off its rest and lets go.
+    """A hand that holds one cart off its rest and lets it go.
 
     Attributes
     ----------
     position : where it holds the cart, position units from rest.
-    release, fade : s; from `release` its force falls linearly to zero during `fade`.
+    release, fade : s. At `release` its force starts to fall linearly, and is zero after `fade`.
     tremor : (3,) phases of its trembling, rad.
     """
 
@@ -55,11 +55,11 @@ class BenchRun:
 
     Attributes
     ----------
-    t, u : (n,) s and input, held between the samples; in a closed loop the bench computes u itself.
+    t, u : (n,) s and input, held between the samples. In closed loop the bench computes u itself.
     free : the carts free to move.
     frequency : of a sine dwell, Hz.
-    reference, controller, input_limit : of a closed loop; `cart` is the controlled one.
-    keep_from : s; the recorder starts here, with its clock.
+    reference, controller, input_limit : of a closed loop. The controlled cart is `cart`.
+    keep_from : s. The recording starts here, and its clock too.
     """
 
     id: str
@@ -94,16 +94,16 @@ class SimulatedBench:
 
     Attributes
     ----------
-    name : of the preset or the model's file; "": no name.
-    effects : beyond the linear chain; without any nothing is compiled.
-    told : one sentence for each effect, with its parameters; never in the submission.
-    travel : intended motion of the carts, position units.
-    count : the encoder step, position units.
-    input_limit : the largest input, input units.
+    name : of the preset or the model's file. May be empty.
+    effects : effects beyond the linear chain. Without effects nothing is compiled.
+    told : one sentence for each effect, with its parameters. Never written into the submission.
+    travel : intended motion of the carts. Position units.
+    count : the encoder step. Position units.
+    input_limit : the largest input. Input units.
     sample_time : s, of the controller, the input and the log.
-    noise_counts : standard deviation of a free cart's encoder noise; with 0.2 its reading flickers
+    noise_counts : standard deviation of a free cart's encoder noise. With 0.2 its reading flickers
         between two counts.
-    zero_error_counts : encoders are zeroed by hand, within this of the carts' rest.
+    zero_error_counts : encoders are zeroed by hand, within so many counts of the carts' rest.
     """
 
     chain: Chain
@@ -120,7 +120,7 @@ class SimulatedBench:
     zero_error_counts: float = 2.0
 
     def refuse_endless(self) -> None:
-        """Refuse effects so stiff, or masses so small, that no simulation of them would end.
+        """Refuse stiff effects or small masses that would make the simulation endless.
 
         Raises
         ------
@@ -139,11 +139,11 @@ class SimulatedBench:
             )
 
     def move(self, run: BenchRun) -> TrueMotion:
-        """Return the motion of the carts: the only place with the law of motion.
+        """Return the motion of the carts; only this function contains the law of motion.
 
         Raises
         ------
-        DataError : the effects make the carts diverge.
+        DataError : the effects make the simulation diverge.
         """
         chain, x = self.chain, np.zeros((self.chain.n, run.t.size))
         rows = [cart - 1 for cart in run.free]
@@ -189,7 +189,7 @@ class SimulatedBench:
         error = self.zero_error_counts * self.count
         zero = rng.uniform(-error, error, size=(n_carts, 1))
         if run.controller is not None:
-            zero[:] = 0.0  # the controller needs its zero at rest, so this comes first
+            zero[:] = 0.0  # the controller needs its zero at rest
         shaken = np.isin(np.arange(1, n_carts + 1), run.free)[:, None]
         noise = self.noise_counts * self.count
         x = motion.x + zero + noise * shaken * rng.standard_normal((n_carts, n))
@@ -197,10 +197,11 @@ class SimulatedBench:
 
 
 def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]) -> Array:
-    """Return the positions (f, n) of the free carts, all but the hand's at rest until it lets go.
+    """Return the positions (f, n) of the free carts around the release by a hand.
 
-    The hand's force on its cart balances the springs at the release and fades from there, so the
-    decay begins softly, as with a hand, not with a step.
+    Until the hand lets go, all other carts are at rest. At the release, the hand's force balances
+    the springs, and then it fades. So the decay begins gradually, as with a real hand, and not with
+    a step.
     """
     A, B, C, _ = chain.state_space(free=free)
     row = sorted(free).index(hand.cart)
@@ -219,9 +220,9 @@ def _release(chain: Chain, t: Array, hand: ReleasingHand, *, free: Sequence[int]
 
 
 def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingHand) -> Array:
-    """Return the readings (n_carts, n) of a run with a hand in it, as `_release` does.
+    """Return the readings (n_carts, n) of a run with a hand, as `_release`, but with effects.
 
-    The hand pulls the cart out before the recorder starts, which sets the state of friction and
+    The hand pulls the cart out before the recording starts, which sets the state of friction and of
     hidden masses. The cart then follows the hand's tremor, and is released as in the linear chain.
     """
     from pipeline.plant.nonlinear.augmented import SteppedBench
@@ -230,7 +231,7 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
     bench, t, cart = SteppedBench(model, free=run.free), run.t, hand.cart
     start = int(np.searchsorted(t, hand.release))
     x = np.zeros((model.chain.n, t.size))
-    # A hand takes 1.5 s to pull a cart out, before the recorder starts.
+    # A hand takes 1.5 s to pull a cart out, before the recording starts.
     pull = np.linspace(0.0, np.pi, round(1.5 / float(t[1] - t[0])))
     path = np.append(hand.hold(t[0])[0] * (1 - np.cos(pull)) / 2, hand.hold(t[: start + 1])[0])
     for sample, position in enumerate(path, start=-pull.size):
@@ -240,7 +241,7 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
     force = bench.let_go(cart, velocity=float(hand.hold(t[start])[1]))
     ramp = force * np.clip(1 - (t - t[start]) / hand.fade, 0.0, 1.0)
     for sample in range(start, t.size - 1):
-        # Between the samples the force is linear; each short step takes its mean.
+        # Between the samples the force falls linearly, in ten short steps.
         steps = 10 if ramp[sample] != 0.0 else 1  # while the hand's force falls
         for share in (np.arange(steps) + 0.5) / steps:
             push = float((1 - share) * ramp[sample] + share * ramp[sample + 1])
@@ -252,10 +253,10 @@ def _release_with_effects(model: AugmentedChain, run: BenchRun, hand: ReleasingH
 
 
 def before_stop(hand: ReleasingHand, model: AugmentedChain) -> ReleasingHand:
-    """Return a hand that holds its cart on the near side of the end stop, if there is one."""
+    """Return the hand, moved so that it holds its cart before any end stop."""
     row = model.tables()[0][hand.cart - 1]
     stiff = row[Cart.END_STOP_STIFFNESS] > model.chain.stiffness[hand.cart - 1, hand.cart - 1]
-    # No hand pulls a cart into its end stop.
+    # A hand pulls a cart to at most 0.9 of the way to its end stop.
     furthest = 0.9 * float(row[Cart.END_STOP_POSITION])
     beyond = hand.position * furthest > furthest**2
     return replace(hand, position=furthest) if stiff and beyond else hand

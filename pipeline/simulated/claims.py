@@ -1,4 +1,4 @@
-"""The report of an honest student: a slightly wrong model, rounded numbers."""
+"""The report of honest students: a slightly wrong model, with rounded numbers."""
 
 import math
 from collections.abc import Sequence
@@ -13,15 +13,15 @@ from pipeline.submission.toml_section import TypedNumber
 
 # Typical errors of a fit to some twenty dwells, as relative standard deviations.
 _FIT_ERROR_SPRING_OR_MASS = 0.005
-# Ruler, cursor and peak-picking: initial estimates from steps and decays.
+# For initial estimates from steps and decays, by ruler, cursor and peak-picking.
 _HAND_ERROR = 0.007
 _GUESSED_ZETA = TypedNumber(
     "0.10"
-)  # "we usually use the initial estimate that both are approximately 0.1"
+)  # the paper: "we usually use the initial estimate that both are approximately 0.1"
 
 
 def believed_chain(chain: Chain, rng: np.random.Generator) -> Chain:
-    """Return the chain as the students have identified it."""
+    """Return the chain that the students have identified."""
 
     def off(values: np.ndarray, spread: float) -> np.ndarray:
         return values * (1 + spread * np.clip(rng.standard_normal(values.size), -2, 2))
@@ -38,8 +38,8 @@ def initial_estimates(
 ) -> dict[str, Value]:
     """Return the students' initial estimates of every named parameter.
 
-    Gains come from the steps, each cart's own frequency and damping from its decay; resonances and
-    nulls are the nearest dwell, and their dampings are guessed.
+    Gains come from the steps. The carts' own frequencies and dampings come from their decays.
+    Resonances and nulls are at the nearest dwell, and their dampings are guessed.
     """
     typed: dict[str, Value] = {}
     for name, value in chain.parameters().items():
@@ -55,12 +55,12 @@ def initial_estimates(
 
 
 def final_estimates(believed: Chain) -> dict[str, Value]:
-    """Return the students' fitted parameters: those of one chain, so that they agree."""
+    """Return the students' fitted parameters; they agree, because they come from one chain."""
     return {name: _significant(value) for name, value in believed.parameters().items()}
 
 
 def state_space(believed: Chain) -> dict[str, Value]:
-    """Return A (2n, 2n) and B (2n,)."""
+    """Return A (2n, 2n) and B (2n,) as the students report them."""
     A, B, _, _ = believed.state_space()
     return {
         "A": [[_significant(a, 4) for a in row] for row in A],
@@ -69,7 +69,7 @@ def state_space(believed: Chain) -> dict[str, Value]:
 
 
 def feedback(design: FeedbackDesign) -> dict[str, Value]:
-    """Return the controller and the students' simulated results of it."""
+    """Return the controller and its simulated results as the students report them."""
     typed: dict[str, Value] = {
         "gains": [_significant(gain, 4) for gain in design.gains],
         "prefilter": _significant(design.prefilter, 4),
@@ -81,6 +81,6 @@ def feedback(design: FeedbackDesign) -> dict[str, Value]:
 
 
 def _significant(value: float, digits: int = 3) -> TypedNumber:
-    """Return the number rounded to significant digits, trailing zeros kept."""
-    exact = value in (0.0, 1.0)  # of a state matrix: written, not measured
+    """Return the number rounded to significant digits, with trailing zeros."""
+    exact = value in (0.0, 1.0)  # entries of a state matrix that are exact
     return TypedNumber(f"{value:g}" if exact else f"{value:#.{digits}g}".removesuffix("."))

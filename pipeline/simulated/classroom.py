@@ -1,4 +1,4 @@
-"""A small class that shows grading: an honest team, a slip, a copied recording."""
+"""A small class that shows grading: an honest team, one mistake, one copied recording."""
 
 import re
 import shutil
@@ -20,7 +20,7 @@ _FREQUENCY = re.compile(r"^omega_n = (.+)$", re.MULTILINE)
 
 
 def write_class(folder: Path) -> None:
-    """Write three submissions on one bench into a new `folder`, all of them or none."""
+    """Write three submissions from one bench into a new `folder`, all of them or nothing."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".class-") as scratch:
         teams = Path(scratch) / "class"

@@ -12,7 +12,7 @@ from pipeline.simulated.submission import Students, write_submission
 
 @dataclass(frozen=True, kw_only=True)
 class Example:
-    """One example: a preset, a seed, and what its students say."""
+    """One example: a preset, a seed, and the text of its students."""
 
     folder: str
     preset: str
@@ -100,7 +100,7 @@ Below 7 rad/s all three carts show it: they rise to only about twice their stati
 
 
 def write_examples(folder: Path) -> None:
-    """Write every example into a folder of its own in `folder`; same bytes every time."""
+    """Write every example into its own folder in `folder`; the bytes are always the same."""
     for example in CATALOGUE:
         write_submission(
             folder / example.folder,

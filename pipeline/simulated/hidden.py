@@ -25,8 +25,8 @@ from pipeline.submission.complaints import nearest, quote
 from pipeline.submission.toml_file import read_text
 
 _PER_CM = {"cm": 1.0, "mm": 10.0, "m": 0.01, "in": 1 / 2.54, "count": 1 / COUNT}
-_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s of a model's motions: ten minutes; far beyond any sampling
-# Sizes beyond any physical number in any unit, yet safe to multiply.
+_SLOWEST, _FASTEST = 0.01, 1e4  # rad/s. From ten minutes to far beyond any sampling
+# Beyond any physical number in any unit, yet safe to multiply.
 _SMALLEST, _LARGEST = 1e-30, 1e30
 _INPUT_RESERVE = 4.0  # times the input that holds a cart at its travel
 
@@ -38,12 +38,12 @@ def prepare_bench(
 
     Parameters
     ----------
-    hide : each `EFFECT` or `EFFECT:key=value,…`; keys are `cart` or `spring` and the parameters of
-        the law. Omitted parameters get a clearly visible size.
+    hide : each is `EFFECT` or `EFFECT:key=value,…`. The keys are `cart` or `spring` and the
+        parameters of the law. Omitted parameters get a clearly visible size.
 
     Raises
     ------
-    ConfigError : neither or both of preset and model, or an error in them or in an effect.
+    ConfigError : neither or both of preset and model are given, or one of the texts is wrong.
     """
     if (preset is None) == (model is None):
         raise ConfigError("name a bench: either --preset or --model")
@@ -87,7 +87,7 @@ def default_values(effect: Effect, chain: Chain, *, place: int, travel: float) -
 
 
 def _named_effect(text: str, bench: SimulatedBench) -> tuple[EffectTerm, frozenset[str]]:
-    """Return the effect of one `--hide`, and which parameters it gives."""
+    """Return the effect of one `--hide`, and the names of the parameters that the text gives."""
     where = f"--hide {text}"
     key, _, assignments = text.partition(":")
     effect = _effect(key.strip(), where=where)
@@ -141,9 +141,9 @@ def _term(effect: Effect, place: int, values: Mapping[str, float]) -> EffectTerm
 
 
 def _place(effect: Effect, chain: Chain, at: float | None, *, where: str) -> int:
-    """Return the cart or spring, or the usual one: cart 1, spring 2, or the only one there is.
+    """Return the given cart or spring, or the usual one: cart 1, spring 2, or the only one.
 
-    Any existing one is accepted, even if no data could show the effect there.
+    Any existing place is accepted, even if no data could show the effect there.
     """
     if effect.place == "input":
         return 0
@@ -169,7 +169,7 @@ def _is_hard_to_tell(term: EffectTerm, chain: Chain) -> bool:
 def _refuse_impossible(
     parameter: EffectParameter, value: float, scales: PlaceScales, *, where: str
 ) -> None:
-    """Refuse a size without meaning in the law."""
+    """Refuse a size that has no meaning in the law."""
     if parameter.signed or parameter.side:
         return
     lower = parameter.lower * parameter.size(scales)
@@ -189,7 +189,7 @@ def _refuse_weak_hold(effect: Effect, values: Mapping[str, float], *, where: str
 
 
 def _refuse_second(term: EffectTerm, present: Sequence[EffectTerm], *, where: str) -> None:
-    """Refuse an effect if the same one, or another of its family, is already hidden."""
+    """Refuse an effect if the same one, or one of its family, is already hidden at its place."""
     for other in present:
         related = other.effect.family and other.effect.family == term.effect.family
         if other.place == term.place and (other.effect is term.effect or related):
@@ -203,12 +203,12 @@ def _session_scales(
 ) -> tuple[PlaceScales, float]:
     """Return typical sizes at a place in a session, and the side of its larger step.
 
-    They are those of the step; a spring is stretched further by the release of a cart.
+    The sizes are those of the step. A spring is stretched further by the release of a cart.
     """
-    # A step over 0.9 of the travel, like a session's larger ones.
+    # The step goes to 0.9 of the travel, like the larger steps of a session.
     u = 0.9 * travel / float(np.max(np.abs(chain.static_gains())))
     slowest = float(np.abs(chain.poles).min())
-    # Six periods of the slowest motion: the first swings are the largest.
+    # Six periods of the slowest motion are enough, as the first swings are the largest.
     t = SAMPLE_TIME * np.arange(max(2.0, 6.0 * 2 * np.pi / (slowest * SAMPLE_TIME)))
     # The larger step of a session goes to the negative side.
     x = simulate_linear(chain, t, np.full(t.size, -u))
@@ -236,7 +236,7 @@ def _at(term: EffectTerm) -> str:
 
 
 def _told(term: EffectTerm, bench: SimulatedBench, *, given: frozenset[str] | None = None) -> str:
-    """Return the effect with its place and parameters in one sentence."""
+    """Return a sentence on the effect, with its place and parameters."""
     sizes = []
     for parameter, value in zip(term.effect.parameters, term.values, strict=True):
         unit = parameter.unit_text(position=bench.position_unit, input=bench.input_unit)
@@ -317,7 +317,7 @@ def _chain(entry: object, *, where: str) -> Chain:
 def _stored_effect(entry: object, bench: SimulatedBench, *, where: str) -> EffectTerm:
     """Return one effect; parameter values are numbers, or objects with a `value`.
 
-    Contact details that are not in the file get their usual size.
+    Details of a contact that are not in the file get their usual size.
     """
     fields = _mapping(entry, where=where)
     effect = _effect(str(fields.get("effect")), where=where)
@@ -335,7 +335,7 @@ def _stored_effect(entry: object, bench: SimulatedBench, *, where: str) -> Effec
     at = _mapping(fields.get("where", {}), where=f"{where}.where").get(effect.place, 0)
     place = _place(effect, bench.chain, _number(str(at), where=f"{where}.where"), where=where)
     usual = default_values(effect, bench.chain, place=place, travel=bench.travel)
-    for parameter in effect.parameters:  # that the model has, not one that a fit cannot give
+    for parameter in effect.parameters:  # null, because a fit could not determine it
         size = values.get(parameter.name, 1.0)
         unsigned = not (parameter.signed or parameter.side)
         if unsigned and (size < 0.0 or (size == 0.0 and parameter.lower > 0.0)):

@@ -18,11 +18,11 @@ from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.plant.loop.sampled_loop import StateFeedback
 from pipeline.simulated.bench import BenchRun, ReleasingHand, SimulatedBench
 
-INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so the log holds what was applied
-FIGURE_FREQUENCY = 4.0  # Hz: the dwell of the paper's Figures 12-14
+INPUT_DECIMALS = 5  # the input is set in steps of 10 µV, so that the log holds the applied input
+FIGURE_FREQUENCY = 4.0  # Hz, the dwell of the paper's Figures 12-14
 
 _LETTERS = "abcdefgh"
-_REST = 0.5  # s of rest before a step and before a closed loop's
+_REST = 0.5  # s of rest before a step, also of a set point
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,9 +31,10 @@ class SimulatedSession:
 
     Attributes
     ----------
-    repeats : of every decay and of every step size.
-    n_dwells : about how many frequencies.
-    transients : every dwell is recorded from rest; else most only once settled: smaller files.
+    repeats : number of repeats of every decay and of every step size.
+    n_dwells : approximate number of dwell frequencies.
+    transients : whether every dwell is recorded from rest. Otherwise most dwells begin when
+        settled, which gives smaller files.
     sweep_time : s.
     """
 
@@ -61,7 +62,7 @@ class SimulatedSession:
 
 
 def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[BenchRun]:
-    """Release each cart by hand, with the others held, several times.
+    """Return releases of each cart by hand, with the others held, several times.
 
     Carts without a spring are skipped.
     """
@@ -70,7 +71,7 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
         if chain.k[cart - 1] + chain.k[cart] == 0:
             continue
         decay_rate = chain.c[cart - 1] / (2 * chain.m[cart - 1])
-        # After 4.5 time constants 1.5 cm have become 7 counts.
+        # After 4.5 time constants, 1.5 cm have become 7 counts.
         ringing = max(1.0, 4.5 / max(decay_rate, 4.5 / 8.0))  # s
         for repeat in range(session.repeats):
             side = 1 if rng.random() < 0.5 else -1
@@ -96,12 +97,12 @@ def plan_decays(session: SimulatedSession, rng: np.random.Generator) -> list[Ben
 
 
 def plan_steps(session: SimulatedSession) -> list[BenchRun]:
-    """Step the input on and off again: a small size, and a larger one to the other side."""
+    """Return steps of the input, on and off: a small one, and a larger one to the other side."""
     chain = session.chain
     wait = settling_wait(chain, time_constants=SETTLED)
     t = session.clock(_REST + 2 * wait)
     on = (t >= _REST) & (t < _REST + wait)
-    # Underdamped carts overshoot to nearly twice their final position.
+    # Carts with little damping overshoot to nearly twice their final position.
     unit = session.travel / float(np.max(np.abs(chain.static_gains())))
     small, large = _typed(0.5 * unit, session), _typed(0.9 * unit, session)
     return [
@@ -118,18 +119,18 @@ def plan_steps(session: SimulatedSession) -> list[BenchRun]:
 
 
 def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
-    """Dwell on one frequency after another, each with the input that moves the carts well."""
+    """Return dwells at one frequency after another, with inputs that move the carts well."""
     chain, runs = session.chain, []
     frequencies = dwell_frequencies(chain, n=session.n_dwells, among=[FIGURE_FREQUENCY])
     for number, hertz in enumerate(frequencies, start=1):
         # A compact session records one dwell in ten from rest.
         whole = session.transients or hertz == FIGURE_FREQUENCY or number % 10 == 0
-        settled = SETTLED_DWELL if whole else 11.0  # time constants, after which nothing is left
+        settled = SETTLED_DWELL if whole else 11.0  # time constants; then no transient is left
         wait = settling_wait(chain, time_constants=settled)
         t = session.clock(wait + steady_time(hertz))
         shape = np.sin(2 * np.pi * hertz * t)
         unit = reach(chain, t, shape=shape, wait=wait)
-        # Far above the resonances the carts swing out at first, then hardly move.
+        # Far above the resonances, the carts swing far at first, then hardly move.
         amplitude = _typed(session.travel * min(0.8 / unit.steady, 1.5 / unit.furthest), session)
         runs.append(
             BenchRun(
@@ -147,7 +148,7 @@ def plan_dwells(session: SimulatedSession) -> list[BenchRun]:
 
 
 def plan_sweep(session: SimulatedSession) -> BenchRun:
-    """Sweep from well below the first resonance to above the last, then let the carts ring out."""
+    """Return a sweep from below the first resonance to above the last, with its ringing."""
     chain = session.chain
     omega = quadratic_factors(chain.poles)[0]
     low, high = 0.4 * omega[0], 1.4 * omega[-1]
@@ -170,7 +171,7 @@ def plan_sweep(session: SimulatedSession) -> BenchRun:
 def plan_closed_loop(
     session: SimulatedSession, *, cart: int, controller: StateFeedback
 ) -> BenchRun:
-    """Step the set point of one cart under state feedback."""
+    """Return a run in which the set point of one cart steps under state feedback."""
     t = session.clock(_REST + 4.0)
     return BenchRun(
         id="control",

@@ -1,4 +1,4 @@
-"""A plant as a whole submission: `submission.toml` and the data a class would record."""
+"""Write a plant as a whole submission: `submission.toml` and the data that a class would record."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -22,15 +22,15 @@ from pipeline.submission.toml_section import toml_section
 
 @dataclass(frozen=True, kw_only=True)
 class Students:
-    """The people who measured a simulated bench, and the text beside their numbers.
+    """The people who measured a simulated bench, and the text with their numbers.
 
     Attributes
     ----------
-    authors : ids; none: two that depend on the seed, so that a class has no duplicates.
-    title : of the submission; "": one with the bench and the seed.
-    springs : those they declare; none: those of the chain.
-    time_decimals : of the log's stamps; 3 gives the rounded ones of an ECP export.
-    notes : text of `notes.md`; "": no file.
+    authors : their ids. By default two that depend on the seed, so that a class has no duplicates.
+    title : of the submission. By default the bench and the seed.
+    springs : the springs that they declare. By default those of the chain.
+    time_decimals : decimals of the log's time stamps. 3 gives rounded stamps as in an ECP export.
+    notes : text of `notes.md`. Without a text there is no file.
     """
 
     authors: Sequence[str] = ()
@@ -56,10 +56,11 @@ def write_submission(
 
     Parameters
     ----------
-    folder : made if necessary; files of the same names are replaced.
+    folder : made if necessary. Files of the same names are replaced.
     bench : the true plant, or a preset's name.
-    compact : fewer repeats and dwells, most dwells without their transient: half the size.
-    reported : add the numbers that honest students report, `[reported]`.
+    compact : whether to record less. There are fewer repeats and dwells, most of them without their
+        transient, for half the size.
+    reported : whether to add the numbers that honest students report, `[reported]`.
 
     Raises
     ------
@@ -105,7 +106,7 @@ def write_submission(
 
 def _task(bench: SimulatedBench) -> Design:
     return Design(
-        cart=min(2, bench.chain.n),  # the far one of two carts; the paper's choice of three
+        cart=min(2, bench.chain.n),  # the far one of two carts; for three, the paper's choice
         reference=bench.travel,
         overshoot_percent=10.0,
         settling_time=1.0,
@@ -141,7 +142,7 @@ def _programme(
 
 
 def _head(bench: SimulatedBench, students: Students, *, seed: int) -> Iterator[str]:
-    """Yield the tables before the experiments."""
+    """Yield the tables that come before the experiments."""
     named = f"Simulated bench, {bench.name}, seed {seed}" if bench.name else "Simulated bench"
     title = students.title or named
     yield toml_section("", {"version": 1, "title": title, "section": students.section})
@@ -157,7 +158,7 @@ def _head(bench: SimulatedBench, students: Students, *, seed: int) -> Iterator[s
 
 
 def _design(believed: Chain, task: Design) -> FeedbackDesign:
-    """Return the controller as it is typed into the bench: gains to four digits."""
+    """Return the controller as it is typed into the bench: gains with four digits."""
     design = design_feedback(believed, task)
     return replace(
         design,
@@ -169,10 +170,10 @@ def _design(believed: Chain, task: Design) -> FeedbackDesign:
 def _csv_text(
     run: BenchRun, motion: TrueMotion, y: Array, *, time_decimals: int, count: float
 ) -> str:
-    """Return the log of one run: time, input, in a closed loop the reference, and x1 … xn.
+    """Return the log of one run: time, input, reference (in a closed loop), and x1 … xn.
 
-    `y` is (n_carts, n) whole counts, in position units, written with one digit more than is needed
-    to distinguish counts.
+    `y` (n_carts, n) are whole counts in position units. They are written with one digit more than
+    is needed to distinguish counts.
     """
     kept = run.t >= run.keep_from
     columns = {"time": _fixed(run.t[kept] - run.t[kept][0], time_decimals)}
@@ -187,7 +188,7 @@ def _csv_text(
 
 
 def _fixed(values: Array, decimals: int) -> list[str]:
-    """Format with fixed decimals, without trailing zeros and without -0."""
+    """Return numbers with fixed decimals, without trailing zeros and without -0."""
     texts = [f"{value:.{decimals}f}" for value in np.round(values, decimals) + 0.0]
     return [text.rstrip("0").rstrip(".") for text in texts] if decimals else texts
 
@@ -197,7 +198,7 @@ def _data_file(run: BenchRun) -> str:
 
 
 def _experiment(run: BenchRun) -> dict[str, Value]:
-    """Return the keys of one `[[experiments]]`."""
+    """Return the keys of one `[[experiments]]` table."""
     entry: dict[str, Value] = {"id": run.id, "kind": run.kind}
     if run.kind == "decay":
         entry["carts"] = list(run.free)

@@ -1,1 +1,1 @@
-"""One file for each stage; stages never import each other."""
+"""The stages, one file each; no stage imports another."""

@@ -1,7 +1,7 @@
 """Fit one chain to the frequency responses of all carts at once.
 
-The stage-by-stage result becomes a physical chain, which all carts then fit jointly: first on a
-logarithmic scale, to get near, then by maximum likelihood, each point by its standard error.
+The stage-by-stage result is turned into a physical chain. Then all carts are fitted jointly: first
+on a logarithmic scale to get near, then by maximum likelihood, each point with its standard error.
 """
 
 import itertools
@@ -27,12 +27,12 @@ from pipeline.plant.linear.recovery import recover_chain
 from pipeline.results import EXPLAINED, ChainFit, Estimate, FrequencyResponse
 from pipeline.set_up import Bench
 
-_START_SPREAD = 0.5  # of ln m and ln k of a random start: mostly half to double
+_START_SPREAD = 0.5  # of ln m and ln k of a random start, mostly half to double
 _START_ZETAS = (0.02, 0.3)
-_SEED = 2005  # of the random starts; any number, but always the same
-_NEAR, _PRECISION = 1e-3, 1e-8  # change of the cost at which it stops: on the way, and at the end
+_SEED = 2005  # of the random starts. Any number, but always the same
+_NEAR, _PRECISION = 1e-3, 1e-8  # relative change of the cost at the end of a fit: first, last
 _EVALUATIONS = 100  # a successful fit takes about ten
-_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds of a missing relative error; ratio
+_SHARES, _SHARE_PRECISION = (1e-6, 10.0), 0.01  # bounds of a missing relative error; its accuracy
 
 
 def fit_bode(
@@ -45,27 +45,28 @@ def fit_bode(
 ) -> ChainFit:
     """Fit the chain of n carts to measured frequency responses; carts may be missing.
 
-    Phases are used if they are given and agree with the magnitudes, else magnitudes alone; they are
-    used without this check if there are no more magnitudes than parameters. A parameter that the
-    data put at or below zero is held there and the others are fitted again. A few dwells beside a
-    sharp peak leave its damping open down to zero. Then the damping ratios of decays that do not
-    contradict are further points of the fit.
+    Phases are used if they agree with the magnitudes. Without more magnitudes than parameters, they
+    are used without this check.
 
-    If the misfit is larger than the points' errors allow, the chain does not describe the bench to
-    that precision. Then a relative error, the same for all points, is added until it does, and the
-    chain is fitted once more. `chi_square_per_dof` and `standardised` keep the stated errors. For a
-    table without errors, standard errors follow the misfit in any case.
+    A parameter that the data put at or below zero is held at zero, and the others are fitted again.
+    A few dwells next to a sharp peak do not bound its damping away from zero. Then the damping
+    ratios of decays become further points of the fit, if they do not contradict the dwells.
+
+    A misfit larger than the points' standard errors allow means that the chain does not describe
+    the bench that precisely. Then the same relative error is added to all points until it does, and
+    the chain is fitted once more. `chi_square_per_dof` and `standardised` use the stated errors.
+    For a table without errors, standard errors follow the misfit in any case.
 
     Parameters
     ----------
     bench : its carts and springs.
     initial : named parameters to start from, if known.
-    decays : by cart, its damping ratio alone; used only if the responses put it at zero.
-    near : similar carts, fitted before: the only start, in place of all others.
+    decays : by cart, its own damping ratio. Used only if the responses put it at zero.
+    near : a similar chain, fitted before. It then is the only start.
 
     Returns
     -------
-    `standardised` has the magnitude residuals by cart ("1", "2", …).
+    The fit. Its `standardised` has the magnitude residuals by cart ("1", "2", …).
 
     Raises
     ------
@@ -121,7 +122,7 @@ def _stand_in(data: Points, known: Mapping[str, float], *, bench: Bench) -> Chai
 def _staged_start(
     data: Points, known: Mapping[str, float], *, bench: Bench, like: Chain
 ) -> tuple[StagedFit | None, Chain]:
-    """Fit stage by stage and return the implied chain, made possible if it is not."""
+    """Fit stage by stage; return the implied chain, corrected to be physically possible."""
     if not any(bench.springs):
         return None, like
     measured = {}
@@ -141,7 +142,7 @@ def _staged_start(
 
 def _random_starts(like: Chain, *, bench: Bench) -> Iterator[Chain]:
     rng = np.random.default_rng(_SEED)
-    # Random starts, tried if the first does not explain the data.
+    # Eight random starts, tried if the first start does not explain the data.
     for _ in range(8):
         m = like.m * np.exp(_START_SPREAD * rng.standard_normal(like.m.shape))
         k = like.k * np.exp(_START_SPREAD * rng.standard_normal(like.k.shape))
@@ -167,7 +168,7 @@ class _Fitted:
 
     @property
     def chi_square_per_dof(self) -> float:
-        """Near 1 for a good fit; of magnitudes alone there may be too few to tell, then near 0."""
+        """χ² per degree of freedom: near 1 for a good fit, near 0 with too few magnitudes."""
         return self.chi_square / max(self.dof, 1)
 
 
@@ -179,7 +180,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
             r = np.full_like(r, np.nan)
         return r, J
 
-    # A bad step may overflow; least_squares then takes a shorter one.
+    # A bad step may overflow; `least_squares` then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         if not np.isfinite(np.sum(evaluate(theta)[0] ** 2)):
             raise DataError("Bode fit: no chain comes near responses as far apart as these")
@@ -221,12 +222,12 @@ def _fit_from_starts(
 
 
 def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
-    """Fit again with the phases, if there are any that agree with the magnitudes."""
+    """Fit again with the phases, if there are any and they agree with the magnitudes."""
     if not data.n_phases:
         return fitted, ""
-    # If there are only as many magnitudes as parameters, they do not predict the phases. Phases are
-    # used unless they are this many times as far off as the magnitudes, as with a delay or a wrong
-    # sign.
+    # The phases are rejected if they are this many times as far off as the magnitudes, as with a
+    # delay or a wrong sign. This cannot be checked with only as many magnitudes as parameters,
+    # because the fit does not predict phases then.
     limit = 3.0 * max(1.0, fitted.chi_square_per_dof**0.5)
     if fitted.dof > 0 and _phase_misfit(fitted, data) > limit:
         return fitted, "magnitudes alone: the phases do not agree with them"
@@ -236,11 +237,11 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
 def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
     """Fit again with the relative error that explains the misfit; 0 if not needed."""
     excess = fitted.chi_square_per_dof - 1
-    # Standard deviations of χ² above its mean: by chance once in a thousand.
+    # χ² may exceed its mean by 3.1 standard deviations; by chance that happens once in a thousand.
     if data.from_table or excess <= 3.1 * np.sqrt(2 / fitted.dof):
         return fitted, 0.0
     share = 0.0
-    # Fits alternating with the required error: it converges to a percent.
+    # Fit and required error are computed in turn, which converges to a percent in three rounds.
     for _ in range(3):
         share = _missing_share(fitted, data)
         widened = data.widened(share)
@@ -249,7 +250,7 @@ def _widen(fitted: _Fitted, data: Points) -> tuple[_Fitted, float]:
 
 
 def _missing_share(fitted: _Fitted, data: Points) -> float:
-    """Return the relative error that lowers chi² to its degrees of freedom, by bisection."""
+    """Return the relative error that lowers χ² to its degrees of freedom, by bisection."""
     low, high = -np.log(_SHARES[1]), -np.log(_SHARES[0])
     while high - low > _SHARE_PRECISION:
         middle = (low + high) / 2
@@ -269,14 +270,14 @@ def _chi_square(fitted: _Fitted, data: Points) -> float:
 def _hold_vanished(
     fitted: _Fitted, data: Points, decays: Mapping[int, Estimate]
 ) -> tuple[_Fitted, Points]:
-    """Fit again with every parameter at zero that the data put there or below.
+    """Fit again with all parameters held at zero that the data put there or below.
 
-    If a decay gives one of these dampings, all decays join the fit: points that leave one damping
-    open say little about the others. Return also the points, with those decays.
+    If a decay gives one of these dampings, all decays join the fit: points that do not determine
+    one damping say little about the others. Also return the points, with these decays.
     """
     P, chain = fitted.parametrisation, fitted.chain
     sizes = _natural_sizes(P, chain, data)
-    # Of its usual size: a damping or far spring that the data put at zero.
+    # A damping or far spring below 1e-4 of its usual size, and k_1 below zero.
     vanished = [
         name
         for name, value, size in zip(P.names, P.physical(chain), sizes, strict=True)
@@ -285,7 +286,7 @@ def _hold_vanished(
     if not vanished:
         return fitted, data
     needed = {cart: zeta for cart, zeta in decays.items() if f"c_{cart}" in vanished}
-    k = chain.k[:-1] + chain.k[1:]  # below zero for k_1: a cart without a decay
+    k = chain.k[:-1] + chain.k[1:]  # not positive if k_1 is below zero; the cart then has no decay
     for told in (decays, needed) if needed and np.all(k > 0) else ():
         c = chain.c.copy()
         for cart, zeta in told.items():
@@ -294,7 +295,7 @@ def _hold_vanished(
         held = P.holding_at_zero(*(name for name in vanished if name not in names))
         along = replace(data, decays=told)
         both = _solve(held, along, held.pack(replace(chain, c=c)), fitted.scale)
-        # χ² that each decay may add: by chance it is three standard errors off.
+        # Each decay may add this to χ²; by chance it is three standard errors off.
         if both.chi_square < fitted.chi_square + 9.0 * len(told):
             return _hold_vanished(both, along, {})
     held = P.holding_at_zero(*vanished)
@@ -302,14 +303,14 @@ def _hold_vanished(
 
 
 def _natural_sizes(P: Parametrisation, chain: Chain, data: Points) -> Array:
-    """Return the natural size of each parameter (n_p,): damping m ω, the stiffest spring."""
+    """Return the natural size of each parameter (n_p,): m, m ω for a damping, the largest k."""
     middle = float(np.median(data.omega[data.omega > 0]))
     sizes = {"m": chain.m, "c": chain.m * middle, "k": np.full(chain.n + 1, np.max(chain.k))}
     return np.array([sizes[symbol][place] for symbol, place in P.places])
 
 
 def _phase_misfit(fitted: _Fitted, data: Points) -> float:
-    """Return the root-mean-square distance of the measured phases from the fit's, in errors."""
+    """Return the rms distance of the measured phases from the fit's, in standard errors."""
     P = fitted.parametrisation
     G, _ = response_at(P, data, P.physical(fitted.chain))
     known = np.isfinite(data.phase_std)
@@ -380,15 +381,16 @@ def _covariance(
 ) -> tuple[tuple[str, ...], Array]:
     """Return the covariance (n_p, n_p) of the physical parameters, and their names.
 
-    A damping that is held at zero is included if the data give its error: no cart is without
-    damping, and numbers that depend on it are known no better. A far spring may truly be missing.
+    A damping that is held at zero is included if the data give its standard error, because every
+    cart has some damping. Numbers that depend on it must not look more certain than it is. A far
+    spring, however, may really be missing.
     """
     springs = tuple(name for name in P.zero if read_name(name).symbol == "k")
     for Q in (replace(P, zero=springs), P):
         sizes = _natural_sizes(Q, chain, data)
         _, J = weighted_residuals(Q, data, scale, Q.physical(chain))
         _, singular, V = np.linalg.svd(J * sizes, full_matrices=False)
-        # Smallest singular value over the largest, columns in natural sizes.
+        # The smallest singular value over the largest, with columns in natural sizes.
         if singular[-1] >= 1e-8 * singular[0]:
             root = (V / singular[:, None]) * sizes
             return Q.names, root.T @ root

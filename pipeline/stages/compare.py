@@ -1,6 +1,6 @@
-"""Compare: initial against final estimates, parameter by parameter.
+"""Compare initial with final estimates, parameter by parameter.
 
-Nearly every parameter is estimated in two ways (Throne 2005, Tables 1-3): frequencies and gains
+Nearly every parameter is estimated in two ways (Throne 2005, Tables 1-3). Frequencies and gains
 usually agree within some percent, damping ratios often do not.
 """
 
@@ -12,10 +12,10 @@ from pipeline.names import read_name
 from pipeline.results import Estimate, ParameterRow
 from pipeline.set_up import Bench
 
-# The paper's own tables: gains and frequencies differ by up to 14 % between the two estimates (one
-# null, read by eye, by 29 %), damping ratios by half and more.
+# From the paper's own tables: the two estimates of gains and frequencies differ by up to 14 %. For
+# one null, read by eye, it is 29 %. Damping ratios differ by half and more.
 GAIN_AND_FREQUENCY_LIMIT, DAMPING_LIMIT = 15.0, 50.0  # percent
-SIGMA_LIMIT = 3.0  # combined standard errors: a smaller difference may be chance
+SIGMA_LIMIT = 3.0  # combined standard errors. A smaller difference may be chance
 _UNDECIDED = "the two estimates are too uncertain to agree or to disagree"
 AT_BOUND = "the fit ends at its bound, zero: its data are too few, so there is no final value"
 NOT_DETERMINED = (
@@ -33,7 +33,7 @@ def compare(
     bench: Bench,
     fitted_to: Collection[str] = (),
 ) -> tuple[ParameterRow, ...]:
-    """Set the initial beside the final estimate of every parameter in `names`.
+    """Combine the initial and the final estimate of every parameter in `names`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Measured frequency response: from dwells, or from step and sweep records; its peaks and nulls."""
+"""Measured frequency response, from dwells or from step and sweep records; peaks and nulls."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,17 +22,17 @@ from pipeline.names import (
 )
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
-_LARGEST_RELATIVE_STD = 0.2  # a record's frequency is kept where the response stands five sigma out
-# Two dwells are repeats if their frequencies differ by less than this: a fitted frequency is
-# accurate to some 1e-4, and no response changes by more than its error within it.
+_LARGEST_RELATIVE_STD = 0.2  # of a record's response. Frequencies with more are dropped
+# Two dwells are repeats if their frequencies differ by less than this. A fitted frequency is
+# accurate to some 1e-4. Within that, no response changes by more than its standard error.
 _SAME_FREQUENCY = 1e-3
-# No bench measures better; exact data would have infinite weight.
+# No bench measures better, and exact data would get infinite weight.
 _SMALLEST_RELATIVE_STD = 1e-6
 
 
-# Peaks and nulls
-_CLEAR_FALL = 3.0  # below the low-frequency level: a mode has been passed, twice its frequency
-_LOW_SHARE = 0.7  # of the first resonance: below it, the magnitude gives the gain
+# Peaks and nulls.
+_CLEAR_FALL = 3.0  # times below the low-frequency level, at twice its frequency: a mode was passed
+_LOW_SHARE = 0.7  # of the first resonance. Below it, the magnitude gives the gain
 
 
 # ---------------------------------------------------------------------- dwells
@@ -51,11 +51,11 @@ def dwell_fault(point: SinePoint) -> str:
 
 
 def collect_dwells(points: Sequence[SinePoint]) -> tuple[FrequencyResponse, ...]:
-    """Collect dwells to one frequency response per cart; repeats of a frequency become one point.
+    """Collect dwells into one frequency response per cart; repeats become one point.
 
-    Repeats combine to their weighted mean; its standard error grows if they scatter more than
-    theirs allow. A dwell that did not settle stays, with an added error of 5 %; one with a
-    `dwell_fault` does not count.
+    Repeats are combined to their weighted mean. Its standard error grows if they scatter by more
+    than their own errors allow. A dwell that did not settle is used with an added error of 5 %. A
+    dwell with a `dwell_fault` is not used.
 
     Raises
     ------
@@ -79,7 +79,7 @@ def _collect_cart(points: Sequence[SinePoint], *, cart: int) -> FrequencyRespons
         groups[-1].append(point)
     rows = []
     for group in groups:
-        # A dwell that ends before its steady state is off by a few per cent.
+        # A dwell that ends before its steady state is wrong by a few percent.
         extra = np.array([0.0 if p.settled else 0.05 for p in group])
         gain = np.array([p.gain for p in group])
         magnitude, magnitude_std = _weighted_mean(
@@ -126,14 +126,14 @@ def _weighted_mean(values: Array, std: Array) -> tuple[float, float]:
 
 
 def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse, ...]:
-    """Take the frequency response of each cart from step and sweep records with all carts free.
+    """Return the frequency response of each cart from step and sweep records with all carts free.
 
-    Each record gives its ratio of transforms (`record_transforms`); records combine by weight,
-    including their scatter. Only frequencies at which the input moves the cart are returned.
+    Each record gives a ratio of transforms (`record_transforms`). The records are averaged by
+    weight, with their scatter. Only frequencies at which the input moves the cart are returned.
 
     Raises
     ------
-    DataError : no record has an input that changes, or none yields a usable frequency.
+    DataError : no record has an input that changes, or no record gives a usable frequency.
     """
     runs = [r for r in records if r.u is not None and np.any(r.u != 0) and r.t.size > 16]
     if not runs:
@@ -163,7 +163,7 @@ def _grid(runs: Sequence[Record]) -> Array:
     """Return harmonics of the (median) record length, thinned to a constant ratio."""
     base = 2 * np.pi / float(np.median([run.t[-1] - run.t[0] for run in runs]))
     top = max(int(max(visible_band(run) for run in runs) / base), 2)
-    # Some five lines across the half-power width 2ζω of a mode with ζ = 0.05.
+    # This gives some five lines within the half-power width 2ζω of a mode with ζ = 0.05.
     count = int(np.log(top) / np.log(1.02)) + 2
     return base * np.unique(np.rint(np.geomspace(1, top, count)))
 
@@ -208,12 +208,13 @@ class _Extremum(NamedTuple):
 def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[str, Estimate]:
     """Estimate resonances, nulls and gains from the measured magnitudes, as the paper does.
 
-    The resonances are the peaks shared by the carts. A first mode too damped to peak is found from
-    the fall of the last cart's response above the others. If fewer than n are found, they get no
-    names, as it is unknown which one is missing. Nulls of cart 1 give omega_x and omega_y (three
-    carts),
-    those of the last but one the last cart's own frequency. Gains are the lowest-frequency
-    magnitudes. Dampings of modes and nulls are assumed.
+    - Resonances are the peaks that the carts share. If the damping of a first mode is too large for
+      a peak, it is found from the fall of the last cart's response above the others. If fewer than
+      n are found, they get no names, as it is unknown which one is missing.
+    - Nulls of cart 1 give omega_x and omega_y (three carts). Nulls of the last cart but one give
+      the last cart's own frequency.
+    - Gains are the magnitudes at the lowest frequency.
+    - Dampings of modes and nulls are assumed.
     """
     by_cart = {response.cart: response for response in responses}
     names = set(parameter_names(n))
@@ -234,7 +235,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
     if n == 3 and 1 in by_cart:
         found |= _estimates(omega_names(NULLS), _strongest(nulls[1], 2))
     assumed = [mode_zeta(suffix) for suffix in (*symbols, *NULLS)]
-    # Peaks are shared by the carts, and gains are corrected by them.
+    # The carts share the peaks, which also correct the gains.
     runs = tuple(dict.fromkeys(run for response in responses for run in response.experiments))
     measured = {name: replace(one, experiments=runs) for name, one in found.items()}
     return measured | {
@@ -245,7 +246,7 @@ def find_resonances(responses: Sequence[FrequencyResponse], *, n: int) -> dict[s
 
 
 def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[str, Estimate]:
-    """Name extrema in ascending order; none if their number differs from that of the names."""
+    """Name extrema in ascending order; {} if their number differs from that of the names."""
     if len(names) != len(extrema):
         return {}
     return {
@@ -255,30 +256,30 @@ def _estimates(names: Sequence[str], extrema: Sequence[_Extremum]) -> Mapping[st
 
 
 def _between(extrema: Sequence[_Extremum], modes: Sequence[_Extremum]) -> list[_Extremum]:
-    """Return those below the highest mode, where the nulls of a chain are."""
+    """Return the extrema below the highest mode; a chain has its nulls there."""
     top = max((mode.omega for mode in modes), default=np.inf)
     return [e for e in extrema if e.omega < top]
 
 
 def _strongest(extrema: Sequence[_Extremum], count: int) -> list[_Extremum]:
-    """Return the most prominent ones, ascending in frequency."""
+    """Return the most prominent extrema, ascending in frequency."""
     return sorted(sorted(extrema, key=lambda e: -e.prominence)[:count])
 
 
 def _extrema(response: FrequencyResponse, *, sign: int) -> list[_Extremum]:
-    """Find the maxima (sign 1) or minima (sign -1) of ln|G| beyond its errors."""
+    """Find the maxima (sign 1) or minima (sign -1) of ln|G| beyond its standard errors."""
     seen = (response.omega > 0) & (response.magnitude > 0)
     omegas, magnitude = response.omega[seen], response.magnitude[seen]
     error = response.magnitude_std[seen] / magnitude
     level, position = sign * np.log(magnitude), np.log(omegas)
     found = []
     for i in range(1, level.size - 1):
-        # With a larger relative error a point shows no peak.
+        # A point with a larger relative error shows no peak.
         if not level[i - 1] < level[i] >= level[i + 1] or (sign > 0 and error[i] > 0.1):
             continue
         left, right = level[:i][::-1], level[i + 1 :]
         prominence = level[i] - max(_saddle(left, level[i]), _saddle(right, level[i]))
-        # Of ln|G|; and six standard errors: noise alone spans five in 40 points.
+        # Prominence of ln|G|: six standard errors, as noise alone reaches five in 40 points.
         if prominence < max(0.05, 6 * np.max(error[i - 1 : i + 2])):
             continue
         curve = np.polyfit(position[i - 1 : i + 2] - position[i], level[i - 1 : i + 2], 2)
@@ -297,10 +298,10 @@ def _saddle(side: Array, peak: float) -> float:
 def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Extremum]:
     """Return up to n peaks, those that most carts show most clearly."""
     peaks = sorted((peak, r.cart) for r in responses for peak in _extrema(r, sign=1))
-    clusters: list[dict[int, _Extremum]] = []  # one peak of each cart at most
+    clusters: list[dict[int, _Extremum]] = []  # at most one peak of each cart
     start = 0.0
     for peak, cart in peaks:
-        # Of ln(omega): carts share their resonances.
+        # In ln(omega); the carts share their resonances.
         if not clusters or np.log(peak.omega / start) > 0.15:
             clusters.append({})
             start = peak.omega
@@ -317,10 +318,10 @@ def _shared_peaks(responses: Sequence[FrequencyResponse], *, n: int) -> list[_Ex
 
 
 def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -> list[_Extremum]:
-    """Add the mode that does not peak, from the roll-off above all others of the last cart.
+    """Add the mode without a peak, from the decrease of the last cart above all other modes.
 
-    |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²| there; the known modes leave
-    1/((omega/omega_0)² - 1).
+    There |G_n| falls as K_n times the product of 1/|1 - (omega/omega_j)²|. Dividing by the known
+    modes leaves 1/((omega/omega_0)² - 1).
     """
     top = max((mode.omega for mode in modes), default=0.0)
     above = (response.omega > 1.5 * top) & (response.magnitude > 0)
@@ -340,7 +341,7 @@ def _with_damped_mode(response: FrequencyResponse, modes: Sequence[_Extremum]) -
 
 
 def _low_frequency_gain(response: FrequencyResponse, *, resonance: float | None) -> Estimate | None:
-    """Estimate K from the lowest frequency, less its rise towards the first resonance."""
+    """Estimate K from the lowest frequency, corrected for the rise towards the first resonance."""
     if resonance is None or response.omega[0] > _LOW_SHARE * resonance:
         return None
     ratio = float(response.omega[0]) / resonance

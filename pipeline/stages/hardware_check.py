@@ -1,8 +1,8 @@
 """Compare the identified chain with a run it was not fitted to: Figures 15-17.
 
-Two simulations per cart. "closed": the controller that ran, with its delay and saturation, closes
-the loop around the chain. "open": the measured input drives the chain, and the logged input's
-sign and scale are put to the test, since some benches change both when the loop is closed.
+There are two simulations per cart. In "closed", the controller that ran closes the loop around the
+chain, with its delay and saturation. In "open", the measured input drives the chain. It also tests
+the logged input's sign and scale, since some benches change both when the loop is closed.
 """
 
 from dataclasses import dataclass, replace
@@ -20,12 +20,13 @@ from pipeline.plant.loop import sampled_loop
 from pipeline.plant.loop.sampled_loop import Controller, LoopRun, Pid, StateFeedback
 from pipeline.results import HardwareCheck, Record
 
-# A factor on the input within this is the model's error, not the log's; another sign or scale is
-# accepted if it leaves at most this share of the difference, and explains half the power.
+# A factor on the input within 1.5 is an error of the model, not of the log. Another sign or scale
+# is accepted if two conditions hold: the difference falls to 0.6 or less of what it was, and to at
+# most 0.7 of the motion.
 _TRUSTED, _WORTH_IT, _HALF = 1.5, 0.6, 0.7
-_WRONG = 0.1  # of the motion: a larger error means that the model does not belong to the run
-_SERVO_PERIOD = 0.000884  # s; of the ECP controller, whose log keeps one sample in several
-_SETTLED_SHARE = 0.2  # of the time after a step: its end, whose mean is the steady state
+_WRONG = 0.1  # of the motion. With a larger error, the model does not belong to the run
+_SERVO_PERIOD = 0.000884  # s. Of the ECP controller, whose log keeps one sample in several
+_SETTLED_SHARE = 0.2  # of the time after a step. The mean of this end is the steady state
 
 
 def check_hardware(
@@ -36,20 +37,21 @@ def check_hardware(
     controlled_cart: int | None = None,
     input_limit: float | None = None,
 ) -> tuple[HardwareCheck, ...]:
-    """Compare the chain with one run, cart by cart: the closed loop first, then the open.
+    """Compare the chain with one run, cart by cart: the closed loop first, then the open loop.
 
-    Any kind of run with a logged input will do. `controller` is what ran on the hardware; without
-    one, or without its gains, the loop is not closed.
+    Any run with a logged input can be used. `controller` is what ran on the hardware. Without it,
+    or without its gains, the loop is not closed.
 
     Parameters
     ----------
-    controlled_cart : whose position a PID controller fed back, unless the controller says it.
-    input_limit : where the input saturates; a lower limit in the log comes first.
+    controlled_cart : the cart whose position a PID controller fed back, unless the controller says
+        it.
+    input_limit : limit of the input. A lower limit found in the log has priority.
 
     Raises
     ------
     DataError : there is neither a logged input nor a controller with its reference and a stable
-        loop; cart 1 was held; no free cart was measured, or none moved.
+        loop; cart 1 was held; no free cart was measured, or no free cart moved.
     """
     run = measured_run(record, chain)
     opened = _open(run) if run.driven else None
@@ -81,9 +83,10 @@ def check_hardware(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Simulated:
-    """Readings (f, n) of the free carts, the factor used on the input, and the one found.
+    """Simulated readings (f, n) of the free carts.
 
-    `u` is the input (n,) that a simulated loop asks for.
+    `factor` is the factor used on the input, `scale` the best one. `u` (n,) is the input of a
+    simulated loop.
     """
 
     y: Array
@@ -145,7 +148,7 @@ def _plant_law(
 
 
 def _steered_cart(controller: submission.Controller | None, stated: int | None) -> int | None:
-    """Return the cart that the loop brings to the set point; None if nothing says which."""
+    """Return the cart that the loop brings to the set point; None if it is unknown."""
     if isinstance(controller, submission.PidController) and (
         stated is None or "cart" in controller.model_fields_set
     ):
@@ -163,8 +166,8 @@ def _close(
 ) -> _Simulated:
     """Close the loop around the chain.
 
-    If the logged input is a multiple of the stated law's, the law is scaled by it, provided that
-    explains the run far better; else it is used as stated.
+    The logged input may be a multiple of what the stated law gives. If scaling the law by that
+    factor explains the run far better, it is scaled. Otherwise it is used as stated.
 
     Raises
     ------
@@ -185,7 +188,7 @@ def _close(
             note = f"the logged input {note} what the stated controller asks for"
     if loop is None:
         raise DataError("the stated controller makes it unstable")
-    # Under feedback a bench may rightly count its input the other way.
+    # Under feedback, a bench may log the input with the opposite sign.
     wrong = abs(times_stated) != 1.0 and misfit <= _WRONG
     return _Simulated(y=loop.x, u=loop.u, note=note, contradicted=wrong)
 
@@ -193,13 +196,13 @@ def _close(
 def _run_loop(
     run: MeasuredRun, law: Controller, *, reference: Array, drive: float, limit: float
 ) -> tuple[LoopRun | None, float]:
-    """Return the run and its misfit; None and the largest misfit if it is unstable.
+    """Return the simulated run and its misfit; None and the largest misfit if it is unstable.
 
-    The controller's sample time, delay and prediction are not logged: of the usual combinations the
-    one nearest to the measurement is taken.
+    The controller's sample time, delay and prediction are not logged. So the usual combinations are
+    tried, and the one nearest to the measurement is returned.
     """
     joined = sampled_loop.LoopSetup(input_limit=limit, drive=drive, rest=run.rest, free=run.free)
-    best, least = None, 10.0  # times the measured motion: above this, it is unstable
+    best, least = None, 10.0  # times the measured motion; above this, the loop is unstable
     for law_as_run, sample_time, delay in _ways(run, law, drive=drive):
         with np.errstate(over="ignore", invalid="ignore"):
             how = replace(joined, sample_time=sample_time, delay=delay)
@@ -217,14 +220,14 @@ def _run_loop(
 def _ways(
     run: MeasuredRun, law: Controller, *, drive: float
 ) -> list[tuple[Controller, float | None, int]]:
-    """Return controllers, each with its sample time (None: the log's) and delay in ticks."""
+    """Return controllers to try, with sample time (None for the log's) and delay in ticks."""
     ways: list[tuple[Controller, float | None, int]] = [(law, None, 1), (law, None, 0)]
     if isinstance(law, StateFeedback):
-        # In units of the effort the chain is 1 / drive as heavy and as stiff.
+        # In units of the effort, masses, dampings and stiffnesses are divided by `drive`.
         chain = run.chain
         model = Chain(m=chain.m / drive, c=chain.c / drive, k=chain.k / drive)
         ways.insert(0, (replace(law, model=model), None, 1))
-    if run.record.sample_time > 3.0 * _SERVO_PERIOD:  # more often logged, the two hardly differ
+    if run.record.sample_time > 3.0 * _SERVO_PERIOD:  # otherwise the two hardly differ
         ways.append((law, _SERVO_PERIOD, 1))
     return ways
 
@@ -232,11 +235,11 @@ def _ways(
 def _logged_per_stated(
     run: MeasuredRun, law: Controller, *, reference: Array, opened: _Simulated | None
 ) -> list[float]:
-    """Return factors, other than 1, between the logged input and that of the law.
+    """Return factors other than 1 between the logged input and that of the law.
 
-    The law is evaluated at the readings, and at the positions that the logged input gives the
-    chain. With fast sampling the velocity from readings is mostly noise, and an integral of the
-    error needs the readings.
+    The law is evaluated twice: at the readings, and at the positions that the chain has under the
+    logged input. With fast sampling, the velocity from readings is mostly noise. But an integral of
+    the error needs the readings.
     """
     record = run.record
     if record.u is None or opened is None:
@@ -254,7 +257,7 @@ def _logged_per_stated(
 def _median_ratio(logged: Array, stated: Array) -> float:
     """Return the factor with the least sum of absolute differences, a weighted median; or 1.
 
-    Samples with a saturated input, or a velocity that is mostly rounding, do not affect it.
+    Samples with a saturated input, or with a velocity that is mostly rounding, do not affect it.
     """
     asked = np.flatnonzero(stated)
     if asked.size == 0:
@@ -266,10 +269,11 @@ def _median_ratio(logged: Array, stated: Array) -> float:
 
 
 def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> str:
-    """Say that the stated controller did not run, if the plant follows its actual input."""
+    """Return a note that another controller ran, if the plant follows its actual input."""
     loop, plant = run.misfit(closed.y), run.misfit(opened.y)
-    # A plant accurate to 2 % under its actual input, but off by a tenth, and this many times more,
-    # in the loop: another loop ran. A stable loop increases a plant's error a few times.
+    # Another loop ran if the plant is accurate to 2 % under its actual input, but the loop is off
+    # by a tenth of the motion and by five times as much. A stable loop increases a plant's error
+    # only a few times.
     if opened.factor != 1.0 or not (plant <= 0.02 and loop > max(_WRONG, 5.0 * plant)):
         return ""
     return (
@@ -282,7 +286,7 @@ def _not_as_stated(run: MeasuredRun, closed: _Simulated, opened: _Simulated) -> 
 def _another_cart(
     run: MeasuredRun, controller: submission.Controller | None, cart: int | None
 ) -> str:
-    """Say that another cart than the stated one comes to rest at the reference."""
+    """Return a note that another cart than the stated one comes to rest at the reference."""
     reference = run.record.reference
     if not isinstance(controller, submission.StateFeedbackController) or reference is None:
         return ""
@@ -294,7 +298,7 @@ def _another_cart(
         run.free[row]: abs(float((run.y[row, window][last] - run.rest[row]).mean()) / target - 1)
         for row in np.flatnonzero(run.seen).tolist()
     }
-    there = [other for other, away in off.items() if away <= 0.05]  # of the reference
+    there = [other for other, away in off.items() if away <= 0.05]  # relative to the reference
     if len(there) != 1 or off.get(cart, 0.0) < 0.2:
         return ""
     return (
@@ -327,7 +331,7 @@ def _compare(
     loop: Literal["closed", "open"],
     steered: int | None,
 ) -> list[HardwareCheck]:
-    """Return a check for each measured cart that moved; the note goes with the first."""
+    """Return a check for each measured cart that moved; the first one has the note."""
     record, note = run.record, simulated.note
     steps = record.reference if record.kind == "closed_loop" else record.u
     window = run.step_window(steps) if record.kind in ("closed_loop", "step") else None
@@ -367,7 +371,7 @@ def _compare(
 
 
 class _Step(NamedTuple):
-    """Overshoot in percent, settling time in s, level as read; None if it does not exist."""
+    """Overshoot in percent, settling time in s and level; None for a value that does not exist."""
 
     overshoot: float | None = None
     settling: float | None = None
@@ -375,13 +379,13 @@ class _Step(NamedTuple):
 
 
 def _judge(run: MeasuredRun, y: Array, *, row: int, window: slice | None, noise: float) -> _Step:
-    """Judge the step of one cart's readings `y` (n,) in the window."""
+    """Return the step measures of one cart's readings `y` (n,) in the window."""
     if window is None:
         return _Step()
     t, after = run.record.t[window], y[window]
     before = y[: window.start].mean() if window.start > 0 else run.rest[row]
     level = after[-max(1, round(_SETTLED_SHARE * after.size)) :].mean()
-    # Of the cart's largest motion; a smaller step has no meaningful overshoot.
+    # A step below 5 % of the cart's largest motion has no meaningful overshoot.
     if abs(level - before) <= max(noise, 0.05 * np.max(np.abs(y - before))):
         return _Step(level=float(level))
     settling = float(step_response.settling_time(t, after, before=before, level=level, noise=noise))

@@ -13,7 +13,7 @@ def combine_repeats(
 ) -> Estimate:
     """Combine repeats of one number to their mean.
 
-    The standard error is the larger of those implied by the spread and by the single errors.
+    Its standard error comes from the spread or from the single errors; the larger one is used.
     """
     v = np.array(values, dtype=float)
     within = float(np.sqrt(np.sum(np.square(std))) / v.size)
@@ -29,7 +29,7 @@ def combine_repeats(
 def estimate_initially(
     *, carts: int, log_decrements: Sequence[LogDecrement], step_gains: Sequence[StepGain]
 ) -> dict[str, Estimate]:
-    """Estimate the gains from steps, the frequency and damping of each cart alone from decays."""
+    """Estimate gains from steps, and each cart's own frequency and damping from decays."""
     measured: dict[str, list[tuple[float, float, str, str]]] = {}
     for decay in log_decrements:
         for name, value, std in (

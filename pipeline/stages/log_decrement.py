@@ -10,12 +10,12 @@ from pipeline.estimation.decay.free_decay import FreeDecay, find_decay, fit_deca
 from pipeline.estimation.noise import grain
 from pipeline.results import LogDecrement, Record
 
-_PEAKS_FOR_REGRESSION = 4  # two amplitudes
+_PEAKS_FOR_REGRESSION = 4  # these give two amplitudes
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Peaks:
-    """Turning points and the results from them: delta and the damped frequency, with errors."""
+    """Turning points, and the decrement and damped frequency from them with standard errors."""
 
     t: Array
     y: Array
@@ -27,13 +27,13 @@ class _Peaks:
 
     @property
     def zeta(self) -> tuple[float, float]:
-        """The damping ratio, and its error."""
+        """The damping ratio and its standard error."""
         length = float(np.hypot(2 * np.pi, self.delta))
         return self.delta / length, (2 * np.pi) ** 2 / length**3 * self.delta_std
 
     @property
     def omega_n(self) -> tuple[float, float]:
-        """The natural frequency, rad/s, and its error."""
+        """The natural frequency, rad/s, and its standard error."""
         zeta, zeta_std = self.zeta
         stretched = 1 / np.sqrt(1 - zeta**2)
         omega_n = self.omega_d * stretched
@@ -44,14 +44,15 @@ class _Peaks:
 def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     """Estimate damping ratio and natural frequency of one cart from its free decay.
 
-    The decay is found: a hold, a hand or a driven part may come before it. There are two estimates:
-    the classical one from the peaks, and an exponential sinusoid with a drifting rest point fitted
-    to every sample. Dry friction is tested for. Valid for one free cart on at least one spring and
-    damping ratios up to about 0.6.
+    The decay is searched for: a hold, a hand or a driven part may come before it. There are two
+    estimates. One is the classical one from the peaks. The other is an exponential sinusoid with a
+    drifting rest point, fitted to every sample. Dry friction is tested for. The method is valid for
+    one free cart on at least one spring and damping ratios up to about 0.6.
 
     Raises
     ------
-    DataError : no two turning points of one decay, or the motion is not a decaying oscillation.
+    DataError : there are no two turning points of one decay, or the motion is not a decaying
+        oscillation.
     """
     t, y = record.t, record.position(cart)
     size = grain(t, y, step=record.encoder_step(cart))
@@ -61,8 +62,8 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     fit, pole = decay.fit, complex(decay.fit.poles[0])
     omega_n, zeta = abs(pole), -pole.real / abs(pole)
     unexplained = fit.rms / float(np.ptp(y[decay.first : decay.stop]))
-    # A fit with a larger residual belongs to another motion; for real carts with dry friction it is
-    # 1.3 to 2.1 % (ten runs).
+    # A fit with a larger residual describes another motion. Real carts with dry friction leave 1.3
+    # to 2.1 % (ten runs).
     if not (0 < zeta < 1 and pole.imag > 0 and unexplained < 0.08):
         raise DataError(
             f"{record.id}: log decrement needs a decaying oscillation of cart {cart}, found "
@@ -72,7 +73,7 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
     peaks = _peaks(t, y, decay, floor=floor)
     (zeta_peaks, zeta_peaks_std), (omega_n_peaks, omega_n_peaks_std) = peaks.zeta, peaks.omega_n
     end = t[decay.stop - 1]
-    n_figure = int(60 * pole.imag * (end - fit.t0) / (2 * np.pi)) + 2  # 60 a period
+    n_figure = int(60 * pole.imag * (end - fit.t0) / (2 * np.pi)) + 2  # 60 points per period
     fit_t = np.linspace(fit.t0, end, min(n_figure, 3000))
     middle = fit.level + fit.slope * (fit_t - fit.t0)
     envelope = np.abs(fit.amplitudes[0]) * np.exp(pole.real * (fit_t - fit.t0))
@@ -104,7 +105,10 @@ def fit_log_decrement(record: Record, *, cart: int) -> LogDecrement:
 
 
 def _pole_errors(pole: complex, covariance: Array) -> tuple[float, float]:
-    """Return those of zeta and omega_n from that (2, 2) of decay rate and damped frequency."""
+    """Return the standard errors of zeta and omega_n.
+
+    `covariance` (2, 2) is that of decay rate and damped frequency.
+    """
     per_zeta = np.array([pole.imag**2, pole.real * pole.imag]) / abs(pole) ** 3
     per_omega = np.array([-pole.real, pole.imag]) / abs(pole)
     zeta_std, omega_n_std = (np.sqrt(per @ covariance @ per) for per in (per_zeta, per_omega))
@@ -117,10 +121,10 @@ def _pole_errors(pole: complex, covariance: Array) -> tuple[float, float]:
 def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     """Locate the turning points between samples and regress ln A on their number.
 
-    With fewer than four the numbers are those of the exponential fit.
+    With fewer than four turning points, the values are those of the exponential fit.
     """
     pole = complex(decay.fit.poles[0])
-    # In rad: this near a turning point a cosine is nearly a parabola.
+    # Within half a radian of a turning point, a cosine is nearly a parabola.
     located = [_vertex(t, y, i, half_width=0.5 / pole.imag) for i in decay.turning]
     peak_t, peak_y = np.array(located).reshape(-1, 2).T
     n = peak_t.size
@@ -138,8 +142,8 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
             omega_d=pole.imag,
             omega_d_std=float(omega_d_std),
         )
-    # The noise is constant in A, so ln A has the weight A²; the errors follow from those of the
-    # turning points, shared by neighbouring A.
+    # The noise of A is constant, so ln A has the weight A². The standard errors follow from those
+    # of the turning points, which neighbouring amplitudes share.
     per_log = _slope(amplitude)
     loss = -float(per_log @ np.log(amplitude))  # per half cycle
     sigma = max(decay.fit.rms, floor)  # of one turning point, at worst
@@ -149,7 +153,7 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
     count = np.arange(n) - (n - 1) / 2
     late = peak_t - peak_t.mean() - interval * count
     interval_std = float(np.linalg.norm(per_time * late)) * np.sqrt(n / (n - 2))
-    # Of the decrement: the remaining difference, with samples at any phase.
+    # The decrement of samples at any phase can still differ by this relative amount.
     return _Peaks(
         t=peak_t,
         y=peak_y,
@@ -162,13 +166,13 @@ def _peaks(t: Array, y: Array, decay: FreeDecay, *, floor: float) -> _Peaks:
 
 
 def _slope(weight: Array) -> Array:
-    """Return what to multiply values (n,) by for the slope of their weighted line per step."""
+    """Return factors (n,) that turn values into the slope per step of their weighted line."""
     line = np.vander(np.arange(float(weight.size)), 2)
     return (np.linalg.pinv(line * weight[:, None]) * weight)[0]
 
 
 def _half_swing(n: int) -> Array:
-    """Return the map (n - 2, n) from turning points to their distance from the moving middle."""
+    """Return the map (n - 2, n) from turning points to half swings about the moving middle."""
     if n < 3:
         return np.empty((0, n))
     return 0.5 * np.eye(n - 2, n, 1) - 0.25 * (np.eye(n - 2, n) + np.eye(n - 2, n, 2))
@@ -189,7 +193,7 @@ def _vertex(t: Array, y: Array, index: int, *, half_width: float) -> tuple[float
 
 
 def _zeta_at_amplitude(amplitude: Array) -> Array:
-    """Return (2, n - 1): mean amplitudes and the damping ratios from one to the next."""
+    """Return (2, n - 1) mean amplitudes, and the damping ratio from each amplitude to the next."""
     if amplitude.size < 2:
         return np.empty((2, 0))
     loss = np.log(amplitude[:-1] / amplitude[1:])
@@ -216,7 +220,7 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
             f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
             f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
         )
-    # A mean is noted if the damping of large amplitudes exceeds it by this much.
+    # Worth a note if the damping of large amplitudes is larger by 5 %.
     elif test and test.f_statistic > test.threshold and test.zeta > 1.05 * zeta:
         notes.append(
             "the decay is not exponential: the damping grows with the amplitude, and zeta is a mean"

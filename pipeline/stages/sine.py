@@ -11,12 +11,12 @@ from pipeline.estimation.colour import colour
 from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_left
 from pipeline.results import Record, SinePoint
 
-FEW_COUNTS = 20  # encoder steps: a smaller amplitude is known only to a few percent
-_MIN_SAMPLES = 12  # five unknowns, and a residual to judge the fit by
-_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: the longer of the two; cycles, s
+FEW_COUNTS = 20  # encoder steps; a smaller amplitude is known only to a few percent
+_MIN_SAMPLES = 12  # for five unknowns, and a residual to judge the fit by
+_WINDOW_CYCLES, _WINDOW_TIME = 3.0, 0.6  # a sliding window: cycles or s, whichever is longer
 _HOP_CYCLES, _HOP_TIME = 1.0, 0.2
 _LAST_WINDOWS = 4
-_PEAK_LINES = 4  # of the padded spectrum: a sine's frequency is no further from its peak
+_PEAK_LINES = 4  # lines of the padded spectrum; a sine's frequency is no further from its peak
 _ITERATIONS = 20
 
 
@@ -26,7 +26,8 @@ class _Part:
 
     Attributes
     ----------
-    columns : (n, p) from `_columns`; inverse (p, n), its pseudo-inverse.
+    columns : (n, p) from `_columns`.
+    inverse : (p, n) its pseudo-inverse.
     angle : of the sine, rad per sample.
     """
 
@@ -47,7 +48,7 @@ class _Part:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Sine:
-    """A sine, an offset and a straight drift (the coefficients), and the residual."""
+    """A fitted sine with offset and linear drift: coefficients and residual."""
 
     part: _Part
     coefficients: Array
@@ -81,7 +82,7 @@ class _Sine:
 
 @dataclass(frozen=True, kw_only=True)
 class _Steady:
-    """The first sample of the steady part; `left`: the possible rest of the transient in it."""
+    """The first sample of the steady part; `left` is how much of a transient may remain in it."""
 
     start: int
     settled: bool
@@ -91,27 +92,28 @@ class _Steady:
 def fit_sine(record: Record, *, cart: int) -> SinePoint:
     """Fit the sinusoidal steady state of one cart to a dwell.
 
-    The last windows show whether there is a steady part, and it reaches back as far as its own sine
-    explains the record. The input is fitted over the same part; if it is held between samples, its
-    amplitude is that of the held staircase. Valid for one frequency, from one cycle on. Several
-    carts of one dwell share much work: see `Dwell`.
+    The last windows show whether there is a steady part. It reaches back as far as its own sine
+    explains the record. The input is fitted over the same part. If it is held between samples, its
+    amplitude is that of the held staircase. The method is valid for one frequency and at least one
+    cycle. Several carts of one dwell share much work, see `Dwell`.
 
     Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
 
     Parameters
     ----------
-    record : the dwell; without `omega` the frequency is fitted to the input.
-    cart : whose position.
+    record : the dwell. Without `omega` the frequency is fitted to the input.
+    cart : the cart whose position is fitted.
 
     Raises
     ------
-    DataError : no input column, an input that does not oscillate, or less than a full cycle.
+    DataError : there is no input column, the input does not oscillate, or there is less than a full
+        cycle.
     """
     return Dwell(record).fit(cart=cart)
 
 
 class Dwell:
-    """The driven part of a dwell: its frequency, and the columns that every fit to it shares."""
+    """The driven part of a dwell: its frequency, and the columns shared by all fits."""
 
     def __init__(self, record: Record) -> None:
         self._record = record
@@ -133,7 +135,7 @@ class Dwell:
         steady = self._steady_part(y, floor=floor)
         t = self._t[steady.start :]
         position, drive = self._fit(y, steady.start), self._fit(self._u, steady.start)
-        # Of the amplitude of the input: a larger residual means another signal.
+        # A residual above half of the input's amplitude means that the input is another signal.
         if drive.rms >= 0.5 * abs(drive.z):
             raise DataError(
                 f"{record.id}: a sine dwell needs an input of one frequency, found an amplitude of "
@@ -142,7 +144,7 @@ class Dwell:
             )
         amplitude, input_amplitude = abs(position.z), abs(drive.z)
         held = _held(t, omega=omega) if record.hold == "zero_order" else 1.0
-        rounding = _rounding_std(position, step=step)  # leaves the phase alone
+        rounding = _rounding_std(position, step=step)  # does not affect the phase
         angle_std = _angle_std(position.z, float(np.hypot(position.std, steady.left)))
         notes = [
             frequency_note,
@@ -176,7 +178,7 @@ class Dwell:
 
     @cached_property
     def _u(self) -> Array:
-        assert self._record.u is not None  # or nothing is driven
+        assert self._record.u is not None  # otherwise nothing would be driven
         return self._record.u[self._driven]
 
     @cached_property
@@ -188,7 +190,7 @@ class Dwell:
         return _columns(self._t, omega=self._frequency[0])
 
     def _fit(self, y: Array, start: int, stop: int | None = None) -> _Sine:
-        """Fit a sine to samples [start, stop) of y (n,), all carts' the same way."""
+        """Fit a sine to samples [start, stop) of y (n,), with columns shared by all carts."""
         span = start, self._t.size if stop is None else stop
         if span not in self._parts:
             t = self._t[slice(*span)]
@@ -201,8 +203,9 @@ class Dwell:
     def _steady_part(self, y: Array, *, floor: float) -> _Steady:
         """Find where the steady part starts, and whether there is one.
 
-        Settled: the complex amplitudes of the last windows agree. Their sine is then extended back
-        over the record as far as it leaves no more than its own residual.
+        The dwell has settled if the complex amplitudes of the last windows agree. Their sine is
+        then extended back over the record, until it misses the record by more than its own
+        residual.
         """
         windows = _windows(self._t, omega=self._frequency[0])
         last = windows[-_LAST_WINDOWS:]
@@ -210,27 +213,27 @@ class Dwell:
         z = np.array([fit.z for fit in fits])
         latest, _ = last[-1]
         spread = float(np.max(np.abs(z - z.mean())))
-        # The last windows agree to half a percent of the amplitude, or to their noise.
+        # The last windows must agree to half a percent of the amplitude, or to their noise.
         agree = spread <= max(0.005 * abs(z.mean()), floor)
         if len(last) < 2 or not (agree or spread <= 3 * max(fit.std for fit in fits)):
             return _Steady(start=latest, settled=False, left=spread)
         start = self._carry_back(y, latest, floor=floor, stretches=len(windows))
         if start > 0:
-            # The share of the steady part given up to the rest of the transient.
+            # A third of the steady part is given up, as it may hold the rest of the transient.
             start = min(start + (y.size - start) // 3, latest)
         start, left = self._drop_drifting(y, start, latest=latest, floor=floor)
         return _Steady(start=start, settled=True, left=left)
 
     def _carry_back(self, y: Array, start: int, *, floor: float, stretches: int) -> int:
-        """Return how far back the sine from `start` on explains the record."""
-        # Of extending the sine back; each roughly doubles its basis.
+        """Return the first sample from which the sine fitted from `start` explains the record."""
+        # Three rounds of extending the sine back; each roughly doubles the samples it is fitted to.
         for _ in range(3):
             steady = self._fit(y, start)
             square = np.cumsum((y - self._columns @ steady.coefficients) ** 2)
             hop = max((y.size - start) // stretches, _MIN_SAMPLES)
             edges = np.arange(start, -1, -hop)
             mean = -np.diff(square[edges]) / hop  # of the stretches before `start`, going back
-            # A stretch whose mean square residual is larger by this factor is not steady.
+            # A stretch with a mean square residual above this limit is not steady.
             limit = max(steady.rms, floor) ** 2 * (1 + 4.0 * np.sqrt(2 / hop))
             worse = np.flatnonzero(mean > limit)
             reached = int(edges[worse[0]]) if worse.size else 0
@@ -242,10 +245,10 @@ class Dwell:
     def _drop_drifting(
         self, y: Array, start: int, *, latest: int, floor: float
     ) -> tuple[int, float]:
-        """Return a start, not after `latest`, from which the two halves agree; and the rest.
+        """Return a start, at most `latest`, from which two halves agree; and the remaining error.
 
-        At a resonance the transient has the dwell's own frequency and hides in its amplitude. Half
-        of the difference between the halves, if it exceeds the noise, is still in the mean.
+        At a resonance, the transient has the dwell's own frequency and hides in its amplitude. If
+        the difference between the halves exceeds the noise, half of it is still in the mean.
         """
         while True:
             middle = (start + y.size) // 2
@@ -255,10 +258,10 @@ class Dwell:
             late = self._fit(y, middle)
             difference = abs(early.z - late.z)
             noise = max(np.hypot(early.std, late.std), floor / np.sqrt(y.size - start))
-            # The steady part's two halves differ by no more.
+            # The two halves of the steady part may differ by three times the noise.
             if start == latest or difference <= 3.0 * noise:
                 return start, float(np.sqrt(max(difference**2 - 4 * noise**2, 0.0))) / 2
-            # The share of it that is dropped at once if they do.
+            # Otherwise, drop a sixth of the part and compare again.
             start = min(start + (y.size - start) // 6, latest)
 
 
@@ -266,7 +269,7 @@ class Dwell:
 
 
 def _columns(t: Array, *, omega: float) -> Array:
-    """Return sin(omega t), cos(omega t), 1 and time, from -1 to 1: (n, 4)."""
+    """Return the columns (n, 4): sin(omega t), cos(omega t), 1, and time from -1 to 1."""
     half = (t[-1] - t[0]) / 2
     tau = (t - (t[0] + half)) / half
     return np.array([np.sin(omega * t), np.cos(omega * t), np.ones_like(t), tau]).T
@@ -278,7 +281,7 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
     X = _columns(t, omega=omega)
     fit = _Part.of(X, angle=angle).fit(y)
     for _ in range(_ITERATIONS):
-        # by how much a change of omega, in rad at the ends of the record, changes the sine
+        # Change of the sine when omega changes by 1 rad at the ends of the record.
         turned = X[:, 3] * (fit.coefficients[0] * X[:, 1] - fit.coefficients[1] * X[:, 0])
         X = np.column_stack([_columns(t, omega=omega), turned])
         fit = _Part.of(X, angle=angle).fit(y)
@@ -290,28 +293,28 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
 
 
 def _angle_std(z: complex, std: float) -> float:
-    """Return the standard error of the phase; an angle drawn blindly has pi/sqrt(3)."""
+    """Return the standard error of the phase, at most pi/sqrt(3) (a random angle)."""
     blind = np.pi / np.sqrt(3)
     return float(min(std / abs(z), blind)) if z else float(blind)
 
 
 def _rounding_std(fit: _Sine, *, step: float) -> float:
-    """Return the amplitude error that rounding leaves however many samples are averaged.
+    """Return the amplitude error from rounding that remains after averaging any number of samples.
 
     Rounding offset + A sin adds sum_k (q / pi k) 2 J1(2 pi k A/q) cos(2 pi k offset/q) to the
-    amplitude, 0.111 q sqrt(q/A) root-mean-square over A and offset; noise removes it.
+    amplitude. Its root mean square over A and offset is 0.111 q sqrt(q/A). Noise removes it.
     """
     if step == 0:
         return 0.0
     left = rounding_left(noise_beyond_rounding(fit.rms, step=step), step=step)
-    # Of the encoder step, times sqrt(step / amplitude): see `_rounding_std`.
+    # In encoder steps, times sqrt(step / amplitude): see the docstring.
     return 0.111 * step * float(np.sqrt(step / max(abs(fit.z), step))) * left
 
 
 def _held(t: Array, *, omega: float) -> complex:
     """Return the factor from a sampled sine to the first harmonic of its held staircase."""
     dt = np.diff(t)
-    # Sample intervals; longer ones are gaps in the log.
+    # Intervals of more than three samples are gaps in the log.
     dt = dt[dt < 3.0 * np.median(dt)]  # the input during a gap is unknown
     return complex(np.sum(-np.expm1(-1j * omega * dt)) / (1j * omega * np.sum(dt)))
 
@@ -332,7 +335,7 @@ def _driven(record: Record) -> slice:
             f"{record.id}: a sine dwell needs an input that oscillates, found {u[0]:g} throughout"
         )
     offset = (np.max(u) + np.min(u)) / 2
-    # Of the input's amplitude: the dwell runs from its first to its last such sample.
+    # The dwell runs from the first to the last sample beyond half of the input's amplitude.
     first, last = np.flatnonzero(np.abs(u - offset) > 0.5 * np.ptp(u) / 2)[[0, -1]]
     driven = slice(int(first), int(last) + 1)
     if last + 1 - first < _MIN_SAMPLES:
@@ -344,20 +347,20 @@ def _driven(record: Record) -> slice:
 
 
 def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]:
-    """Return the frequency, rad/s: as stated, unless the input clearly says otherwise."""
+    """Return the frequency, rad/s: as stated, unless the input clearly has another one."""
     grid = np.linspace(t[0], t[-1], t.size)
     even = np.interp(grid, t, u - np.mean(u))
-    n = 4 * t.size  # padded: the peak is found to a quarter of a line
+    n = 4 * t.size  # padded, so that the peak is found to a quarter of a line
     spectrum = np.abs(np.fft.rfft(even * np.hanning(t.size), n))
     line = 2 * np.pi / (n * (grid[1] - grid[0]))
     peak = line * (1 + int(np.argmax(spectrum[1:])))
     fitted, std = _refined(t, u, omega=peak)
-    if abs(fitted - peak) > _PEAK_LINES * line:  # not a sine, which the caller will notice
+    if abs(fitted - peak) > _PEAK_LINES * line:  # not a sine; the caller will notice
         fitted = peak
     if stated is None:
         return fitted, ""
-    # A stated frequency is rejected if it is this far off in standard errors, and by more than any
-    # clock error.
+    # A stated frequency is rejected if it is off by five standard errors, and by more than a
+    # clock's error.
     if abs(fitted - stated) <= max(5.0 * std, 2e-4 * stated):
         return stated, ""
     return fitted, (
@@ -367,12 +370,12 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
 
 
 def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
-    """Return sliding windows [start, stop) over the record, the last one ending with it."""
+    """Return sliding windows [start, stop) over the record; the last one ends with it."""
     period = 2 * np.pi / omega
     duration = t[-1] - t[0]
     length = max(_WINDOW_CYCLES * period, _WINDOW_TIME)
     hop = max(_HOP_CYCLES * period, _HOP_TIME)
-    if length + (_LAST_WINDOWS - 1) * hop > duration:  # short record: single cycles
+    if length + (_LAST_WINDOWS - 1) * hop > duration:  # for a short record, single cycles
         length, hop = period, max(period / 2, (duration - period) / _LAST_WINDOWS)
     ends = t[-1] - hop * np.arange(int((duration - length) / hop + 1e-9) + 1)
     first, stop = np.searchsorted(t, ends - length), np.searchsorted(t, ends, side="right")
@@ -394,7 +397,7 @@ def _note_small(amplitude: float, *, step: float) -> str:
 
 
 def _note_off_sine(fit: _Sine, *, floor: float) -> str:
-    # Of the amplitude: a residual below this is a good sine.
+    # A residual below 1 % of the amplitude is good.
     if fit.rms <= max(2 * floor, 0.01 * abs(fit.z)):
         return ""
     return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"

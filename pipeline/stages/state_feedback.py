@@ -1,13 +1,14 @@
 """Design state feedback with a prefilter, so that one cart follows a step.
 
-The design is sampled and its model holds the computer's one-sample delay: the gains multiply the
-state predicted for the moment the effort acts (`plant.loop.sampled_loop`). So the loop has the
-poles of Phi - Gamma G and one at z = 0 for the delay, with 2n gains.
+The design is sampled, and its model includes the computer's one-sample delay: the gains multiply
+the state predicted for the moment at which the effort acts (`plant.loop.sampled_loop`). So with 2n
+gains, the loop has the poles of Phi - Gamma G and one at z = 0 for the delay.
 
-"lqr" weights energy against the input, alpha times the potential and beta times the kinetic, and
-searches both. "poles" is the design by hand: a dominant pair replaces the plant's slowest, and the
-further pairs, at the plant's own frequencies but better damped, are varied. Both take the gentlest
-candidates whose simulated step meets the goal, and of these the fastest.
+Method "lqr" weights energy against the input, alpha times the potential and beta times the kinetic
+energy, and searches both weights. Method "poles" is the design by hand. A dominant pair replaces
+the plant's slowest pair. The further pairs keep the plant's own frequencies, with more damping, and
+are varied. Both methods take those candidates with the smallest inputs whose simulated step meets
+the goal, and of these the fastest.
 """
 
 from dataclasses import dataclass, replace
@@ -37,26 +38,27 @@ from pipeline.submission import Design
 
 Method = Literal["poles", "lqr"]
 
-_POINTS = 512  # of a candidate's step; a power of two, as it is made by doubling
+_POINTS = 512  # points of a candidate's step, a power of two, as it is computed by doubling
 
-# Shares of the goal (settling time, overshoot) to aim at, the best first: the plant is known to a
-# few percent only and should still meet the goal.
+# Shares of the goal (settling time, overshoot) to aim at, the best first. The plant is known only
+# to a few percent and should still meet the goal.
 _AIMS = ((0.8, 0.05), (0.8, 0.5), (1.0, 1.0))
 _UNSEEN = 0.05  # percent of overshoot that nobody notices
 
-_WEIGHTS = np.logspace(-3, 4, 25)  # of energies: from invisible feedback to a stiff loop
-_HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # to all but deadbeat
+_WEIGHTS = np.logspace(-3, 4, 25)  # weights of energies, from no visible feedback to a stiff loop
+_HEAVY_WEIGHTS = np.logspace(-3, 12, 40)  # up to almost deadbeat control
 _DOMINANT_SETTLING = np.linspace(0.3, 1.0, 8)  # of the goal
-_FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # at least; a pair keeps its own if better
+_FURTHER_ZETA = (0.0, 0.1, 0.2, 0.35, 0.5, 0.7)  # smallest damping ratios; a pair may have more
 _FURTHER_SPEED = (1.0, 1.25)  # of the plant's own frequency
 
 
 def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
     """Design u = prefilter r - gains [x1, v1, x2, v2, …] for a step of one cart.
 
-    A goal that cannot be met gives `reachable` False, the nearest design, and a message that
-    says what is reachable. The settling time counts from the step of the reference, the delay
-    included. A sample time that is not stated is 0.00884 s, less where plant or goal is fast.
+    If the goal cannot be met, `reachable` is False. The result is the nearest design, with a
+    message that says what is reachable. The settling time counts from the step of the reference, so
+    it includes the delay. If no sample time is stated, it is 0.00884 s, or less for a fast plant or
+    goal.
 
     Raises
     ------
@@ -80,7 +82,7 @@ def design_feedback(chain: Chain, task: Design) -> FeedbackDesign:
         reference=task.reference,
     )
     try:
-        # A candidate may be unstable and diverge; it is judged by its final numbers.
+        # A candidate may be unstable and diverge; its final numbers show that.
         with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
             plant = SampledPlant.of(
                 chain, cart=task.cart, settling=task.settling_time, sample_time=task.sample_time
@@ -103,7 +105,7 @@ def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDe
         requested, costs = None, energy_weights(plant, _WEIGHTS)
         candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
         best, met = _choose(plant, candidates, goal)
-        if not met:  # perhaps the goal is much faster than the plant
+        if not met:  # the goal may be much faster than the plant
             costs = energy_weights(plant, _HEAVY_WEIGHTS)
             candidates = _try_step(plant, lqr_gains(plant.phi, plant.gamma, costs), goal)
             best, met = _choose(plant, candidates, goal)
@@ -129,7 +131,7 @@ def _design(plant: SampledPlant, goal: "_Goal", *, method: Method) -> FeedbackDe
 class _Goal:
     overshoot: float  # percent
     settling: float  # s
-    limit: float  # input units; infinite for none
+    limit: float  # input units; infinite without a limit
     reference: float  # position units
 
     def __str__(self) -> str:
@@ -152,8 +154,8 @@ def _pole_candidates(plant: SampledPlant, goal: _Goal) -> ComplexArray:
             dominant_zeta, goal.settling * _DOMINANT_SETTLING, _FURTHER_ZETA, _FURTHER_SPEED
         )
     )
-    # exp(-4) is the 2 % of the settling time. No pair is made slower than the plant's own: that
-    # would cancel stiffness and leave a small difference of large numbers.
+    # exp(-4) is the 2 % of the settling time. No pair is made slower than the plant's own pair, as
+    # this would cancel stiffness and leave a small difference of large numbers.
     dominant = np.maximum(4 / (z * settling), omega[0])
     pairs = [_pair(dominant, z)]
     for own_omega, own_zeta in zip(omega[1:], zeta[1:], strict=True):
@@ -178,33 +180,34 @@ class _Candidates:
 
     gains: Array
     overshoot: Array  # percent
-    settling: Array  # s; estimated from the slowest pole if the step is not followed that far
+    settling: Array  # s. Estimated from the slowest pole if the simulated step ends earlier
     peak: Array  # input units
-    level_error: Array  # percent of the step, from errors in the model
+    level_error: Array  # percent of the step, due to errors in the model
 
 
 def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
-    """Follow the step of every candidate at once; exact at the sampled points.
+    """Simulate the step of every candidate at once, exactly at the sampled points.
 
-    They are close enough to show every peak, even if the view then ends before the goal's time:
-    settling is then estimated.
+    The points are close enough to show every peak. If the simulation then ends before the goal's
+    settling time, the settling time is estimated.
     """
     loop = plant.phi - plant.gamma[:, None] * gains[:, None, :]
     fastest = np.abs(plant.chain.poles).max() + 4 / goal.settling
-    # Settling times of the goal for which a candidate's step is followed.
+    # The step is simulated for three times the goal's settling time, if the points suffice.
     apart = min(3.0 * goal.settling / _POINTS, RADIANS_PER_SAMPLE / fastest)
     stride = max(1, round(apart / plant.sample_time))
     level = np.linalg.solve(np.eye(plant.gamma.size) - loop, plant.gamma[:, None])
     prefilter = 1 / level[:, plant.row]
     level = level * prefilter[:, None]
-    # The distance to go shrinks by `loop` each sample; each pass doubles the points known.
+    # The distance to the level is multiplied by `loop` in each sample; each pass doubles the
+    # points.
     to_go, ahead = -level, np.linalg.matrix_power(loop, stride)
     while to_go.shape[-1] < _POINTS:
         to_go, ahead = np.concatenate([to_go, ahead @ to_go], axis=-1), ahead @ ahead
     points = np.arange(_POINTS, dtype=np.float64)
     t = plant.sample_time * (1 + stride * points)  # the first sample is the delay
     y = 1 + to_go[:, plant.row]
-    # With the input that holds the level: a slow candidate may not be there yet.
+    # Includes the input that holds the level, as a slow candidate may not be there yet.
     u = prefilter - np.einsum("ci,cin->cn", gains, np.append(to_go, 0 * level, axis=-1) + level)
     one = np.ones(len(gains))
     settling = t[0] + step_response.settling_time(t, y, before=0.0, level=one)
@@ -221,21 +224,26 @@ def _try_step(plant: SampledPlant, gains: Array, goal: _Goal) -> _Candidates:
 
 
 def _choose(plant: SampledPlant, candidates: _Candidates, goal: _Goal) -> tuple[int, bool]:
-    """Return the index of the best candidate and whether it meets the goal, or comes nearest."""
+    """Return the index of the best candidate, and whether it meets the goal.
+
+    If no candidate meets the goal, it is the nearest one.
+    """
     within = candidates.peak <= goal.limit
-    if not within.any():  # a step of this size cannot be reached: design for a smaller one
+    if not within.any():  # a step of this size is out of reach, so design for a smaller one
         within = np.full_like(within, True)
-    # Percent of the step by which errors in the springs may move the level, if possible.
+    # Errors in the springs should move the level by at most 10 % of the step, if possible.
     for level_error, (settling, overshoot) in product((10.0, np.inf), _AIMS):
         good = within & (candidates.level_error <= level_error)
         good &= candidates.settling <= settling * goal.settling
         good &= candidates.overshoot <= max(overshoot * goal.overshoot, _UNSEEN)
         if not good.any():
             continue
-        # Times the gentlest candidate's peak input that a faster one may take.
+        # A faster candidate may take 1.25 times the peak input of the candidate with the least
+        # input.
         good &= candidates.peak <= 1.25 * candidates.peak[good].min()
         order = np.flatnonzero(good)[np.argsort(candidates.settling[good], kind="stable")]
-        # Candidates, in order, tried for a loop that is stable for all errors of the model.
+        # The first eight are tried until one gives a loop that is stable for all errors of the
+        # model.
         for index in order[:8]:
             if plant.stays_stable(plant.to_units(candidates.gains[index])):
                 return int(index), True
@@ -268,8 +276,8 @@ def _finish(
     if requested is not None:
         away = np.abs(requested[None, :] - poles[:, None])
         requested = requested[linear_sum_assignment(away)[1]]
-    # Settling times of the chosen design's step in the result.
-    # Settling times of the goal at which a design that misses it is given up.
+    # The result shows twice the goal's or the design's settling time, whichever is longer. A design
+    # that misses the goal is shown for at most 20 times the goal's.
     shown = 2.0 * min(max(goal.settling, settling), 10.0 * goal.settling)
     check_ticks(shown, T)
     t = T * np.arange(np.ceil(shown / T) + 1, dtype=np.float64)
@@ -307,7 +315,7 @@ def _finish(
 
 
 def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
-    """Describe what can be reached if the goal cannot, and the effect of model errors; often ""."""
+    """Return what can be reached if the goal cannot, and the effect of model errors; often ""."""
     said = []
     tied = plant.chain.k[0] > 0 or plant.chain.k[-1] > 0
     held = abs(plant.chain.static_gains()[plant.cart - 1]) * goal.limit if tied else np.inf

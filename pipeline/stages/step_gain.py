@@ -14,22 +14,22 @@ from pipeline.estimation.noise import grain, noise_beyond_rounding, rounding_lef
 from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepEdge, StepGain
 
-_MOVED = 6.0  # grains (encoder steps, or noise as coarse): a cart that moved less has not moved
-_EXTRAPOLATES = 0.02  # of the motion: what a fit that foretells the level may leave, and be off by
-_STICKS_SIGMAS = 4.0  # standard errors: by chance one edge in 16,000 is as far off
+_MOVED = 6.0  # grains (see `_FLAT`). A smaller motion does not count
+_EXTRAPOLATES = 0.02  # of the motion. Largest residual and error of an extrapolated level
+_STICKS_SIGMAS = 4.0  # standard errors. By chance one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
-# Motion is counted in grains: the encoder step, or the step that would round as coarsely as the
-# noise.
-_FLAT = 3.0  # a window with a smaller range is level
+# Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals
+# the noise.
+_FLAT = 3.0  # grains. A window with a smaller range is level
 _PROMINENCE = 6.0
-_ARITHMETIC = 1e-3  # the scatter of a level without noise or rounding
+_ARITHMETIC = 1e-3  # scatter of a level without noise or rounding
 _DRIFT_PASSES = 4
 _SAME_INPUT = 0.02  # of the input's range
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Level:
-    """The rest of a cart at one input: value, error, and samples."""
+    """The rest of a cart at one input: value, standard error, and samples."""
 
     first: int
     stop: int
@@ -40,9 +40,9 @@ class _Level:
 
 @dataclass(frozen=True, kw_only=True)
 class _Plateau:
-    """Samples [first, stop) at one input, and the level at which the cart settled or None.
+    """Samples [first, stop) with one input, and the level at which the cart settled.
 
-    It is None if the cart did not settle.
+    The level is None if the cart did not settle.
     """
 
     first: int
@@ -54,14 +54,15 @@ class _Plateau:
 def fit_step_gain(record: Record, *, cart: int) -> StepGain:
     """Estimate the static gain of one cart from every edge of a stepped input.
 
-    A level is the mean of the samples after the last motion. If a record (or the next edge) cuts
-    the ringing short, the level is that of damped sinusoids fitted to it, one for each free cart.
-    Valid for any number of carts on at least one spring, steps of any size and sign.
+    A level is the mean of the samples after the last motion. If the end of the record or the next
+    edge cuts the ringing short, damped sinusoids are fitted to it, one for each free cart, and give
+    the level. The method is valid for any number of carts on at least one spring, and steps of any
+    size and sign.
 
     Raises
     ------
-    DataError : no input column, no step in it, a cart that is held, does not move or never
-        settles.
+    DataError : there is no input column or no step in it, or the cart is held, does not move or
+        never settles.
     """
     t, y, step = record.t, record.position(cart), record.encoder_step(cart)
     parts, drift = _constant_parts(record), 0.0
@@ -71,7 +72,7 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         raise DataError(f"{record.id}: step gain needs motion, cart {cart} does not move")
     size = grain(t, y, step=step)
     found = [_settle(record, y, part, size=size, step=step) for part in parts]
-    for _ in range(_DRIFT_PASSES):  # with less drift the settled windows reach further
+    for _ in range(_DRIFT_PASSES):  # without the drift, more samples count as settled
         more = _drift(t, y, [p.level for p in found if p.level], size=size)
         if not more:
             break
@@ -115,14 +116,14 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
 
 
 def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
-    """Return (first, stop, input) of the stretches of constant input, edges in between."""
+    """Return (first, stop, input) of the stretches of constant input, with edges in between."""
     u = record.u
     if u is None:
         raise DataError(
             f"{record.id}: step gain needs the input beside the positions, found no input column: "
             "export it too, or name it under `columns`"
         )
-    # Of the input's range: two halves of a constant stretch differ by less.
+    # Halves of a constant stretch differ by less than 0.5 % of the input's range.
     creep = 0.005 * float(np.ptp(u))
     long = [
         (a, b)
@@ -131,7 +132,7 @@ def _constant_parts(record: Record) -> list[tuple[int, int, float]]:
     ]
     share = sum(b - a for a, b in long) / u.size
     parts = [(a, b, float(np.mean(u[a:b]))) for a, b in long]
-    # With a smaller share of the record at constant input this is not a step run.
+    # In a step run, the input is constant for at least 60 % of the record.
     if share < 0.6 or not any(value for _, _, value in parts):
         raise DataError(
             f"{record.id}: step gain needs an input that steps and then stays, found it constant "
@@ -158,7 +159,7 @@ def _settle(
 
 
 def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Level | None:
-    """Return the level that y (n,) settles at, or None."""
+    """Return the level at which y (n,) settles, or None."""
     motion, pace = float(np.ptp(y)), _pace(t, y, size=size)
     flat = _flat_from(y, span=_FLAT * size)
     if flat == 0 or t[-1] - t[flat] >= pace:
@@ -166,7 +167,7 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
     ringing = _extrapolated(t, y, n_modes=n_modes, floor=size / np.sqrt(12))
     if ringing:
         return ringing
-    # Of the motion, where a window is not level to the noise.
+    # If no window is level down to the noise, 2 % of the motion must do.
     flat = _flat_from(y, span=0.02 * motion)
     if t[-1] - t[flat] >= pace:
         return _mean_level(y, flat, step=step, arithmetic=_ARITHMETIC * size)
@@ -174,9 +175,9 @@ def _level(t: Array, y: Array, *, n_modes: int, size: float, step: float) -> _Le
 
 
 def _pace(t: Array, y: Array, *, size: float) -> float:
-    """Return the length of window that proves rest: a period, or a rise, s."""
+    """Return how long (s) a window must be to prove rest: two periods, or two rise times."""
     turning = extrema(y, prominence=_PROMINENCE * size)
-    if len(turning) > 3:  # the ends are no turning points
+    if len(turning) > 3:  # the ends are not turning points
         return 2 * float(np.max(np.diff(t[turning[1:-1]])))
     risen = np.abs(y - y[0]) >= (1 - np.exp(-1)) * abs(y[-1] - y[0])
     return 2 * float(t[int(np.argmax(risen))] - t[0])
@@ -190,9 +191,9 @@ def _flat_from(y: Array, *, span: float) -> int:
 
 
 def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Level:
-    """Return the mean from `first` on.
+    """Return the mean from `first` on as a level.
 
-    The rounding of a still cart errs by up to half an encoder step.
+    If the cart stands still, rounding causes an error of up to half an encoder step.
     """
     window = y[first:]
     residual = window - window.mean()
@@ -211,7 +212,7 @@ def _mean_level(y: Array, first: int, *, step: float, arithmetic: float) -> _Lev
 def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level | None:
     """Return the level about which y still rings, if damped sinusoids fit it well.
 
-    One for each free cart, or fewer if noise hides the smallest.
+    There is one sinusoid for each free cart, or fewer if noise hides the smallest.
     """
     motion = float(np.ptp(y))
     for n in range(n_modes, 0, -1):
@@ -237,14 +238,14 @@ def _extrapolated(t: Array, y: Array, *, n_modes: int, floor: float) -> _Level |
 def _with_unseen_start(
     t: Array, y: Array, found: list[_Plateau], *, size: float, step: float
 ) -> tuple[list[_Plateau], list[str]]:
-    """Put a rest before a record that starts with the input on and the cart starting to move."""
+    """Add a rest in front, if the input is on at the start and the cart just begins to move."""
     head = found[0]
     if head.u == 0 or not head.level or abs(head.level.value - y[0]) <= _MOVED * size:
         return found, []
     radian = _pace(t[: head.stop], y[: head.stop], size=size) / (2 * np.pi)
     n = max(5, int(np.searchsorted(t, t[0] + radian / 2)))
     velocity = np.polyfit(t[:n] - t[0], y[:n], 2)[1]
-    # Of the motion, per radian of the ringing: an initial velocity below this.
+    # The initial velocity must be below 10 % of the motion per radian of the ringing.
     if abs(velocity) * radian > 0.1 * abs(head.level.value - y[0]):
         return found, []
     std = max(size, step) / np.sqrt(12)
@@ -254,7 +255,7 @@ def _with_unseen_start(
 
 
 def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> float:
-    """Return the slope that every settled window shares, per second; 0 if they do not."""
+    """Return the slope that every settled window shares, per second; 0 without one."""
     slopes, errors = [], []
     for level in levels:
         if level.extrapolated or level.stop - level.first < _MIN_SAMPLES:
@@ -270,7 +271,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
         return 0.0
     weight = 1 / np.square(errors)
     drift = float(np.average(slopes, weights=weight))
-    # A drift must show, equally, in every settled window.
+    # All settled windows must show the same drift clearly.
     seen = abs(drift) > 5.0 / np.sqrt(weight.sum())
     alike = np.abs(np.array(slopes) - drift) <= 0.3 * abs(drift) + 3 * np.array(errors)
     return drift if seen and bool(np.all(alike)) else 0.0
@@ -280,7 +281,7 @@ def _drift(t: Array, y: Array, levels: Sequence[_Level], *, size: float) -> floa
 
 
 def _edges(t: Array, found: Sequence[_Plateau]) -> list[StepEdge]:
-    """Return the edges of the input on whose two sides the cart settles."""
+    """Return the edges of the input with a settled cart on both sides."""
     same = _SAME_INPUT * float(np.ptp([p.u for p in found]))
     edges = []
     for before, after in pairwise(found):
@@ -302,10 +303,10 @@ def _edges(t: Array, found: Sequence[_Plateau]) -> list[StepEdge]:
 
 
 def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
-    """Return the weighted mean gain and its error.
+    """Return the weighted mean gain and its standard error.
 
-    Edges share their levels, and a cart at rest is rounded the same way each time, so the error
-    does not shrink with the number of edges; the spread's error is used if it is larger.
+    Edges share levels, and a cart at rest is rounded the same way each time. So the standard error
+    does not shrink with the number of edges. If the spread gives a larger one, that is used.
     """
     gains = np.array([edge.gain for edge in edges])
     std = np.array([edge.gain_std for edge in edges])
@@ -315,7 +316,7 @@ def _combine(edges: Sequence[StepEdge]) -> tuple[float, float]:
 
 
 def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
-    """Return how far the cart rests from its first rest at the same input, and the error."""
+    """Return how far a later rest is from the first rest at the same input, and its error."""
     span = max(p.u for p in found) - min(p.u for p in found)
     settled = [p for p in found if p.level]
     for last in reversed(settled[1:]):
@@ -326,7 +327,7 @@ def _rest_shift(found: Sequence[_Plateau]) -> tuple[float | None, float]:
 
 
 def _interval(edges: Sequence[StepEdge], *, shift: float) -> tuple[float, float]:
-    """Return the gains that friction makes possible: a rest point is off by half the shift."""
+    """Return the gains that friction allows: each rest point may be off by half the shift."""
     gains = [edge.gain for edge in edges]
     slack = abs(shift) / (2 * min(abs(edge.u_after - edge.u_before) for edge in edges))
     slack = max(slack, max(edge.gain_std for edge in edges))

@@ -1,12 +1,12 @@
 """Joint fit of one chain to time records: steps, sweeps, decays and closed loops at once.
 
-Output-error fit: the chain is simulated exactly from the measured input, and the simulated
+It is an output-error fit: the chain is simulated exactly from the measured input, and simulated
 positions are compared with the measured ones. Start and encoder zeros of each record enter linearly
 and are eliminated, so the search moves only the physical parameters. It starts from a linear
-regression and needs no guess.
+regression and needs no initial guess.
 
-Reference: L. Ljung, System Identification, 2nd ed., sections 7.5 and 10.2; for residuals that
-are not white section 9.5.
+Reference: L. Ljung, System Identification, 2nd ed., sections 7.5 and 10.2; for residuals that are
+not white section 9.5.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from pipeline.plant.linear.chain import Chain
 from pipeline.results import ChainFit, Estimate, Record
 from pipeline.set_up import Bench
 
-_TOLERANCE = 1e-9  # of the cost, relative; far below one standard error for any record
+_TOLERANCE = 1e-9  # relative change of the cost; far below one standard error for any record
 
 
 def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None = None) -> ChainFit:
@@ -42,12 +42,12 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
     Parameters
     ----------
     bench : its carts and springs.
-    start : tried in addition to the starts from the records.
+    start : a chain to start from, in addition to the starts from the records.
 
     Returns
     -------
-    The fit. Its covariance allows for correlated residuals, as caused by dry friction;
-    `chi_square_per_dof` counts them against the encoder step and the local noise.
+    The fit. Its covariance allows for correlated residuals, as caused by dry friction. But
+    `chi_square_per_dof` compares the residuals with encoder step and local noise only.
 
     Raises
     ------
@@ -90,40 +90,41 @@ def _open(records: Sequence[Record]) -> tuple[list[FitWindow], list[str]]:
     return windows, [f"left out: {reason}" for reason in left_out]
 
 
-# ------------------------------------------------------- what the residuals tell
+# ----------------------------------------------------- knowledge from the residuals
 
 
 def _informed(attempt: Attempt, index: int) -> FitWindow:
-    """Return a window that knows its errors, from its residuals, and whether it starts at rest."""
+    """Return a window with standard errors from its residuals, and whether it starts at rest."""
     window, misfit = attempt.windows[index], attempt.misfits[index]
     at_rest = window.kind != "decay" and _starts_at_rest(attempt, index)
     return window.informed(misfit.residual * window.sigma[:, None], at_rest=at_rest)
 
 
 def _starts_at_rest(attempt: Attempt, index: int) -> bool:
-    """Return whether a window starts at rest: freeing its start gains no more than chance.
+    """Return whether a window starts at rest: a free start improves the fit only by chance.
 
-    The gain is that of the whole fit, to first order, with all parameters following. Residuals
-    beyond the stated noise are the chain's own error, of which a record has few independent values.
+    The improvement is that of the whole fit, to first order, with all parameters adjusted.
+    Residuals beyond the stated noise are an error of the chain itself; a record has few independent
+    values of it.
     """
     resting = replace(attempt.windows[index], at_rest=True)
     (held,) = look([resting], attempt.parametrisation, attempt.theta).misfits
     others = [misfit for i, misfit in enumerate(attempt.misfits) if i != index]
     misfit = attempt.misfits[index]
     gain = condense([*others, held])[-1, -1] ** 2 - condense([*others, misfit])[-1, -1] ** 2
-    # Independent values of the chain's own error in a record.
+    # A record is assumed to have 20 independent values of the chain's own error.
     structure = (np.sum(misfit.residual**2) - misfit.residual.size) / 20
     chance = max(long_run_variance(misfit.residual), structure)
     freed = misfit.n_nuisance - held.n_nuisance
-    # Beyond chance, the improvement that a free start must bring to be kept.
+    # The improvement may exceed the expected one by five standard deviations.
     return bool(gain <= chance * (freed + 5.0 * np.sqrt(2 * freed)))
 
 
 def _covariance(attempt: Attempt) -> Array:
     """Return the covariance (n_p, n_p) of the free physical parameters.
 
-    Sandwich of the Gauss-Newton Hessian and the scores' long-run covariance, never below that of
-    white residuals of the same size.
+    It is a sandwich of the Gauss-Newton Hessian and the long-run covariance of the scores. It is at
+    least that of white residuals of the same size.
 
     Raises
     ------
@@ -139,7 +140,7 @@ def _covariance(attempt: Attempt) -> Array:
     long = np.concatenate([s.reshape(scale.size, -1) for s in jacobians], axis=1)
     R = np.asarray(np.linalg.qr(long.T, mode="r"))
     _, singular, Vt = np.linalg.svd(R)
-    # Smallest singular value of the scaled Jacobian over its largest.
+    # The smallest singular value of the scaled Jacobian over its largest.
     if singular[-1] < 1e-9 * singular[0]:
         raise _undetermined(names[int(np.argmax(np.abs(Vt[-1])))])
     whitening = np.linalg.inv(R)  # jacobians @ whitening are orthonormal
@@ -158,13 +159,13 @@ def _undetermined(name: str) -> DataError:
 
 
 def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
-    """Return the wall springs, or else the dampings, that the fit has driven to zero.
+    """Return the wall springs, or else the dampings, that the fit has moved to zero.
 
-    Carts without springs keep their dampings: a body without forces has no modes.
+    Carts without springs keep their dampings, because a body without forces has no modes.
     """
     parametrisation, chain = attempt.parametrisation, attempt.chain
     share = parametrisation.physical(chain) / np.sqrt(np.diag(covariance))
-    # Of its standard error: a damping or wall spring that is held at zero.
+    # A damping or wall spring below 5 % of its standard error is held at zero.
     gone = [name for name, value in zip(parametrisation.names, share, strict=True) if value < 0.05]
     walls = tuple(name for name in gone if name in ("k_1", f"k_{chain.n + 1}"))
     is_held = chain.k[0] > 0 or chain.k[-1] > 0
@@ -172,17 +173,17 @@ def _negligible(attempt: Attempt, covariance: Array) -> tuple[str, ...]:
 
 
 def _released(attempt: Attempt) -> Attempt:
-    """Return the same with the dampings free that were held at zero.
+    """Return the attempt with those dampings free that were held at zero.
 
-    No cart is without damping, and numbers that depend on it are known no better. A spring may
-    truly be missing.
+    Every cart has some damping, and numbers that depend on it must not look more certain than it
+    is. A spring, however, may really be missing.
     """
     held, chain = attempt.parametrisation, attempt.chain
     springs = tuple(name for name in held.zero if read_name(name).symbol == "k")
     if springs == held.zero:
         return attempt
     free = replace(held, zero=springs)
-    # Of the critical one: practically zero, but its logarithm has derivatives.
+    # 1e-6 of critical damping: almost zero, but its logarithm has derivatives.
     c = np.where(chain.c > 0, chain.c, 1e-6 * critical_damping(chain))
     return look(attempt.windows, free, free.pack(replace(chain, c=c)))
 
@@ -193,13 +194,13 @@ def _released(attempt: Attempt) -> Attempt:
 def _result(
     attempt: Attempt, *, explained: bool, n_starts: int, remarks: Sequence[str]
 ) -> ChainFit:
-    """Collect the fit's result, with residuals counted in the stated errors."""
+    """Return the fit's result; its χ² compares the residuals with the stated standard errors."""
     parametrisation, chain = attempt.parametrisation, attempt.chain
     released = _released(attempt)
     names, covariance = released.parametrisation.names, _covariance(released)
     try:
         parameters = named_estimates(chain, names=names, covariance=covariance, source="time_fit")
-    except DataError:  # several carts without a wall: they have no gains to name
+    except DataError:  # several carts without a wall have no gains
         parameters: dict[str, Estimate] = {}
     chi_square = 0.0
     standardised = {}

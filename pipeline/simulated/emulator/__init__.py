@@ -1,1 +1,1 @@
-"""The virtual bench: carts and a controller behind a serial line."""
+"""The virtual bench: carts and a controller at the end of a serial line."""

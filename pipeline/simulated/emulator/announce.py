@@ -1,4 +1,4 @@
-"""The virtual benches running on this computer, each with a file."""
+"""List the virtual benches that run on this computer, by one file each."""
 
 import json
 import os
@@ -19,7 +19,7 @@ class RunningBench:
 
     Attributes
     ----------
-    address : what a host opens.
+    address : the address that a host opens.
     """
 
     name: str
@@ -28,11 +28,11 @@ class RunningBench:
 
 @contextmanager
 def announced(bench: RunningBench) -> Iterator[None]:
-    """Announce a running bench to this user's desks; the file is removed at the end."""
+    """Announce a running bench to this user's desks; remove the file at the end."""
     folder, pid = _find_folder(), os.getpid()
     path = folder / f"{pid}.json"
     told = {"name": bench.name, "address": bench.address, "began": _began(pid)}
-    with suppress(OSError):  # nowhere to write: its address can still be typed
+    with suppress(OSError):  # without a folder, its address can still be typed
         folder.mkdir(OWNERS_FOLDER, exist_ok=True)
         if _is_own(folder):
             _clear_stale(folder)
@@ -45,7 +45,7 @@ def announced(bench: RunningBench) -> Iterator[None]:
 
 
 def running_benches() -> list[RunningBench]:
-    """Return the virtual benches that run now."""
+    """Return the virtual benches that are running now."""
     folder = _find_folder()
     if not _is_own(folder):
         return []
@@ -54,7 +54,7 @@ def running_benches() -> list[RunningBench]:
 
 
 def _find_folder() -> Path:
-    """Return the folder of the files, which no other user can write to if systems tell."""
+    """Return the folder of the files; no other user can write there, if the system has users."""
     own = str(os.getuid()) if hasattr(os, "getuid") else "user"
     root = os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()
     return Path(root) / f"cartlab-benches-{own}"
@@ -82,7 +82,7 @@ def _read(path: Path) -> RunningBench | None:
 def _began(pid: int) -> float:
     """Return when a process began, s; 0 if there is no such process.
 
-    A process number is used again, but not with the same time.
+    The system may give the number to a new process, which then has another time.
     """
     try:
         return psutil.Process(pid).create_time()

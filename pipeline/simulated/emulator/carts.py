@@ -1,4 +1,4 @@
-"""The carts of a virtual bench: a preset with hidden effects, its hands and its encoders."""
+"""The carts of a virtual bench: a preset with hidden effects, hands and encoders."""
 
 import math
 from collections.abc import Generator
@@ -11,11 +11,11 @@ from pipeline.plant.nonlinear.augmented import SteppedBench
 from pipeline.plant.nonlinear.effects import AugmentedChain
 from pipeline.simulated.bench import ReleasingHand, SimulatedBench, before_stop
 
-TRUE_PERIOD = 1.0024e-3  # s between ticks, while the controller assumes 1 ms
-REACH = 12.0  # times the travel that full duty moves the carts, roughly: 1 cm is some 300 counts
-FEWEST_ENCODERS = 2  # a line has two counts even where there is one cart
+TRUE_PERIOD = 1.0024e-3  # s between ticks, although the controller assumes 1 ms
+REACH = 12.0  # full duty moves the carts by this many travels, so 1 cm is some 300 counts
+FEWEST_ENCODERS = 2  # a line has two counts, even for a single cart
 
-_NOISE = 0.2  # counts of noise on a free cart's encoder: it flickers between two counts
+_NOISE = 0.2  # counts of noise on a free cart's encoder, which flickers between two counts
 
 
 class VirtualCarts:
@@ -28,7 +28,7 @@ class VirtualCarts:
 
     Attributes
     ----------
-    encoders : number of counts, at least two; those without a cart stay at zero.
+    encoders : number of encoders, at least two. Those without a cart stay at zero.
     """
 
     def __init__(self, bench: SimulatedBench, *, seed: int, period: float = TRUE_PERIOD) -> None:
@@ -38,7 +38,7 @@ class VirtualCarts:
         n = bench.chain.n
         self.encoders = max(FEWEST_ENCODERS, n)
         self.input_per_count = input_per_count(bench)
-        # An encoder's position between two counts at power-on is random.
+        # At power-on, an encoder is at a random position between two counts.
         self._phase = self._noise_rng.uniform(-0.5, 0.5, size=n)
         self.take_in_hand(Hands())
 
@@ -58,7 +58,7 @@ class VirtualCarts:
 
         Raises
         ------
-        DataError : the hidden effects make the carts diverge.
+        DataError : the hidden effects make the simulation diverge.
         """
         if self._hand is not None:
             try:
@@ -80,11 +80,11 @@ class VirtualCarts:
         self._hand = self._lead(hands.released) if hands.released in free else None
 
     def start(self) -> None:
-        """Let the hands know that a run starts."""
+        """Tell the hands that a run starts."""
         self._started = True
 
     def _lead(self, cart: int) -> Generator[None]:
-        """Pull a cart out, hold it until a run has begun, let go; one tick a step."""
+        """Pull a cart out, hold it until a run has begun, then let go; one tick per step."""
         rng = self._hand_rng
         tremor = rng.uniform(0.0, 2 * np.pi, size=3)
         hand = before_stop(
@@ -108,7 +108,7 @@ class VirtualCarts:
         force = self._plant.let_go(cart, velocity=float(hand.hold(held)[1][0]))
         ticks = math.ceil(hand.fade / self._period)
         for tick in range(ticks):
-            # The force of a tick is the mean of a fall in a straight line.
+            # The force of a tick is the mean of a linear fall.
             push = force * (1.0 - (tick + 0.5) / ticks)
             self._plant.push(cart, push)
             yield self._plant.step(0.0, following=0.0, interval=self._period)
@@ -119,10 +119,10 @@ class VirtualCarts:
 
 
 def input_per_count(bench: SimulatedBench) -> float:
-    """Return input units per duty count: five over a power of ten, over full scale.
+    """Return input units per duty count: full scale is 5 times a power of ten.
 
-    A full-scale input holds the carts some ten travels out, so one travel takes hundreds of counts;
-    with 5 V for all of it there would be 28.
+    Full-scale input holds the carts some ten travels out, so one travel is hundreds of duty counts.
+    If full scale were always 5 V, it would be only 28.
     """
     hold = bench.travel / float(np.max(np.abs(bench.chain.static_gains())))
     return 5.0 * 10.0 ** round(math.log10(REACH * hold / 5.0)) / FULL_SCALE

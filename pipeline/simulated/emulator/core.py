@@ -1,4 +1,4 @@
-"""A bench's controller between its line and its motor: a state machine, stepped once a period.
+"""A bench's controller between serial line and motor: a state machine with one step per period.
 
 docs/protocol.md specifies it in words and formulas.
 """
@@ -32,8 +32,8 @@ from pipeline.plant.loop.sampled_loop import VELOCITY_CORRECTION
 class Core(Protocol):
     """A bench's controller without its hardware.
 
-    The owner calls `receive` when bytes arrive, `tick` once a period while the bench has power, and
-    `take` for bytes to send. The firmware and `ReferenceCore` have this interface.
+    The owner calls `receive` when bytes arrive, `tick` once per period while the bench has power,
+    and `take` for bytes to send. The firmware and `ReferenceCore` have this interface.
     """
 
     def receive(self, data: bytes) -> None:
@@ -45,24 +45,24 @@ class Core(Protocol):
 
         Parameters
         ----------
-        counts : of the encoders since power-on; a reset makes the next ones zero.
-        stamp : whole ms of the bench's clock, used for lines, waves and run times.
-        now : whole ms of wall time, for the watchdog alone: an emulation may run faster.
+        counts : encoder counts since power-on. A reset makes the next ones zero.
+        stamp : time of the bench's clock in whole ms. Used for lines, waves and run times.
+        now : wall time in whole ms. Used only for the watchdog, as an emulation may run faster.
         """
         ...
 
     def take(self) -> bytes:
-        """Return the bytes to send since the last call: lines of readings, answers."""
+        """Return the bytes to send since the last call: lines of readings, and answers."""
         ...
 
 
 class ReferenceCore:
-    """The controller in Python, plain rather than fast.
+    """The controller in Python, written to be clear rather than fast.
 
     Parameters
     ----------
-    description : the answer to a query. Its period is the one used in the control laws; without
-        `commands` it is the stock bench, which gives no answer.
+    description : the answer to a query. The control laws use its period. Without `commands` it is
+        the stock bench, which gives no answer.
     """
 
     def __init__(self, description: Description) -> None:
@@ -109,8 +109,8 @@ class ReferenceCore:
         self._gains: PidGains | StateGains = PidGains(kp=0.0, ki=0.0, kd=0.0)
         self._chirp_end: float | None = None
         self._tones: tuple[Tone, ...] = ()
-        self._zero: tuple[int, ...] | None = None  # None: the next counts are zero
-        self._heard: int | None = None  # ms of wall time of the last heartbeat; None: disarmed
+        self._zero: tuple[int, ...] | None = None  # None if the next counts are the zero
+        self._heard: int | None = None  # last heartbeat, ms of wall time; None before
 
     def _obey(self, command: Command, *, stamp: int, now: int) -> None:
         match command:
@@ -137,7 +137,7 @@ class ReferenceCore:
             case Signal.QUERY:
                 self._sent += format_description(self._description)
             case Hands():
-                pass  # of the virtual bench around this controller
+                pass  # carried out by the virtual bench around this controller
 
     def _loop(self, start: Start) -> "_Law":
         if start.encoder is None:
@@ -168,7 +168,7 @@ class _OpenLoop:
 
 
 class _Pid:
-    """As `pipeline.plant.loop.sampled_loop` has it, acting at once."""
+    """The PID law of `pipeline.plant.loop.sampled_loop`, which acts at once."""
 
     def __init__(self, gains: PidGains, *, row: int, period: float) -> None:
         self._gains, self._row, self._period = gains, row, period
@@ -183,7 +183,7 @@ class _Pid:
 
 
 class _StateFeedback:
-    """As `pipeline.plant.loop.sampled_loop` has it without a model, acting one tick later."""
+    """The state feedback of `pipeline.plant.loop.sampled_loop` without model, one tick later."""
 
     def __init__(self, gains: StateGains, *, period: float) -> None:
         self._gains, self._period = gains, period

@@ -1,7 +1,8 @@
 """Deliberate faults on a serial line, inserted into the lines that a bench sends.
 
-Each is written `KIND=RATE`, `KIND@SECONDS` or, for an encoder, `stuck=ENCODER@SECONDS`: at random
-in this share of the lines, or once, when the bench has streamed for this long in all its runs.
+A fault is written `KIND=RATE`, `KIND@SECONDS` or, for an encoder, `stuck=ENCODER@SECONDS`. The
+first form affects a random share of the lines. The others occur once, when the bench has streamed
+for so many seconds in all its runs.
 """
 
 import re
@@ -26,7 +27,7 @@ KINDS = {
     "stuck": "from then on the encoder stands still",
 }
 _SYNTAX = re.compile(r"(?P<kind>[a-z]+)(?:=(?P<value>[0-9.e-]+))?(?:@(?P<at>[0-9.]+))?")
-_NOISE = b"#?xZ~ \x80\xff"  # none of these is in a line, so no garbled line passes for a reading
+_NOISE = b"#?xZ~ \x80\xff"  # no reading has these, so a garbled line is never taken for one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +37,8 @@ class LineFault:
     Attributes
     ----------
     rate : share of the lines affected.
-    at : s of streaming after which it occurs once; None: at random.
-    encoder : that is stuck; 0: none.
+    at : s of streaming after which it occurs once. None for random faults.
+    encoder : the encoder that is stuck. Zero for other faults.
     """
 
     kind: str
@@ -51,7 +52,7 @@ def read_fault(text: str) -> LineFault:
 
     Raises
     ------
-    ConfigError : it is not a fault.
+    ConfigError : the text is not a fault.
     """
     where = f"--fault {text}"
     match = _SYNTAX.fullmatch(text.strip())
@@ -77,7 +78,7 @@ def read_fault(text: str) -> LineFault:
 
 
 class Faults:
-    """Applies faults to passing lines, at most one to each.
+    """Applies faults to passing lines, at most one fault per line.
 
     Parameters
     ----------
@@ -85,7 +86,7 @@ class Faults:
 
     Attributes
     ----------
-    injected : number of faults of each kind; `late` counts the lines held back by a delay.
+    injected : number of faults of each kind. `late` counts the lines held back by a delay.
     """
 
     def __init__(self, faults: Sequence[LineFault] = (), *, seed: int, period: float) -> None:
@@ -95,15 +96,15 @@ class Faults:
         self._rng = np.random.default_rng(seed)
         self.injected: Counter[str] = Counter()
         self._period, self._streamed = period, 0.0  # s
-        self._stuck: dict[int, bytes | None] = {}  # the frozen encoder reading; None: freeze now
-        self._ms = -1  # of the last line
+        self._stuck: dict[int, bytes | None] = {}  # frozen readings; None: freeze at the next
+        self._ms = -1  # stamp of the last line
         self._clock_began = 0  # ms of the run, at the last reset
-        self._open = False  # the last line has lost its end
+        self._open = False  # whether the last line has lost its end
         self._held = bytearray()
         self._until = 0.0  # s of the bench's clock, the end of the hold
 
     def strike(self, line: bytes, *, clock: float) -> tuple[bytes, str]:
-        """Return what is sent in place of a line, and the kind of fault ("": none).
+        """Return the bytes to send instead of a line, and the kind of fault ("" if none).
 
         Parameters
         ----------
@@ -126,16 +127,16 @@ class Faults:
         return self._hold(line, clock=clock), kind
 
     def idle(self, *, clock: float) -> bytes:
-        """Return data still due when the bench sends no line: a late chunk, a lost line end."""
+        """Return bytes still due while the bench sends no line: a late chunk, a lost line end."""
         end, self._open = b"\n" * self._open, False
         return self._hold(end, clock=clock)
 
     def behind(self, data: bytes, *, clock: float) -> bytes:
-        """Return what is sent for text outside the stream: it overtakes no line."""
+        """Return the bytes to send for text outside the stream, which must not overtake a line."""
         return self._hold(data, clock=clock)
 
     def _hold(self, data: bytes, *, clock: float) -> bytes:
-        """Return what is sent now: this and the held data, or nothing yet."""
+        """Return the bytes to send now: the held data with this, or nothing yet."""
         self._held += data
         if not self._held or clock < self._until:
             return b""
@@ -144,7 +145,7 @@ class Faults:
         return out
 
     def _choose(self) -> str:
-        """Return the kind of fault for the next line; "": none."""
+        """Return the kind of fault for the next line; "" if none."""
         self._streamed += self._period
         while self._timed and self._timed[0][0] <= self._streamed:
             _, fault = self._timed.pop(0)
@@ -152,12 +153,12 @@ class Faults:
             if not fault.encoder:
                 return fault.kind
             self._stuck[fault.encoder] = None
-        if self._open or not self._random:  # the line behind a merger is lost with it already
+        if self._open or not self._random:  # the line after a lost line end is lost already
             return ""
         draw = self._rng.random()
         for fault in self._random:
             if draw < fault.rate:
-                if fault.kind == "delay" and self._held:  # late already
+                if fault.kind == "delay" and self._held:  # it is late already
                     return ""
                 self.injected[fault.kind] += 1
                 return fault.kind
@@ -165,10 +166,10 @@ class Faults:
         return ""
 
     def _rewritten(self, line: bytes, *, reset: bool) -> bytes:
-        """Return the line after stuck encoders and a restarted clock."""
+        """Return the line with the readings of stuck encoders, and with a restarted clock."""
         *counts, target, duty, stamp = line.rstrip().split(b":")
         ms = int(stamp)
-        if reset or ms < self._ms:  # or another run
+        if reset or ms < self._ms:  # or another run has begun
             self._clock_began = ms if reset else 0
         self._ms = ms
         for encoder, shown in self._stuck.items():

@@ -1,4 +1,4 @@
-"""The far ends of a serial line: a TCP port that `socket://` reaches, or a pseudo-terminal."""
+"""The bench's end of a serial line: a TCP port for `socket://`, or a pseudo-terminal."""
 
 import contextlib
 import errno
@@ -17,53 +17,53 @@ _CHUNK = 65_536  # bytes
 
 
 class Link(Protocol):
-    """A bench's end of its line. Hosts come one after the other; the next one waits.
+    """A bench's end of its line; hosts connect one after the other, and the next one waits.
 
     Attributes
     ----------
-    address : what a host opens.
+    address : the address that a host opens.
     """
 
     address: str
 
     @property
     def connected(self) -> bool:
-        """Whether a host is there; `receive` brings it up to date."""
+        """Whether a host is connected; `receive` updates this."""
         ...
 
     @property
     def unsent(self) -> int:
-        """Bytes that wait for the host to read."""
+        """The number of bytes that the host has not yet read."""
         ...
 
     def wait(self, seconds: float) -> None:
-        """Sleep until something arrives, or for this time."""
+        """Sleep until something arrives, or for `seconds`."""
         ...
 
     def receive(self) -> bytes:
-        """Return what arrived; b"": nothing."""
+        """Return the bytes that arrived; b"" for nothing."""
         ...
 
     def send(self, data: bytes) -> None:
-        """Send, or keep what the host does not take yet; drop everything without a host."""
+        """Send bytes, or keep those that the host does not take yet; without a host drop them."""
         ...
 
     def hang_up(self) -> None:
-        """Drop the host, and what it has not read."""
+        """Disconnect the host, and drop the bytes that it has not read."""
         ...
 
     def close(self) -> None:
-        """Leave the line."""
+        """Close the line."""
         ...
 
 
 def open_link(port: str, *, remote: bool = False) -> Link:
-    """Open `socket://HOST:PORT` (port 0: any that is free) or `pty`.
+    """Open `socket://HOST:PORT` (port 0 for any free port) or `pty`.
 
     Raises
     ------
-    ConfigError : it is neither; the port is taken; or others could reach it while `remote` is
-        False.
+    ConfigError : the port has another form or is taken, or others could reach it although `remote`
+        is False.
     """
     if port == "pty":
         return _open_pty()
@@ -85,7 +85,7 @@ def open_link(port: str, *, remote: bool = False) -> Link:
             "take 127.0.0.1, or add --remote if you mean it"
         )
     listener = socket.socket(family, socket.SOCK_STREAM)
-    if sys.platform != "win32":  # there it would let two emulators share a port
+    if sys.platform != "win32":  # on Windows it would let two emulators share a port
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind(address)
@@ -103,7 +103,7 @@ class _SocketLink:
     def __init__(self, listener: socket.socket, *, address: str) -> None:
         self.address, self._listener = address, listener
         self._client: socket.socket | None = None
-        self._ready = False  # something arrived, or a host is waiting
+        self._ready = False  # whether bytes have arrived or a host is waiting
         self._unsent = bytearray()
 
     @property
@@ -133,7 +133,7 @@ class _SocketLink:
             data = self._client.recv(_CHUNK)
         except BlockingIOError:
             return b""
-        except OSError:  # reset by the host
+        except OSError:  # the host has reset the connection
             data = b""
         if not data:
             self.hang_up()
@@ -176,7 +176,7 @@ def _open_pty() -> "Link":
 
 class _PtyLink:
     def __init__(self) -> None:
-        import tty  # not on Windows
+        import tty  # does not exist on Windows
 
         self._master, slave = os.openpty()
         tty.setraw(slave)
@@ -195,7 +195,7 @@ class _PtyLink:
             writers = [self._master] if self._unsent else []
             select.select([self._master], writers, [], seconds)
         else:
-            time.sleep(min(seconds, 0.01))  # somebody may open the pseudo-terminal
+            time.sleep(min(seconds, 0.01))  # somebody may open the pseudo-terminal meanwhile
 
     def receive(self) -> bytes:
         self.send(b"")
@@ -204,7 +204,7 @@ class _PtyLink:
         except BlockingIOError:
             self.connected = True
             return b""
-        except OSError:  # nobody has it open
+        except OSError:  # no host has it open
             data = b""
         self.connected = bool(data)
         if not data:
@@ -220,7 +220,7 @@ class _PtyLink:
                 del self._unsent[: os.write(self._master, self._unsent[:_CHUNK])]
 
     def hang_up(self) -> None:
-        """Only forget its data: a pseudo-terminal cannot be taken away from a host."""
+        """Forget the data of a host, which keeps the pseudo-terminal open."""
         self._unsent.clear()
 
     def close(self) -> None:

@@ -24,20 +24,20 @@ from pipeline.simulated.emulator.core import Core, ReferenceCore
 from pipeline.simulated.emulator.faults import Faults, read_fault
 from pipeline.simulated.emulator.links import open_link
 
-_MOST_UNSENT = 262_144  # bytes: a bench faster than its host waits for it
+_MOST_UNSENT = 262_144  # bytes. A bench that is faster than its host waits for it
 
 
 @dataclass(frozen=True, kw_only=True)
 class EmulatorOptions:
-    """How a virtual bench is run.
+    """Options of a virtual bench.
 
     Attributes
     ----------
-    port, remote : as `open_link` takes them.
-    speed : factor over real time, as far as the computer can.
-    period : true s between ticks; the controller assumes whole ms.
-    stock : it knows no extension of the protocol and answers no query.
-    faults : each as `read_fault` takes it.
+    port, remote : as in `open_link`.
+    speed : factor over real time, as far as the computer can. At least in the long run.
+    period : true s between ticks. The controller assumes whole ms.
+    stock : whether it has no extension of the protocol and answers no query.
+    faults : the faults, each as in `read_fault`.
     seed : of noise, hands and faults.
     """
 
@@ -55,8 +55,8 @@ class Server:
 
     Parameters
     ----------
-    core : makes the controller for a description.
-    tell : called with each event as it happens.
+    core : function that makes the controller for a description.
+    tell : called with each event when it happens.
 
     Attributes
     ----------
@@ -67,7 +67,7 @@ class Server:
     Raises
     ------
     ConfigError : port or fault are invalid, or the simulation would never end.
-    DataError : no spring connects the carts to a wall, or hidden effects make them diverge.
+    DataError : no spring ties the carts to a wall, or hidden effects make the simulation diverge.
     """
 
     def __init__(
@@ -107,33 +107,34 @@ class Server:
         self.events: list[dict] = []
         self._ticks = 0
         self._still_since = 0.0  # s of the bench's clock
-        self._start = Start(wave=Wave.DELTA, frequency=1.0, amplitude=0)  # the last one heard
-        self._ending = ""  # why its run will end; "": by itself
-        self._lines = 0  # streamed in this run
-        self._heard: float | None = None  # s of wall time, of the last heartbeat
-        self._injected_before: Counter[str] = Counter()  # by the end of the last run
+        self._start = Start(wave=Wave.DELTA, frequency=1.0, amplitude=0)  # the last one received
+        self._ending = ""  # why its run will end; "" by itself
+        self._lines = 0  # lines sent in this run
+        self._heard: float | None = None  # s of wall time of the last heartbeat
+        self._injected_before: Counter[str] = Counter()  # at the end of the last run
         self._connected = False
-        self._pulled = False  # a fault asks to pull the cable
+        self._pulled = False  # whether a fault disconnects the line
 
     def serve(self, *, until: Callable[[], bool]) -> None:
-        """Keep the bench running until told otherwise."""
-        gc.freeze()  # garbage collection over everything loaded would delay it by 0.1 s
+        """Keep the bench running until `until` returns true."""
+        gc.freeze()  # otherwise a search for garbage would delay it by 0.1 s
         owed, last = 0.0, time.monotonic()
         while not until():
             asleep = self._is_asleep()
             late = owed >= self._period and self._link.unsent < _MOST_UNSENT
-            # Data due between two looks at the line are sent together.
+            # Bytes that are due between two checks of the line are sent together.
             self._link.wait(0.1 if asleep else 0.0 if late else 2e-3)
             self._listen()
             now = time.monotonic()
-            # A delay of the computer beyond 1 s of the bench's clock is skipped.
+            # If the computer falls behind by more than 1 s of the bench's clock, the rest is
+            # skipped.
             owed = 0.0 if asleep else min(owed + (now - last) * self._speed, 1.0)
             last = now
             out = bytearray()
             while owed >= self._period and self._link.unsent < _MOST_UNSENT:
                 out += self._tick()
                 owed -= self._period
-                if self._pulled or time.monotonic() - now > 0.01:  # s: look at the line again
+                if self._pulled or time.monotonic() - now > 0.01:  # s. Check the line again
                     break
             self._link.send(bytes(out))
             if self._pulled:
@@ -146,7 +147,7 @@ class Server:
         return self._link.address
 
     def close(self) -> None:
-        """Leave the line."""
+        """Close the line."""
         self._link.close()
 
     @property
@@ -154,8 +155,8 @@ class Server:
         return self._ticks * self._period
 
     def _is_asleep(self) -> bool:
-        """Whether nothing moves and nobody would see it."""
-        # In 10 s of its clock after the motor goes off, everything comes to rest.
+        """Whether nothing moves and no host would see it."""
+        # 10 s of its clock after the motor goes off, everything is at rest.
         resting = self._clock - self._still_since > 10.0
         return resting and not self._connected and not self._lines
 
@@ -209,7 +210,7 @@ class Server:
         return out
 
     def _end_run(self, ending: str) -> None:
-        """Log the run that streamed until now, if one did; "": ended by itself."""
+        """Log the run that ends now, if there was one; `ending` is "" if it ended by itself."""
         if not self._lines:
             return
         left = self._start.duration - self._lines * self._period
