@@ -95,19 +95,18 @@ def fit_sine(record: Record, *, cart: int) -> SinePoint:
     The last windows show whether there is a steady part. It reaches back as far as its own sine
     explains the record. The input is fitted over the same part. If it is held between samples, its
     amplitude is that of the held staircase. The method is valid for one frequency and at least one
-    cycle. Several carts of one dwell share much work, see `Dwell`.
+    cycle.
 
     Reference: IEEE Std 1057-2017, section 4.6 (three- and four-parameter sine fits).
 
     Parameters
     ----------
     record : the dwell. Without `omega` the frequency is fitted to the input.
-    cart : the cart whose position is fitted.
+    cart : the cart whose position is fitted. Several carts share much work, see `Dwell`.
 
     Raises
     ------
-    DataError : there is no input column, the input does not oscillate, or there is less than a full
-        cycle.
+    DataError : no input column, an input that does not oscillate, or less than a full cycle.
     """
     return Dwell(record).fit(cart=cart)
 

@@ -54,8 +54,7 @@ class Excitation(NamedTuple):
     held : (3, k) work array. It holds the input after the drive's laws, and its integrals.
     free : (n,) which carts move.
     guided : (n, samples) motion of the other carts. Zero by default.
-    shots : (shots + 1,) the first sample of each piece with its own start. The last entry is the
-        number of samples.
+    shots : (shots + 1,) bounds of the pieces with their own start.
     refine : divisor of the step.
     """
 
@@ -387,13 +386,11 @@ def simulate(
     Parameters
     ----------
     variants : b of them, each with its tables and its start.
-    of : (2, lanes) the variable of each derivative. It is a kind of `sensitivity`, and a cart or
-        spring from 0.
+    of : (2, lanes) the variable of each derivative, a kind of `sensitivity` and a place from 0.
 
     Returns
     -------
-    (b, n, samples) readings without encoder zero. NaN if a variant diverged. Also (lanes, n,
-        samples)
+    (b, n, samples) readings without encoder zero, NaN if a variant diverged; (lanes, n, samples)
     derivatives of the first variant's readings.
     """
     of = _plain(of, np.int64)
