@@ -24,11 +24,8 @@ _ITERATIONS = 20
 class _Part:
     """Some samples and the columns fitted to them, solved once for all signals.
 
-    Attributes
-    ----------
-    columns : (n, p) from `_columns`.
-    inverse : (p, n) its pseudo-inverse.
-    angle : of the sine, rad per sample.
+    `columns` (n, p) are those of `_columns`, `inverse` (p, n) is their pseudo-inverse, and `angle`
+    is that of the sine, rad per sample.
     """
 
     columns: Array

@@ -71,12 +71,9 @@ class Excitation(NamedTuple):
 class StartState(NamedTuple):
     """The start state of the bodies of one run.
 
-    Attributes
-    ----------
-    x, v : (shots, n) position and velocity of the carts at the start of each shot. With (shots, 2
-        n), the hidden masses follow, relative to their carts. Only the first shot uses these; the
-        later ones continue.
-    scatter : (n,) factor on all dry friction of a cart.
+    `x` and `v` (shots, n) are those of the carts at the start of each shot. With (shots, 2 n),
+    hidden masses follow, relative to their carts; only the first shot uses these. `scatter` (n,) is
+    a factor on all dry friction of a cart.
     """
 
     x: Array
@@ -95,9 +92,8 @@ def describe_run(
 ) -> Excitation:
     """Return a run in the simulator's form, with arrays of any kind copied.
 
-    `command` (k,) is held from knot to knot, by default from sample to sample. `free` (n,) says
-    which carts move. Without `guided` (n, samples) the others stand still at zero. By default there
-    is one shot.
+    `command` (k,) is held from knot to knot, by default from sample to sample. Without `guided` (n,
+    samples), carts that are not `free` (n,) stand at zero. By default there is one shot.
     """
     t, free = _plain(t, np.float64), _plain(free, np.bool_)
     command = _plain(command, np.float64)
@@ -125,10 +121,7 @@ def _plain(array: Any, dtype: Any) -> Any:
 
 @jit
 def _assemble(tables, free, s, K, C, parent, switches):
-    """Fill the linear matrices and the numbers of the switches.
-
-    Return the number of bodies, the motor's row (or -1), and the number of switches.
-    """
+    """Fill the linear matrices and switches; return numbers of bodies and switches, motor's row."""
     cart, spring, drive = tables.cart, tables.spring, tables.drive
     n = cart.shape[0]
     for i in range(n):
@@ -208,10 +201,9 @@ def _edge(run, delay, now, end, at):
 
 @inlined
 def _steps(tables, bodies, refine):
-    """Return longest step (s), longest step in a contact (s), friction sizes and smooth places.
+    """Return longest step, longest in a contact (s), friction (sliding, presliding), places.
 
-    The friction sizes are those of sliding and of presliding friction. The last value says where
-    there are smooth forces.
+    The places are those of smooth forces.
     """
     # These are sums, later used as flags: numba would compile a function for every constant flag.
     rubbing = presliding = fastest = contact = 0.0
