@@ -122,7 +122,7 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         own = [d for d in rubbed if d.cart == cart]
         decays = f"{len(own)} decay{'s' * (len(own) > 1)}"
         yield f"| ζ of cart {cart}, {decays}, viscous damping only | {span(own, _apparent)} |"
-        yield f"| the same, with dry friction in the model | {span(own, _viscous)} |"
+        yield f"| ζ of cart {cart}, {decays}, with dry friction | {span(own, _viscous)} |"
     for found in gap.effects:
         place = next((f", {what} {number}" for what, number in found.where.items()), "")
         values = ", ".join(
