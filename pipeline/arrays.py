@@ -1,4 +1,4 @@
-"""Arrays: real and complex ones by type, and read-only copies."""
+"""Types of real and complex arrays, and functions for read-only copies."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -16,7 +16,7 @@ from pathlib import Path
 from pipeline.errors import ConfigError
 
 OWNER_ONLY, OWNERS_FOLDER = 0o600, 0o700  # modes of files and folders with students' names
-LOCK, TURN = ".lock", ".turn"  # of `pipeline.lock`
+LOCK, TURN = ".lock", ".turn"  # lock files, see `pipeline.lock`
 # Not a formula although it begins like one: a number, or the dash for a missing value.
 _PLAIN = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?|-", re.ASCII)
 # Characters that start a formula, wide and small forms included, at the start of a cell or after a

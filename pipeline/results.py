@@ -46,7 +46,7 @@ def passed(good: bool) -> CheckOutcome:
 EXPLAINED = 2.0
 
 
-# ----------------------------------------------------- a recording, and what it tells alone
+# --------------------------------------- a recording, and results of single recordings
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -25,7 +25,8 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
 
     Raises
     ------
-    DataError : the loop is not stable, a mode of the carts is undamped, or the chain too extreme.
+    DataError : the loop is not stable, a mode of the carts is undamped, or the numbers of the chain
+        differ by too many orders of magnitude.
     """
     try:
         found = stability_margins(chain, design.controller(chain), sample_time=design.sample_time)

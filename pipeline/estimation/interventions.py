@@ -61,7 +61,7 @@ def _first_alike(record: Record, records: Sequence[Record]) -> str:
 def but_releases(
     interventions: Sequence[Intervention], records: Sequence[Record]
 ) -> list[Intervention]:
-    """Return the interventions except the proper holds from which decays are released."""
+    """Return the interventions without the holds that precede the release of a decay."""
     released = {(record.id, float(record.t[0])) for record in records if record.kind == "decay"}
     return [one for one in interventions if (one.experiment, one.start) not in released]
 

@@ -1,11 +1,11 @@
-"""Modulating functions: an equation of motion averaged over windows, the data never differentiated.
+"""Modulating functions: average an equation of motion over windows, without derivatives of data.
 
 The equation is multiplied by a bump that vanishes at both ends of a window with its first three
 derivatives, and integrated by parts: the derivatives move from the data to the known bump. The
 result is linear in masses, dampings and springs.
 
-References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin,
-Computers & Chemical Engineering 17 (1993).
+References: M. Shinbrot, Trans. ASME 79 (1957), 579-588; H. A. Preisig & D. W. T. Rippin, Computers
+& Chemical Engineering 17 (1993).
 """
 
 import numpy as np

@@ -14,7 +14,7 @@ OTHER_DWELL = 0.1  # relative. A dwell this far from its stated frequency is ano
 LEAST_SHARE = 0.2  # of a held cart's swing. A cart that moves less is not the free one
 _HELD_FIRMLY = 0.05  # of the free carts' swing. A cart that is held firmly moves less
 _LONGEST = 3.0  # m. No bench has a longer track
-_LONGEST_WHOLE = 0.5  # m. The same if all readings are whole numbers, as counts are
+_LONGEST_WHOLE = 0.5  # m. Limit if all readings are whole numbers, as counts are
 _LARGEST = 100.0  # V. No amplifier at a bench gives as much
 
 

@@ -282,7 +282,7 @@ def _refined(t: Array, y: Array, *, omega: float) -> tuple[float, float]:
         X = np.column_stack([_columns(t, omega=omega), turned])
         fit = _Part.of(X, angle=angle).fit(y)
         omega += fit.coefficients[4] / half
-        # In rad, at the ends of the record.
+        # The change is below 1e-9 rad at the ends of the record.
         if abs(fit.coefficients[4]) < 1e-9:
             break
     return float(omega), fit.error(4) / float(half)

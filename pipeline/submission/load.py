@@ -245,7 +245,7 @@ def _problems(submission: Submission, folder: Path) -> Iterator[tuple[Location, 
 
 
 def _another_count(submission: Submission) -> Iterator[tuple[Location, str]]:
-    """Yield a problem if at least two other statements agree on another number of carts."""
+    """Yield a problem if at least two other statements imply another number of carts."""
     reported = submission.reported or Reported()
     controllers = {e.id: e.controller for e in submission.experiments}
     lengths = {

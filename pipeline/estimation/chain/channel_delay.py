@@ -146,7 +146,7 @@ def _tells(record: Record, cart: int) -> bool:
 def _equations(
     record: Record, cart: int, *, after: float, step: float, period: float, parts: int
 ) -> list[_Normal]:
-    """Return the equations of each part of a record; none if it is too short."""
+    """Return the equations of each part of a record; [] if the record is too short."""
     t = np.arange(record.t[0], record.t[-1], step)
     # A bump lasts a quarter of the motion's period, because wider bumps would suppress the fast
     # motion, the most informative part. With fewer than 16 samples under a bump, only the encoder's

@@ -22,7 +22,7 @@ class SeparableModel(Protocol):
 
     @property
     def columns(self) -> Array:
-        """The factors of the linear unknowns, (n, n_linear)."""
+        """The columns (n, n_linear) that multiply the linear unknowns."""
         ...
 
     def derivatives(self, linear: Array) -> Array:

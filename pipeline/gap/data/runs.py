@@ -15,8 +15,8 @@ from pipeline.results import Record
 
 _STILL = 2.6  # encoder steps, peak to peak. A smaller range counts as rest
 _SMOOTHING = 0.03  # s, half width of a local cubic. For a bench of carts
-_HELD_SAMPLES = 4  # Fewer samples at the top of the motion are not a hold
-_HELD_TIME = 2.0  # Nor is a stay there shorter than this many times that of free motion
+_HELD_SAMPLES = 4  # a hold at the top of the motion has at least so many samples
+_HELD_TIME = 2.0  # and lasts at least this many times a free passage of the top
 _RESTING = 1.5  # encoder steps. The range of the readings of a cart at rest
 _ONE_READING = 0.07  # s. At rest, this time counts as one independent reading
 
@@ -125,7 +125,7 @@ def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     """Prepare one record of a bench with n carts.
 
     `in_motion` is true for a part of a longer record, which may begin in motion. A decay starts
-    after the hand has let go, so its beginning by hand is cut. A part that begins in motion starts
+    after the hand has let go; the samples before that are cut. A part that begins in motion starts
     at its first turning point, where no hand can still act.
     """
     rows = tuple(cart - 1 for cart in record.carts if cart in record.free)

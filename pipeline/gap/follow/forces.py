@@ -178,7 +178,7 @@ def add_forces(laws, run, state, work, step):
 def add_slopes(laws, run, state, work, h, crossing):
     """Fill DF and DR: derivatives of forces and friction, directly and through the state.
 
-    The parameters of the input count unless a play is being crossed.
+    The parameters of the input have no effect while a play is being crossed.
     """
     p, factor, aux, v, xm = laws.p, run.factor, state.aux, state.v, work.xm
     DX, DV, DA, DF, DR = state.DX, state.DV, state.DA, work.DF, work.DR

@@ -138,7 +138,7 @@ class Study:
 
 
 def judge(fit: GapFit, study: Study) -> Hypothesis:
-    """Return the hypothesis of a fit."""
+    """Return a fit as a hypothesis, with its criterion and its error on the held-out runs."""
     held = fit_nuisance(fit, study.held_out, study.mapper)
     errors, sizes = [], []
     for run, left in zip(study.held_out, _residuals(held, study.held_out), strict=True):
@@ -189,7 +189,10 @@ def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
 
 
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:
-    """Return whether the held-out error falls; by a tenth if too much is left for a name."""
+    """Return whether the held-out error falls enough.
+
+    It must fall by a tenth if so much is left that the gap cannot be named.
+    """
     gain = 1.0 if study.explains(child) else limits.PARTIAL_GAIN
     return child.error < gain * parent.error
 

@@ -81,8 +81,8 @@ class Search:
     def add_constant_force(self) -> None:
         """Add a constant force if the rest points imply one.
 
-        With the force in the model, the encoder zeros are those of the file, to half the noise. All
-        hypotheses are then judged under this assumption.
+        With the force in the model, the encoder zeros are those of the file, known to half the
+        noise. All hypotheses are then judged under this assumption.
         """
         self.path = steps_to(self.chosen, self.found, self.study)
         with suppress(OutOfTime):
@@ -165,7 +165,7 @@ class Search:
                 training=tuple(run.with_zeros(width=width) for run in study.training),
                 held_out=tuple(run.with_zeros(width=width) for run in study.held_out),
             )
-            for width in (1e-4, 0.5)  # in noises: exact zeros, zeros off by rounding
+            for width in (1e-4, 0.5)  # times the noise: zeros exact, or rounded
         )
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)

@@ -13,7 +13,7 @@ def stays_stable(chain: Chain, controller: StateFeedback, *, sample_time: float)
     """Return whether the loop is stable on all plants within the errors of identification.
 
     A two-level screening design, together with its mirror image, gives 32 plants. They cover every
-    main effect of the errors and many combinations. For up to four carts.
+    main effect of the errors and many combinations, for up to four carts.
 
     Reference: R. L. Plackett, J. P. Burman, Biometrika 33 (1946) 305-325.
     """
