@@ -43,7 +43,7 @@ Kind = Literal["step", "sweep"]
 Shape = Literal["square", "triangle", "chirp"]
 
 _PERIOD = 5e-3  # s between samples. Several samples fall in a period
-_PER_CYCLE, _BEYOND = 10, 2.0  # samples per period. Up to this multiple of the last resonance
+_PER_CYCLE, _BEYOND = 10, 2.0  # samples per period at this multiple of the highest resonance
 _TIME = 12.0  # s. Approximate duration of a record
 _LONGEST = 4  # times as long at most. Used if the record would not settle its best pair
 _STEP = 1e-3  # relative. Change of an effect's parameter for a difference

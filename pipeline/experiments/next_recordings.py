@@ -145,7 +145,7 @@ def plan_next(
 
 
 def _doubt(analysis: Analysis, folder: Path) -> str:
-    """Return a note if more than noise remains, because the errors count only noise."""
+    """Return a note if the fit leaves more than noise; the predicted errors count only noise."""
     fit = analysis.fit
     if fit is None or fit.explains_data:
         return ""

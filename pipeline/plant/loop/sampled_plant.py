@@ -14,7 +14,7 @@ RADIANS_PER_SAMPLE = 0.5  # of the fastest mode, at most; about 12 samples in a 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledPlant:
-    """The sampled plant without units: x in 1, v in `rate`, u in `stiffness`."""
+    """The sampled plant in scaled units: v is divided by `rate`, u by `stiffness`."""
 
     chain: Chain
     cart: int
