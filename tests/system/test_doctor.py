@@ -4,12 +4,12 @@ import json
 import os
 from importlib.metadata import version
 
-from tests.helpers.commandline import cartlab
+from tests.helpers.commandline import cartlab, cartlab_here
 
 
 def test_all_that_is_needed_works_here():
     """Each needed package has its installed version; the text and the JSON agree."""
-    told, text = cartlab("doctor", "--json"), cartlab("doctor")
+    told, text = cartlab_here("doctor", "--json"), cartlab_here("doctor")
 
     assert (told.returncode, text.returncode) == (0, 0), told.stdout
     health = json.loads(told.stdout)
