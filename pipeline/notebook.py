@@ -18,7 +18,7 @@ from pipeline.plant.loop.margins import closed_loop
 from pipeline.plant.nonlinear.motion import EquationsOfMotion
 from pipeline.report.document import Block, Document, Heading
 from pipeline.report.draft.content import build_document
-from pipeline.report.gap.section import with_gap
+from pipeline.report.gap.beside import with_gap
 from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.render.html import render_fragment
 from pipeline.report.sections.questions import ask

@@ -175,7 +175,7 @@ def make_gap(folder: str, *, progress: Progress) -> None:
 
 def make_plots(folder: str, *, progress: Progress) -> None:
     """Write the page of plots into the submission's folder, next to its report."""
-    from pipeline.report.gap.section import with_gap
+    from pipeline.report.gap.beside import with_gap
     from pipeline.report.plots.page import write_plots
     from pipeline.workflow import analyse
 

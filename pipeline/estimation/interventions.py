@@ -12,11 +12,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.arrays import Array
 from pipeline.estimation.law_of_motion import ForceLeft, Seen, forces_left, see
 from pipeline.estimation.noise import MEDIAN_TO_SIGMA
+from pipeline.estimation.sliding import most_around
 from pipeline.results import Intervention, Record
 
 _BULK = 2.0  # standard deviations of the law's residual, as in its fit
@@ -144,7 +144,7 @@ def _recurs(one: Intervention, found: Sequence[Intervention], driven: Mapping[st
 
 def _share(force: ForceLeft, size: float) -> Array:
     """Return the unexplained share of the force on the cart around each time."""
-    acting = maximum_filter1d(force.acting, 2 * round(_AROUND / force.hop) + 1)
+    acting = most_around(force.acting, 2 * round(_AROUND / force.hop) + 1)
     return np.abs(force.left) / (acting + size)
 
 
@@ -171,9 +171,7 @@ def _known(forces: Sequence[ForceLeft], size: float) -> list[NDArray[np.bool_]]:
         known &= inside & ((calm >= _MOST * visits) & (calm >= _VISITS))[at]
     bounds = np.cumsum([0, *(force.t.size for force in forces)])
     # A window also sees a little of its neighbours.
-    parts = [
-        minimum_filter1d(known[first:stop].astype(int), 3) > 0 for first, stop in pairwise(bounds)
-    ]
+    parts = [~most_around(~known[first:stop], 3) for first, stop in pairwise(bounds)]
     return [part | force.idle for part, force in zip(parts, forces, strict=True)]
 
 

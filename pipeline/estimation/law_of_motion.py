@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter1d
 
 from pipeline.arrays import Array
 from pipeline.estimation.modulating import bump_integral, window_weights
@@ -180,7 +179,7 @@ def see(record: Record) -> Seen | None:
     reach = round(_LAGS[-1] / interval) + 1
     # A jump is a change by 30 % of the input's range from one sample to the next.
     jump = np.abs(np.diff(u, prepend=u[0])) > 0.3 * np.ptp(u)
-    lately = maximum_filter1d(jump.astype(int), width + reach, origin=(width + reach - 1) // 2)
+    jumped = np.append(0, np.cumsum(jump))  # so many times before each sample
     x, v, acceleration, span = means[6:].reshape(4, len(record.carts), -1)
     return Seen(
         record=record,
@@ -192,7 +191,7 @@ def see(record: Record) -> Seen | None:
         v=v,
         acceleration=acceleration,
         span=span,
-        jumps=np.array(lately[first + width - 1] > 0, dtype=np.bool_),
+        jumps=jumped[first + width] > jumped[np.maximum(first - reach, 0)],
     )
 
 

@@ -41,7 +41,7 @@ from pipeline.plant.nonlinear.effects.base import chain_scales
 from pipeline.report.document import Formula
 from pipeline.report.draft.content import build_document
 from pipeline.report.equations.effects import augmented_equations, law
-from pipeline.report.gap.section import with_gap
+from pipeline.report.gap.beside import with_gap
 from pipeline.report.gap.story import build_gap_document, render_gap
 from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.report.render.html import render_html

@@ -1,9 +1,9 @@
 """The content of a report in order: turn an `Analysis` into a `Document`."""
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 from pipeline import __version__
-from pipeline.gap.types import Gap
 from pipeline.report.document import Block, Document, Heading, Paragraph, paragraph
 from pipeline.report.draft.changes import DraftChanges, change_blocks
 from pipeline.report.equations.model import (
@@ -13,7 +13,6 @@ from pipeline.report.equations.model import (
     symbolic_state_space,
     symbolic_transfer_functions,
 )
-from pipeline.report.gap.section import augmented_hardware_blocks, gap_blocks, gap_in_short
 from pipeline.report.render.builder import Part
 from pipeline.report.sections.housekeeping import (
     assumption_blocks,
@@ -39,13 +38,18 @@ from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress, silent
 from pipeline.words.spans import spans
 
+if TYPE_CHECKING:
+    from pipeline.gap.types import Gap
+
+Blocks = Callable[[Page], list[Block]]
+
 _WORDS = phrases("report")
 
 
 def build_document(
     analysis: Analysis,
     *,
-    gap: Gap | None = None,
+    gap: "Gap | None" = None,
     worked: Sequence[Part] = (),
     answer: Callable[[Asked], Paragraph] | None = None,
     changes: DraftChanges | None = None,
@@ -61,13 +65,14 @@ def build_document(
     changes : differences from an earlier draft.
     """
     page = Page(analysis)
+    gap_short, gap_replays, gap_verdict = _about_gap(gap)
     asked = ask(analysis)
     notes = "" if answer else analysis.discussion or ""
     written, rest = split_notes(discussion_blocks(notes), asked)
     answers = {one.id: (answer(one),) for one in asked} if answer else written
     made = _WORDS.text("made", version=__version__)
     parts: Sequence[Part] = (
-        ("summary", "Summary", lambda page: [*summary(page), *gap_in_short(gap)]),
+        ("summary", "Summary", lambda page: [*summary(page), *gap_short(page)]),
         ("changes", "Since the earlier draft", lambda page: change_blocks(page, changes)),
         *(worked or (("model", "The model", _model),)),
         ("parameters", "Initial and final estimates", parameter_blocks),
@@ -76,8 +81,12 @@ def build_document(
         ("steps", "Steps and static gains", step_blocks),
         ("steady-state", "Sinusoidal steady state", dwell_blocks),
         ("feedback", "State feedback", feedback_blocks),
-        ("hardware", "Model and measurement", lambda page: _hardware(page, gap)),
-        ("gap", "What the linear model leaves out", lambda page: gap_blocks(page, gap)),
+        (
+            "hardware",
+            "Model and measurement",
+            lambda page: [*hardware_blocks(page), *gap_replays(page)],
+        ),
+        ("gap", "What the linear model leaves out", gap_verdict),
         ("checks", "Consistency checks", check_blocks),
         ("assumptions", "Assumptions", assumption_blocks),
         (
@@ -123,5 +132,21 @@ def _model(page: Page) -> list[Block]:
     return blocks
 
 
-def _hardware(page: Page, gap: Gap | None) -> list[Block]:
-    return [*hardware_blocks(page), *augmented_hardware_blocks(page, gap)]
+# ------------------------------------------------------------------------- gap
+
+
+def _about_gap(gap: "Gap | None") -> tuple[Blocks, Blocks, Blocks]:
+    """Return what shows a gap analysis: one paragraph, runs simulated with it, and its section."""
+    if gap is None:
+        return _nothing, _nothing, _nothing
+    from pipeline.report.gap import section  # loads the catalogue of effects
+
+    return (
+        lambda _: section.gap_in_short(gap),
+        lambda page: section.augmented_hardware_blocks(page, gap),
+        lambda page: section.gap_blocks(page, gap),
+    )
+
+
+def _nothing(_: Page) -> list[Block]:
+    return []

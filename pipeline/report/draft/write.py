@@ -3,20 +3,23 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.gap.types import Gap
 from pipeline.json_files import json_text
 from pipeline.output import clear_files, own_folder, write_file
 from pipeline.report.draft.changes import DraftChanges
 from pipeline.report.draft.content import build_document
-from pipeline.report.gap.section import with_gap
-from pipeline.report.plots import page as plots
+from pipeline.report.gap.beside import with_gap
+from pipeline.report.plots import NAME as PLOTS
 from pipeline.report.render.pdf import missing_characters
 from pipeline.report.render.write import write_document
 from pipeline.results import Analysis
 from pipeline.submission import Submission
 from pipeline.words.progress import Progress, silent
 from pipeline.workflow import analyse
+
+if TYPE_CHECKING:
+    from pipeline.gap.types import Gap
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +69,7 @@ def render_report(
     analysis: Analysis,
     out: Path,
     *,
-    gap: Gap | None = None,
+    gap: "Gap | None" = None,
     changes: DraftChanges | None = None,
     files: Files = Files(),
     progress: Progress = silent,
@@ -81,12 +84,14 @@ def render_report(
         analysis = replace(analysis, warnings=(*analysis.warnings, warning))
         progress(warning)
     document = build_document(analysis, gap=gap, changes=changes, progress=progress)
-    clear_files(out, plots.NAME)  # left by an earlier report
+    clear_files(out, PLOTS)  # left by an earlier report
     if files.plots:
-        document = replace(document, plots=plots.NAME)
+        document = replace(document, plots=PLOTS)
     write_document(document, out, name="report", pdf=files.pdf)
     if files.plots:
-        plots.write_plots(analysis, out, gap=gap, progress=progress)
+        from pipeline.report.plots.page import write_plots  # loads the catalogue of effects
+
+        write_plots(analysis, out, gap=gap, progress=progress)
 
 
 def _students_text(analysis: Analysis) -> str:

@@ -4,14 +4,11 @@ It is included if the folder has a gap analysis of the same data.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
-from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from pipeline.errors import ConfigError
 from pipeline.gap.replay import Replay, replay_driven
-from pipeline.gap.types import Gap, read_gap
+from pipeline.gap.types import Gap
 from pipeline.report.document import Block, paragraph
 from pipeline.report.equations.effects import augmented_equations, law
 from pipeline.report.figures.style import (
@@ -37,49 +34,14 @@ from pipeline.report.gap.verdict import (
     verdict_title,
 )
 from pipeline.report.sections.page import Page
-from pipeline.results import Analysis
-from pipeline.submission.toml_file import read_text
 from pipeline.words.numbers import listing
 from pipeline.words.text import capital, clean
 
-_PLACES = ("gap/gap.json", "gap.json")  # paths in the submission's folder
-_MOST_BYTES = 10_000_000  # ten times the size for three carts and a hundred runs
 _MOST_RUNS = 4
 
 
-def with_gap(analysis: Analysis, folder: Path) -> tuple[Analysis, Gap | None]:
-    """Return the analysis, and the gap analysis of the same data from its folder.
-
-    A gap analysis of other data, or one that cannot be read, becomes a warning.
-    """
-    gap, warning = _find(folder, analysis)
-    if warning:
-        analysis = replace(analysis, warnings=(*analysis.warnings, warning))
-    return analysis, gap
-
-
-def _find(folder: Path, analysis: Analysis) -> tuple[Gap | None, str]:
-    for place in _PLACES:
-        path = folder / place
-        if not path.is_file():
-            continue
-        try:
-            text = read_text(path, where=place, limit=_MOST_BYTES, error=ConfigError)
-            gap = read_gap(text)
-            if gap.linear.chain.n != analysis.bench.n:
-                raise ConfigError(f"it is of {gap.linear.chain.n} carts")
-        except ConfigError as error:
-            return None, f"{place} cannot be used: {error}"
-        if gap.provenance.files != analysis.files:
-            return None, f"{place} belongs to other data than this report: run cartlab gap again"
-        return gap, ""
-    return None, ""
-
-
-def gap_in_short(gap: Gap | None) -> list[Block]:
+def gap_in_short(gap: Gap) -> list[Block]:
     """Return the verdict as one paragraph with a link to its section."""
-    if gap is None:
-        return []
     name = listing([effect_name(found.effect, found.where) for found in gap.effects])
     names = f" ({name})" if name and gap.verdict in ("named", "partial") else ""
     said = WORDS.spans(
@@ -90,10 +52,8 @@ def gap_in_short(gap: Gap | None) -> list[Block]:
     return [paragraph(said)]
 
 
-def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
+def gap_blocks(page: Page, gap: Gap) -> list[Block]:
     """Return the verdict, the errors, and the equations with the effects."""
-    if gap is None:
-        return []
     blocks = [*verdict_blocks(gap), error_board(gap), error_table(page, gap)]
     terms = gap.model.terms
     if terms:
@@ -107,9 +67,9 @@ def gap_blocks(page: Page, gap: Gap | None) -> list[Block]:
 # ---------------------------------------------------------------------- the bench
 
 
-def augmented_hardware_blocks(page: Page, gap: Gap | None) -> list[Block]:
+def augmented_hardware_blocks(page: Page, gap: Gap) -> list[Block]:
     """Return the model with effects next to the linear one, both driven by the measured input."""
-    if gap is None or not gap.model.terms:
+    if not gap.model.terms:
         return []
     opened = [check for check in page.analysis.hardware if check.loop == "open"]
     runs = list(dict.fromkeys(check.experiment for check in opened))

@@ -28,6 +28,7 @@ from pipeline.report.figures.style import (
 )
 from pipeline.report.figures.svg import plain_svg
 from pipeline.report.gap.verdict import added_name, share
+from pipeline.report.plots import NAME
 from pipeline.report.plots.pack import MOST_WHOLE, pack_run
 from pipeline.report.plots.runs import ComparedRun, compare_runs
 from pipeline.report.render.html import render_plots
@@ -38,7 +39,6 @@ from pipeline.words.phrases import phrases
 from pipeline.words.progress import Progress
 from pipeline.words.text import clean
 
-NAME = "compare.html"  # next to report.html
 _KINDS = ("decay", "step", "sine", "sweep", "closed_loop")
 _SHOWS = ("overlay", "residual", "spectrum", "leftover")
 _MODELS = ("linear", "effects", "loop")
