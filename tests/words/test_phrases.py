@@ -26,16 +26,24 @@ def written(folder: Path, text: str) -> Phrases:
     return Phrases(path)
 
 
+@pytest.fixture(scope="module")
+def modules() -> list[tuple[str, set[str]]]:
+    """The text of each module of the package, and the strings in it."""
+    texts = [path.read_text(encoding="utf-8") for path in PIPELINE.rglob("*.py")]
+    return [
+        (text, {n.value for n in ast.walk(ast.parse(text))
+                if isinstance(n, ast.Constant) and isinstance(n.value, str)})
+        for text in texts
+    ]  # fmt: skip
+
+
 @pytest.mark.parametrize("subject", SUBJECTS)
-def test_every_sentence_is_said_somewhere(subject):
+def test_every_sentence_is_said_somewhere(subject, modules):
     """Every sentence of a catalogue is used somewhere."""
     asking = (f'"{subject}"', "WORDS", "words: Phrases", "said=(")
     strings: set[str] = set()
     parts: set[str] = set()  # keys that are built, as in f"title_{verdict}"
-    for path in PIPELINE.rglob("*.py"):
-        text = path.read_text(encoding="utf-8")
-        constants = [n.value for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant)]
-        found = {value for value in constants if isinstance(value, str)}
+    for text, found in modules:
         strings |= found
         parts |= found if any(word in text for word in asking) else set()
     built = tuple(s for s in parts if s.endswith("_"))
