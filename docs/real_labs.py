@@ -14,12 +14,17 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from benchmarks.silverbox import INTERVAL, TRAIN
 from pipeline.cli.reports import explain, run_report
 from pipeline.gap.types import Gap, read_gap
 from pipeline.output import write_file
 from pipeline.report.draft.write import Files
+from pipeline.report.figures.style import drawing, panels
+from pipeline.report.figures.svg import plain_svg, to_svg
 from pipeline.results import Analysis, LogDecrement
 from pipeline.words.numbers import with_error
 from pipeline.words.text import with_symbols
@@ -28,6 +33,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 PAGE = Path(__file__).with_name("real-labs.md")
 IMAGES = Path(__file__).with_name("images")
+LIMIT_CYCLE = "07-Feb-2025_09_26_10.txt"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,8 +56,16 @@ def write_lab(folder: Path, data: str, system: str, runs: Mapping[str, str]) -> 
     text = f"version = 1\n[system]\n{system}\n"
     for file, lines in runs.items():
         shutil.copyfile(REAL_DATA / data / file, folder / "data" / file)
-        text += f'[[experiments]]\nid = "{Path(file).stem}"\nfile = "data/{file}"\n{lines}\n'
+        for number, own in enumerate(lines.split("\n\n"), start=1):
+            name = Path(file).stem + (f"-{number}" if "\n\n" in lines else "")
+            text += f'[[experiments]]\nid = "{name}"\nfile = "data/{file}"\n{own}\n'
     (folder / "submission.toml").write_text(text, encoding="utf-8")
+
+
+def write_one(folder: Path) -> None:
+    """Write the submission of cart 1 alone: five equal steps."""
+    runs = {f"DOF1_en1_input1_test{i}.csv": 'kind = "step"' for i in range(1, 6)}
+    write_lab(folder, "ecp210-ucsd", "carts = 1\nsprings = [true, false]", runs)
 
 
 def write_day(folder: Path) -> None:
@@ -59,6 +73,31 @@ def write_day(folder: Path) -> None:
     files = ("14-Feb-2025_09_22_43.txt", "14-Feb-2025_09_44_21.txt")
     runs = {file: 'kind = "decay"\ncarts = [2]' for file in files}
     write_lab(folder, "ecp210-2025", "carts = 2\nsprings = [true, true, false]", runs)
+
+
+def write_silverbox(folder: Path) -> None:
+    """Write three parts of the training record of the Silverbox."""
+    samples = 10_000
+    starts = np.linspace(TRAIN[0], TRAIN[1] - samples, 3).astype(int)
+    system = 'carts = 1\nsprings = [true, false]\nposition = { unit = "V" }\n'
+    system += 'columns = { input = "V1", x1 = "V2" }'
+    lines = f'kind = "sweep"\nsample_rate = {1 / INTERVAL}\nhold = "band_limited"\nwindow = '
+    parts = (f"{lines}[{a * INTERVAL:.4f}, {(a + samples - 1) * INTERVAL:.4f}]" for a in starts)
+    write_lab(folder, "silverbox", system, {"SNLS80mV.mat": "\n\n".join(parts)})
+
+
+def write_emps(folder: Path) -> None:
+    """Write the training record of the positioning axis."""
+    system = 'carts = 1\nsprings = [false, false]\nposition = { unit = "m" }\n'
+    system += 'columns = { time = "t", input = "vir", reference = "qg", x1 = "qm" }'
+    write_lab(folder, "emps", system, {"DATA_EMPS.mat": 'kind = "closed_loop"'})
+
+
+def write_servo(folder: Path) -> None:
+    """Write the sweep of the servo and its loop."""
+    loop = 'kind = "closed_loop"\ncontrolled_cart = 1'
+    runs = {"raw_data_freq.txt": 'kind = "sweep"', "raw_data_cl_step1.m": loop}
+    write_lab(folder, "ecp220-servo", "carts = 1\nsprings = [false, false]", runs)
 
 
 def write_torsion(folder: Path) -> None:
@@ -70,6 +109,10 @@ def write_torsion(folder: Path) -> None:
 
 
 LABS = {
+    "one": Lab(
+        write=write_one,
+        figures={"gap/figures/before-after-1.svg": "one-gap.svg"},
+    ),
     "two": Lab(
         write=lambda folder: write_two_cart_submission(folder, REAL_DATA, steps=(1, 2, 3, 4, 5)),
         figures={
@@ -78,7 +121,18 @@ LABS = {
         },
     ),
     "day": Lab(write=write_day, figures={"gap/figures/before-after-1.svg": "day-gap.svg"}),
+    "emps": Lab(
+        write=write_emps,
+        figures={
+            "gap/figures/before-after-1.svg": "emps-gap.svg",
+            "gap/figures/effect-3.svg": "emps-cogging.svg",
+        },
+    ),
+    "silverbox": Lab(
+        write=write_silverbox, figures={"gap/figures/before-after-1.svg": "silverbox.svg"}
+    ),
     "torsion": Lab(write=write_torsion, figures={"gap/figures/before-after-1.svg": "torsion.svg"}),
+    "servo": Lab(write=write_servo, figures={"gap/figures/effect-1.svg": "servo.svg"}),
 }
 
 
@@ -91,6 +145,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for name in options.labs or LABS:
             make(name, (options.keep or Path(scratch)) / name)
+    draw_limit_cycle()
 
 
 def make(name: str, folder: Path) -> None:
@@ -117,6 +172,12 @@ def rows(analysis: Analysis, gap: Gap) -> Iterator[str]:
         if row.final is not None:
             number = with_unit(row.final.value, row.final.std, row.unit)
             yield f"| {with_symbols(row.name)} | {number} |"
+    driven = any(record.u is not None and np.any(record.u) for record in analysis.records)
+    if analysis.fit is None and driven:
+        # The report needs a run in open loop, the search does not.
+        chain, units = gap.chain, gap.chain.units
+        yield f"| mass | {with_unit(chain.m[0], gap.chain_std['m_1'], units.m)} |"
+        yield f"| damping | {with_unit(chain.c[0], gap.chain_std['c_1'], units.c)} |"
     rubbed = [d for d in analysis.log_decrements if d.friction and d.friction.present]
     for cart in sorted({d.cart for d in rubbed}):
         own = [d for d in rubbed if d.cart == cart]
@@ -154,6 +215,19 @@ def _apparent(decay: LogDecrement) -> float:
 def _viscous(decay: LogDecrement) -> float:
     assert decay.friction is not None
     return decay.friction.zeta
+
+
+def draw_limit_cycle() -> None:
+    """Draw a run that the program leaves out: the swing grows while the motor drives."""
+    columns = np.loadtxt(REAL_DATA / "ecp210-2025" / LIMIT_CYCLE, skiprows=1, delimiter="\t")
+    part = columns[3500::12]
+    with drawing():
+        figure, (ax,) = panels(1.6)
+        ax.plot(part[:, 1], part[:, 2], lw=0.9)
+        ax.set_xlabel("time [s]")
+        ax.set_ylabel("cart 1 [count]")
+        svg = to_svg(figure, name="limit-cycle", alt="cart 1 swings more and more, then decays")
+    write_file(IMAGES / "real-day-limit-cycle.svg", plain_svg(svg))
 
 
 if __name__ == "__main__":
