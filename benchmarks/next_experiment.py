@@ -96,7 +96,7 @@ def run(preset: str, *, seed: int, n: int, dwells: int, scratch: Path) -> tuple[
     stages = [known_after(bench, before, chain)]
     known = Knowledge.of(before)
     chosen = choose_next(before, plan, n=n, goal="worst", commands=bench.description.commands)
-    told = known.told + sum(known.of_recording(one) for one in chosen.recordings)
+    told = known.information + sum(known.of_recording(one) for one in chosen.recordings)
     half = known.by_parameters() @ np.linalg.inv(told[0])
     promised = np.sqrt(np.diag(half @ told[1] @ half.T))
     bench.record(folder, renamed(chosen.recordings, taken=["sweep"]), limits=plan.limits)

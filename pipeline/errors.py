@@ -41,7 +41,7 @@ class HardwareError(PipelineError):
     """The bench does not answer as it should: look at the cable, the port, the motor."""
 
 
-def lies_in_the_name(error: OSError) -> bool:
+def is_name_fault(error: OSError) -> bool:
     """Return whether the file's name caused the error, rather than the computer.
 
     An error without a number comes from a text decoder, so it is about the file too.
@@ -49,11 +49,11 @@ def lies_in_the_name(error: OSError) -> bool:
     return error.errno is None or error.errno in _OF_A_NAME
 
 
-def lies_in_the_file(error: OSError) -> bool:
+def is_file_fault(error: OSError) -> bool:
     """Return whether the file or its name caused the error, rather than the computer."""
     return error.errno is None or error.errno in _OF_A_FILE
 
 
-def lacks_room(error: OSError) -> bool:
+def is_disk_full(error: OSError) -> bool:
     """Return whether a file could not be written because the disk is full."""
     return error.errno in _OF_ROOM

@@ -16,7 +16,7 @@ from pipeline.estimation.interventions import find_interventions
 from pipeline.identify.assumptions import list_assumptions
 from pipeline.identify.carts import compare_estimates
 from pipeline.identify.log import Log
-from pipeline.identify.remarks import hand_remarks, reading_remarks, turn_of_the_gains
+from pipeline.identify.remarks import gain_sign_warning, hand_remarks, reading_remarks
 from pipeline.identify.sound import identify_from_sound
 from pipeline.ingest.read import Ingested, read_data
 from pipeline.results import (
@@ -131,7 +131,7 @@ def _with_loops(
         feedback = replace(feedback, margins=margins)
         checks.append(verify_design(fit.chain, feedback))
         if not any(check.kind == "input" for check in checks):
-            log.warn(turn_of_the_gains(analysis.records))
+            log.warn(gain_sign_warning(analysis.records))
     progress("hardware against model")
     hardware = _hardware(submission, analysis, log=log)
     return replace(

@@ -20,7 +20,7 @@ from typer.exceptions import TyperException
 
 from pipeline import __version__
 from pipeline.cli.stopping import ctrl_c_says
-from pipeline.errors import PipelineError, lacks_room, lies_in_the_file
+from pipeline.errors import PipelineError, is_disk_full, is_file_fault
 from pipeline.words.progress import Progress
 
 app = typer.Typer(
@@ -64,7 +64,7 @@ def run() -> None:
         _fail(str(error))
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""
-        elsewhere = lacks_room(error) or lies_in_the_file(error) or error.errno == errno.EROFS
+        elsewhere = is_disk_full(error) or is_file_fault(error) or error.errno == errno.EROFS
         hint = ": choose another place, for example with --out" if elsewhere else ""
         _fail(f"{where}{error.strerror or error}{hint}")
 

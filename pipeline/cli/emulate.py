@@ -58,7 +58,7 @@ def emulate(
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    for sentence in bench.told:
+    for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
     said = server.description
     say(

@@ -89,9 +89,9 @@ def _say_what_came_of_it(done: "Summary", *, out: Path, rubric: Path) -> None:
             say(f"  and {more} more; see cartlab history")
     for submission, reason in done.failed:
         say(f"{submission}: {reason}")
-    if done.lacks_room:
+    if done.is_disk_full:
         say(
-            f"the disk is full: {done.lacks_room} of {done.total} submissions could not be "
+            f"the disk is full: {done.is_disk_full} of {done.total} submissions could not be "
             f"unpacked in {out}; free some space there and repeat the command"
         )
     if len(done.failed) == done.total > 1 and not done.unsettled:

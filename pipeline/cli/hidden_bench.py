@@ -19,7 +19,7 @@ def find_hidden(out: Path, *, progress: Progress) -> list[str]:
     if not (folder / "submission.toml").exists():
         write_submission(folder, hidden, seed=0)
     _, told = explain(folder, out=out / "gap", progress=progress)
-    return [*(f"hidden: {sentence}" for sentence in hidden.told), *told]
+    return [*(f"hidden: {sentence}" for sentence in hidden.effect_sentences), *told]
 
 
 def _end_with_the_first() -> None:

@@ -27,7 +27,7 @@ def simulate(
 
     new_folder(out)
     bench = prepare_bench(preset=preset, model=model, hide=hide or ())
-    for sentence in bench.told:
+    for sentence in bench.effect_sentences:
         say(f"hidden: {sentence}")
     with progress_line() as progress:
         progress("simulating the experiments")

@@ -34,7 +34,7 @@ def look_at_exercise(
         return {"wrong": str(error), "effects": [], "told": []}
     effects = [_describe_effect(plain, entry) for entry in chosen]
     try:
-        told, wrong = _prepare(bench, [one["hide"] for one in effects]).told, ""
+        told, wrong = _prepare(bench, [one["hide"] for one in effects]).effect_sentences, ""
     except ConfigError as error:
         told, wrong = (), str(error)
     return {"wrong": wrong, "effects": effects, "told": list(told)}
@@ -79,7 +79,7 @@ def make_exercises(
 
 def tell_hidden(bench: Mapping[str, str], hide: Sequence[str]) -> list[str]:
     """Return what is hidden in a bench, one sentence for each effect."""
-    return list(_prepare(bench, hide).told)
+    return list(_prepare(bench, hide).effect_sentences)
 
 
 def make_solution(folder: str, *, progress: Progress) -> None:

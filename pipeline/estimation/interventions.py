@@ -38,7 +38,7 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     Runs under feedback are skipped: there, part of what drives the motor is often not logged.
     """
     open_loop = [record for record in records if record.kind not in ("closed_loop", "bode")]
-    first = {record.id: _first_alike(record, open_loop) for record in open_loop}
+    first = {record.id: _first_copy(record, open_loop) for record in open_loop}
     alone = [record for record in open_loop if first[record.id] == record.id]
     carts = sorted({cart for r in alone for cart in r.free if cart in r.carts})
     seen = [one for one in map(see, alone) if one is not None]
@@ -53,12 +53,12 @@ def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:
     return tuple(sorted(found, key=lambda one: (order.index(one.experiment), one.cart, one.start)))
 
 
-def _first_alike(record: Record, records: Sequence[Record]) -> str:
+def _first_copy(record: Record, records: Sequence[Record]) -> str:
     """Return the id of the first record with the same readings; a file may be listed twice."""
     return next(other.id for other in records if np.array_equal(other.y, record.y))
 
 
-def but_releases(
+def without_releases(
     interventions: Sequence[Intervention], records: Sequence[Record]
 ) -> list[Intervention]:
     """Return the interventions without the holds that precede the release of a decay."""

@@ -60,7 +60,7 @@ class _Weighed:
     worth: tuple[float, float]
     recording: Recording
     pair: tuple[int, int]
-    told: float
+    separation: float
     t: Array
     u: Array
     predicted: Array
@@ -99,19 +99,19 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
     sigma, pinned = _noise(gap), _pinned(gap)
 
     def weighed(recording: Recording, height: float) -> _Weighed | None:
-        found = _tell_apart(models, recording, height, sigma=sigma, pinned=pinned)
+        found = _separate(models, recording, height, sigma=sigma, pinned=pinned)
         if found is None or np.abs(found[3][weight > 0.0]).max() > limits.travel:
             return None
-        told, t, u, predicted = found
+        separation, t, u, predicted = found
         counted = np.outer(weight, weight)
-        score = counted * told
+        score = counted * separation
         i, j = divmod(int(np.argmax(score)), len(models))
         return _Weighed(
             # First settle as many pairs as possible, then separate them as far as possible.
-            worth=(float((counted * np.minimum(told, _DECIDED)).sum()), float(score.sum())),
+            worth=(float((counted * np.minimum(separation, _DECIDED)).sum()), float(score.sum())),
             recording=recording,
             pair=(i, j),
-            told=float(told[i, j]),
+            separation=float(separation[i, j]),
             t=t,
             u=u,
             predicted=predicted,
@@ -125,8 +125,8 @@ def with_proposal(gap: Gap, *, limits: PlanLimits, without: Sequence[Recording] 
     best = max((one for one in options if one), key=lambda one: one.worth, default=None)
     if best is None or best.worth <= (0.0, 0.0):
         return gap
-    if best.told < _DECIDED and not best.recording.release:
-        times = min(_LONGEST, ceil(_DECIDED / best.told))
+    if best.separation < _DECIDED and not best.recording.release:
+        times = min(_LONGEST, ceil(_DECIDED / best.separation))
         longer = {"cycles": times * best.recording.cycles}
         best = weighed(best.recording.model_copy(update=longer), 0.0) or best
     return replace(gap, proposal=_propose(best, limits))
@@ -139,7 +139,7 @@ def _propose(best: _Weighed, limits: PlanLimits) -> Proposal:
     return Proposal(
         recording=best.recording.model_dump(mode="json", exclude_defaults=True),
         limits=limits.model_dump(),
-        separation=float(np.sqrt(best.told / (best.t.size * len(best.recording.carts)))),
+        separation=float(np.sqrt(best.separation / (best.t.size * len(best.recording.carts)))),
         prediction=Prediction(
             pair=best.pair, cart=cart + 1, t=best.t, u=best.u, positions=best.predicted[:, cart]
         ),
@@ -243,7 +243,7 @@ def far_sweep(chain: Chain, limits: PlanLimits) -> Recording:
 # ------------------------------------------------------------------ the separation
 
 
-def _tell_apart(
+def _separate(
     models: Sequence[AugmentedChain],
     recording: Recording,
     height: float,
@@ -265,16 +265,16 @@ def _tell_apart(
         return None
     predicted = np.array([x for x, _ in moved])
     free = [cart - 1 for cart in recording.carts]
-    told = np.zeros((len(models), len(models)))
+    separation = np.zeros((len(models), len(models)))
     for i, j in combinations(range(len(models)), 2):
         if not u.any() and _need_input(models[i], models[j]):
             continue
         difference = ((predicted[i] - predicted[j]) / sigma[:, None])[free].ravel()
-        told[i, j] = min(
+        separation[i, j] = min(
             _left(difference, (by / sigma[:, None])[:, free], pinned)
             for _, by in (moved[i], moved[j])
         )
-    return told, t, u, predicted
+    return separation, t, u, predicted
 
 
 def _need_input(one: AugmentedChain, other: AugmentedChain) -> bool:

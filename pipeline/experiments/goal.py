@@ -39,9 +39,9 @@ class Goal:
     rows: Array
     mean: Literal["largest", "root mean square", "volume"] = "largest"
 
-    def of(self, told: Array) -> Array:
+    def of(self, information: Array) -> Array:
         """Return the error (…,) for information H and S (…, 2, n_p, n_p); inf if unbounded."""
-        H, S = told[..., 0, :, :], told[..., 1, :, :]
+        H, S = information[..., 0, :, :], information[..., 1, :, :]
         if self.mean == "volume":
             (sign, of_h), (_, of_s) = np.linalg.slogdet(H), np.linalg.slogdet(S)
             log = np.where(sign > 0, of_s - 2 * of_h, np.inf)
@@ -57,9 +57,9 @@ class Goal:
             return np.full((*H.shape[:-2], len(self.rows)), np.inf)
         return np.einsum("...kp,...pq,...kq->...k", half, S, half)
 
-    def worst(self, told: Array) -> int:
+    def worst(self, information: Array) -> int:
         """Return the index of the row with the largest error."""
-        return int(np.argmax(self._variances(*told)))
+        return int(np.argmax(self._variances(*information)))
 
 
 def check_goal(name: str, *, names: Sequence[str]) -> None:
@@ -132,7 +132,7 @@ def _by_overshoot(known: Knowledge, feedback: FeedbackDesign) -> Array:
     return np.array([columns])
 
 
-def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
+def choose(candidates: Array, information: Array, *, n: int, goal: Goal) -> tuple[int, ...]:
     """Return the `n` candidates (m, 2, n_p, n_p) that give the smallest error, the best first.
 
     One candidate may be chosen several times. First, candidates are added one by one. Then each one
@@ -140,7 +140,7 @@ def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, 
 
     Parameters
     ----------
-    told : (2, n_p, n_p) the present information.
+    information : (2, n_p, n_p) the present information.
 
     References
     ----------
@@ -149,7 +149,7 @@ def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, 
     """
     enough = 1 - 1e-6  # a smaller relative improvement is rounding
     chosen: list[int] = []
-    total = told
+    total = information
     for _ in range(n):
         chosen.append(int(np.argmin(goal.of(total + candidates))))
         total = total + candidates[chosen[-1]]
@@ -163,5 +163,5 @@ def choose(candidates: Array, told: Array, *, n: int, goal: Goal) -> tuple[int, 
                 chosen[place], total = best, others + candidates[best]
         if float(goal.of(total)) >= enough * before:
             break
-    alone = goal.of(told + candidates)
+    alone = goal.of(information + candidates)
     return tuple(sorted(chosen, key=lambda one: (alone[one], one)))

@@ -47,7 +47,8 @@ class Knowledge:
     Attributes
     ----------
     chain : the identified chain.
-    told : (2, n_p, n_p) H and S for relative changes of the parameters. See `parametrisation`.
+    information : (2, n_p, n_p) H and S for relative changes of the parameters. See
+        `parametrisation`.
     size : (n_p,) the reference values of these changes, in physical units.
     step, noise : (n,) encoder step and other noise of each cart. In position units.
     sample_time : s, of the bench.
@@ -60,7 +61,7 @@ class Knowledge:
 
     chain: Chain
     parametrisation: Parametrisation
-    told: Array
+    information: Array
     size: Array
     step: Array
     noise: Array
@@ -93,7 +94,7 @@ class Knowledge:
         known = cls(
             chain=chain,
             parametrisation=P,
-            told=np.tile(np.asarray(np.linalg.inv(covariance), dtype=np.float64), (2, 1, 1)),
+            information=np.tile(np.asarray(np.linalg.inv(covariance), dtype=np.float64), (2, 1, 1)),
             size=size,
             step=_median_by_cart(records, [r.resolution for r in records], n=chain.n),
             noise=np.zeros(chain.n),
@@ -127,7 +128,7 @@ class Knowledge:
         J, inverse = self.by_parameters(), np.linalg.inv(H)
         found, expected = (np.diag(J @ C @ J.T) for C in (covariance, inverse @ S @ inverse))
         beyond = max(1.0, float(np.median(found / expected)))
-        return replace(self, told=np.stack([H, H @ covariance @ H]), beyond=beyond)
+        return replace(self, information=np.stack([H, H @ covariance @ H]), beyond=beyond)
 
     def by_parameters(self) -> Array:
         """Return the relative change (n_named, n_p) of each named parameter, in table order."""

@@ -41,8 +41,8 @@ def optimal_tones(
     reach = np.max(np.abs(G), axis=0)
     # Amplitude of the motion for one part of the power; the peak is about 1.8 times the rms.
     each = travel / 1.8 * np.sqrt(2 / _QUANTA)
-    told = known.of_lines(omega, amplitude=each / reach, seconds=seconds)
-    chosen = choose(told, known.told, n=_QUANTA, goal=goal)
+    information = known.of_lines(omega, amplitude=each / reach, seconds=seconds)
+    chosen = choose(information, known.information, n=_QUANTA, goal=goal)
     which, count = np.unique(chosen, return_counts=True)
     size = np.sqrt(count) / reach[which]
     phase = low_peak_phases(lines[which], size, G[:, which])

@@ -87,13 +87,13 @@ class NextPlan:
             f"({time_words(session_time(self.recordings))} at the bench)"
         )
         alone = [f"{name} alone ± {_percent(error)}" for name, error in self.planned.items()]
-        told = (
+        notes = (
             ", ".join(steps),
             f"of the plan so far, {first_few(alone, _ALONE)}" if alone else "",
             STATISTICAL if self.errors[-1] < CALIBRATION else "",
             self.doubt,
         )
-        return tuple(sentence for sentence in told if sentence)
+        return tuple(sentence for sentence in notes if sentence)
 
 
 def plan_next(
@@ -184,16 +184,16 @@ def choose_next(
     ]
     if not candidates:
         raise DataError("every useful recording was refused before")
-    told = np.array([known.of_recording(candidate) for candidate in candidates])
+    information = np.array([known.of_recording(candidate) for candidate in candidates])
     done = {record.id for record in analysis.records}
     still = {
         one.id: known.of_recording(one)
         for one in plan.recordings
-        if one.id not in done and not tells_nothing(one, known, limits=plan.limits)
+        if one.id not in done and not why_useless(one, known, limits=plan.limits)
     }
-    start = known.told + sum(still.values())
-    chosen = choose(told, start, n=n, goal=wanted)
-    sums = np.concatenate([start[None], told[list(chosen)]]).cumsum(axis=0)
+    start = known.information + sum(still.values())
+    chosen = choose(information, start, n=n, goal=wanted)
+    sums = np.concatenate([start[None], information[list(chosen)]]).cumsum(axis=0)
     errors = wanted.of(sums)
     if not errors[-1] < errors[0]:
         raise DataError(f"no experiment that the limits allow makes {wanted.words} smaller")
@@ -209,13 +209,13 @@ def choose_next(
         plan=plan,
         path=None,
         recordings=recordings,
-        now=float(wanted.of(known.told)),
+        now=float(wanted.of(known.information)),
         errors=tuple(errors.tolist()),
-        planned={name: float(wanted.of(known.told + one)) for name, one in still.items()},
+        planned={name: float(wanted.of(known.information + one)) for name, one in still.items()},
     )
 
 
-def tells_nothing(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
+def why_useless(recording: Recording, known: Knowledge, *, limits: PlanLimits) -> str:
     """Return why a recording would not improve the carts' parameters; "" if it would."""
     kinds = ("sine",) if known.dwells else ("step", "sweep")
     if recording.kind not in kinds:
@@ -273,7 +273,7 @@ def _words(goal: Goal, known: Knowledge, *, after: Array) -> str:
     if goal.name != WORST:
         return goal.words
     names = list(known.chain.parameters())
-    now, then = (names[goal.worst(told)] for told in (known.told, after))
+    now, then = (names[goal.worst(information)] for information in (known.information, after))
     which = now if now == then else f"now {now}, then {then}"
     return f"{goal.words} ({which})"
 

@@ -14,7 +14,14 @@ from pipeline.experiments.plan import Plan, PlanLimits, Recording, StateLoop
 from pipeline.lock import turn_in
 from pipeline.output import write_file
 from pipeline.submission import Submission, System, load_submission
-from pipeline.submission.complaints import Location, all_told, dotted, explain, quote, told_once
+from pipeline.submission.complaints import (
+    Location,
+    dotted,
+    explain,
+    list_faults,
+    quote,
+    relevant_errors,
+)
 from pipeline.submission.toml_file import parse_toml, read_text
 from pipeline.submission.toml_section import toml_section
 
@@ -159,13 +166,13 @@ def _parse(text: str, *, where: str, system: System) -> Plan:
     try:
         plan = Plan.model_validate(document, strict=True)
     except ValidationError as error:
-        problems = [explain(e, document, root=Plan) for e in told_once(error.errors())]
+        problems = [explain(e, document, root=Plan) for e in relevant_errors(error.errors())]
     else:
         found = list(_problems(plan, system))
         problems = [f"{dotted(at, document)}: {what}" for at, what in found]
         if not problems:
             return plan
-    raise ConfigError(all_told(where, problems))
+    raise ConfigError(list_faults(where, problems))
 
 
 def _tuples(value: Any) -> Any:

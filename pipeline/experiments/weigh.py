@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from pipeline.experiments.goal import find_goal
 from pipeline.experiments.information import Knowledge
-from pipeline.experiments.next_recordings import choose_next, tells_nothing
+from pipeline.experiments.next_recordings import choose_next, why_useless
 from pipeline.experiments.plan import Plan, Recording
 from pipeline.results import Analysis
 
@@ -47,8 +47,8 @@ def weigh(
     found = choose_next(analysis, nothing_open, n=1, goal=goal, commands=commands)
     known = Knowledge.of(analysis)
     error = find_goal(goal, known, feedback=analysis.feedback).of
-    why = tells_nothing(proposed, known, limits=plan.limits)
-    after = found.now if why else float(error(known.told + known.of_recording(proposed)))
+    why = why_useless(proposed, known, limits=plan.limits)
+    after = found.now if why else float(error(known.information + known.of_recording(proposed)))
     if after > 1.01 * found.now:  # 1 % is visible in two digits
         why = _WHY_WORSE
     return Weighed(

@@ -115,7 +115,7 @@ def explain_gap(
         repeats = repeatability([*study.training, *study.held_out]) or 0.0
         search = Search(replace(study, repeatability=repeats), linear, deadline)
         search.find_effects()
-        search.measure_noise_anew()
+        search.remeasure_noise()
         search.change_sides()
         search.add_constant_force()
         search.reach_verdict()

@@ -58,7 +58,7 @@ class Grading(Member):
     findings : results of the checks, as `judge.reweigh` stores them; "" if grading failed.
     figures : file names and SVG texts for the feedback.
     detail : for developers: the traceback of an error in the grader, or "".
-    lacks_room : the disk was full. This concerns only this run; the gradebook does not keep it.
+    is_disk_full : the disk was full. This concerns only this run; the gradebook does not keep it.
     """
 
     status: Literal["graded", "failed"]
@@ -68,7 +68,7 @@ class Grading(Member):
     findings: str = ""
     figures: tuple[tuple[str, str], ...] = ()
     detail: str = ""
-    lacks_room: bool = False
+    is_disk_full: bool = False
 
     @property
     def member(self) -> Member:
@@ -101,7 +101,7 @@ class Batch:
     shared : by submission, the flag for recordings that another submission also contains.
     failed : submission and reason, for those that could not be graded.
     unsettled : number of failed submissions that the next run tries again.
-    lacks_room : number of submissions that failed because the disk was full.
+    is_disk_full : number of submissions that failed because the disk was full.
     kept, moved, taken_over : changes since the last class list; see `so_far.SoFar`.
     """
 
@@ -109,7 +109,7 @@ class Batch:
     shared: Mapping[str, Flag]
     failed: tuple[tuple[str, str], ...] = ()
     unsettled: frozenset[str] = frozenset()
-    lacks_room: frozenset[str] = frozenset()
+    is_disk_full: frozenset[str] = frozenset()
     kept: tuple[str, ...] = ()
     moved: Mapping[str, str] = field(default_factory=dict)
     taken_over: tuple[tuple[str, tuple[str, ...], tuple[str, ...]], ...] = ()

@@ -23,7 +23,7 @@ from pipeline.submission.complaints import (
     explain,
     nearest,
     quote,
-    told_once,
+    relevant_errors,
     without_tag,
 )
 from pipeline.submission.load import spring_names
@@ -170,7 +170,7 @@ def _validate(document: dict, *, lost: Collection[str]) -> _Validated:
         tagged = [_with_check(own, i, document, complaints) for i, own in enumerate(criteria)]
         document = {**document, "criteria": tuple(tagged)}
     rubric, wrong = _try(document)
-    complaints += [_complaint(error, document) for error in told_once(wrong)]
+    complaints += [_complaint(error, document) for error in relevant_errors(wrong)]
     if wrong:
         rubric, _ = _try(_without(document, wrong))
     if rubric is not None:

@@ -5,7 +5,7 @@ from math import ceil
 
 import numpy as np
 
-from pipeline.estimation.interventions import but_releases
+from pipeline.estimation.interventions import without_releases
 from pipeline.ingest.columns import conversion
 from pipeline.ingest.read import Ingested
 from pipeline.results import Intervention, Record
@@ -49,7 +49,7 @@ def hand_remarks(interventions: Sequence[Intervention], *, records: Sequence[Rec
                 end=f"{one.end:.2f}",
             ),
         )
-        for one in but_releases(interventions, records)
+        for one in without_releases(interventions, records)
     )
 
 
@@ -86,7 +86,7 @@ def is_reversed(records: Sequence[Record]) -> bool:
     return sum(1 if sign > 0 else -1 for sign in signs) < 0
 
 
-def turn_of_the_gains(records: Sequence[Record]) -> list[str]:
+def gain_sign_warning(records: Sequence[Record]) -> list[str]:
     """Return a warning if the bench's input has the opposite sign of the designed gains."""
     if not is_reversed(records):
         return []

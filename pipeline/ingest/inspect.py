@@ -14,7 +14,7 @@ from pipeline.ingest.clock import Clock, clock_notes, read_clock
 from pipeline.ingest.columns import Column, assign_columns, conversion, holds_counts
 from pipeline.ingest.formats.recognise import FORM_TITLES, read_table
 from pipeline.ingest.formats.table import FileTable, Variable
-from pipeline.ingest.unnamed import Roles, tell_columns
+from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.results import Kind
 from pipeline.words.numbers import by_note, first_few
 
@@ -121,7 +121,7 @@ def inspect_file(path: Path, *, columns: Mapping[str, str | int] = {}) -> Inspec
         problems.append(unusable[-1])
     unnamed = all(name.isdigit() for name in table.names)
     bare = not assigned and unnamed
-    told = tell_columns(table) if bare else Roles()
+    told = find_roles(table) if bare else Roles()
     guessed = dict(told.columns)
     if bare:
         assigned, _ = assign_columns(table, explicit=guessed, free=(1,))

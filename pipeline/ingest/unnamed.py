@@ -38,13 +38,13 @@ class Roles:
     doubts: tuple[str, ...] = ()
 
 
-def tell_columns(table: FileTable) -> Roles:
+def find_roles(table: FileTable) -> Roles:
     """Return the roles of the columns of a table without names; empty if they cannot be found."""
     with np.errstate(all="ignore"):  # undefined shares compare as false
-        return _tell(table)
+        return _find_roles(table)
 
 
-def _tell(table: FileTable) -> Roles:
+def _find_roles(table: FileTable) -> Roles:
     values = table.values
     clocks = [i for i, column in enumerate(values) if _is_clock(column)]
     if not clocks:
@@ -61,7 +61,7 @@ def _tell(table: FileTable) -> Roles:
     ]  # fmt: skip
     signals = _without_copies(table, signals)
     signals = _without_rates(values, signals, interval=interval)
-    drive, reference, doubt = _tell_input(table, signals)
+    drive, reference, doubt = _find_input(table, signals)
     doubts += [doubt] if doubt else []
     positions = [i for i in signals if i not in (drive, reference)]
     if not 0 < len(positions) <= MOST_CARTS:
@@ -145,7 +145,7 @@ def _without_rates(values: Array, signals: Sequence[int], *, interval: float) ->
 # ---------------------------------------------------------------------------------- the input
 
 
-def _tell_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, int | None, str]:
+def _find_input(table: FileTable, signals: Sequence[int]) -> tuple[int | None, int | None, str]:
     """Return the columns of input and reference, each if there is one, and what is in doubt."""
     if len(signals) < 2:
         return None, None, ""

@@ -96,7 +96,7 @@ class SimulatedBench:
     ----------
     name : of the preset or the model's file. May be empty.
     effects : effects beyond the linear chain. Without effects nothing is compiled.
-    told : one sentence for each effect, with its parameters. Never written into the submission.
+    effect_sentences : one for each effect, with its parameters. Never written into the submission.
     travel : intended motion of the carts. Position units.
     count : the encoder step. Position units.
     input_limit : the largest input. Input units.
@@ -109,7 +109,7 @@ class SimulatedBench:
     chain: Chain
     name: str = ""
     effects: tuple[EffectTerm, ...] = ()
-    told: tuple[str, ...] = ()
+    effect_sentences: tuple[str, ...] = ()
     position_unit: str = "cm"
     input_unit: str = "V"
     travel: float = 1.0

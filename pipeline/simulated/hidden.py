@@ -51,8 +51,12 @@ def prepare_bench(
     for text in hide:
         term, given = _named_effect(text, bench)
         _refuse_second(term, bench.effects, where=f"--hide {text}")
-        told = _told(term, bench, given=given)
-        bench = replace(bench, effects=(*bench.effects, term), told=(*bench.told, told))
+        sentences = _describe(term, bench, given=given)
+        bench = replace(
+            bench,
+            effects=(*bench.effects, term),
+            effect_sentences=(*bench.effect_sentences, sentences),
+        )
     return bench
 
 
@@ -235,7 +239,9 @@ def _at(term: EffectTerm) -> str:
     return f"{term.effect.place} {term.place}" if term.place else ""
 
 
-def _told(term: EffectTerm, bench: SimulatedBench, *, given: frozenset[str] | None = None) -> str:
+def _describe(
+    term: EffectTerm, bench: SimulatedBench, *, given: frozenset[str] | None = None
+) -> str:
     """Return a sentence on the effect, with its place and parameters."""
     sizes = []
     for parameter, value in zip(term.effect.parameters, term.values, strict=True):
@@ -284,8 +290,8 @@ def _read_model(path: Path) -> SimulatedBench:
     for number, entry in enumerate(effects, start=1):
         term = _stored_effect(entry, bench, where=f"{where}: effects[{number}]")
         _refuse_second(term, bench.effects, where=f"{where}: effects[{number}]")
-        told = (*bench.told, _told(term, bench))
-        bench = replace(bench, effects=(*bench.effects, term), told=told)
+        sentences = (*bench.effect_sentences, _describe(term, bench))
+        bench = replace(bench, effects=(*bench.effects, term), effect_sentences=sentences)
     return bench
 
 

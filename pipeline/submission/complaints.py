@@ -16,7 +16,7 @@ from pipeline.words.numbers import first_few
 Location = Sequence[int | str]
 
 _LONGEST_QUOTE = 60  # characters to show of a found value
-MOST_TOLD = 20  # faults to list for a file. Finding the nearest valid key takes a while
+MOST_LISTED = 20  # faults to list for a file. Finding the nearest valid key takes a while
 _MOST_KNOWN = 40  # valid values to list
 
 # Descriptions of expected values, by pydantic's name for the error.
@@ -178,7 +178,7 @@ def refusal(error: ErrorDetails) -> str:
     return f"expected {_EXPECTED[kind].format(**error.get('ctx', {}))}, found {found}"
 
 
-def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
+def relevant_errors(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
     """Return errors, unknown keys first; drop missing keys that are only misspelt."""
     unknown = [error for error in errors if error["type"] == "extra_forbidden"]
 
@@ -191,10 +191,10 @@ def told_once(errors: Sequence[ErrorDetails]) -> list[ErrorDetails]:
     return [*unknown, *(e for e in others if e["type"] != "missing" or not is_misspelt(e))]
 
 
-def all_told(where: str, problems: Sequence[str], *, more: int = 0) -> str:
+def list_faults(where: str, problems: Sequence[str], *, more: int = 0) -> str:
     """Return the faults of a file, one line each, and the number of further faults."""
-    beyond = max(len(problems) - MOST_TOLD, 0) + more
-    lines = [f"{where}: {what}" for what in problems[:MOST_TOLD]]
+    beyond = max(len(problems) - MOST_LISTED, 0) + more
+    lines = [f"{where}: {what}" for what in problems[:MOST_LISTED]]
     return "\n".join([*lines, *([f"{where}: and {beyond} more"] if beyond else [])])
 
 

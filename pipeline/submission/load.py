@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from pipeline.errors import SubmissionError, lies_in_the_file
+from pipeline.errors import SubmissionError, is_file_fault
 from pipeline.names import parameter_names
 from pipeline.submission.complaints import (
-    MOST_TOLD,
+    MOST_LISTED,
     Location,
-    all_told,
     dotted,
     explain,
+    list_faults,
     list_keys,
     nearest,
     quote,
-    told_once,
+    relevant_errors,
     without_tag,
 )
 from pipeline.submission.models import Experiment, Reported, StateFeedbackController, Submission
@@ -84,7 +84,7 @@ class InvalidSubmission(SubmissionError):
         self, where: str, problems: Sequence[tuple[Location, str]], *, more: int = 0
     ) -> None:
         self.problems = tuple(problems)
-        super().__init__(all_told(where, [what for _, what in problems], more=more))
+        super().__init__(list_faults(where, [what for _, what in problems], more=more))
 
 
 def parse_submission(text: str, *, folder: Path, where: str = NAME) -> Submission:
@@ -163,7 +163,7 @@ def _validate(document: dict, *, where: str) -> Submission:
     keys = list_keys(Submission)
     unknown: list[tuple[Location, str]] = [
         ((key,), f"{dotted([key], document)}: unknown key{nearest(key, keys)}")
-        for key in islice((key for key in document if key not in keys), MOST_TOLD)
+        for key in islice((key for key in document if key not in keys), MOST_LISTED)
     ]
     document = {key: value for key, value in document.items() if key in keys}
     try:
@@ -176,8 +176,8 @@ def _validate(document: dict, *, where: str) -> Submission:
     try:
         submission = Submission.model_validate(plain, strict=True)
     except ValidationError as error:
-        found = told_once(error.errors())
-        first = found[:MOST_TOLD]
+        found = relevant_errors(error.errors())
+        first = found[:MOST_LISTED]
         worded = [(without_tag(e["loc"], plain), explain(e, plain)) for e in first]
         more = len(found) - len(first)
         raise InvalidSubmission(where, [*unknown, *worded], more=more) from None
@@ -406,7 +406,7 @@ def outside(folder: Path, name: str, *, taken: Collection[str] = ()) -> str | No
     except FileNotFoundError:
         return f"there is no file {shown}{_near_file(folder, posix(name), taken)}"
     except OSError as error:
-        if not lies_in_the_file(error):
+        if not is_file_fault(error):
             raise
         why = "a loop of links" if error.errno == errno.ELOOP else error.strerror
         return f"{shown} cannot be read ({why})"

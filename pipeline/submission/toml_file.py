@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 
 from pydantic import BaseModel
 
-from pipeline.errors import PipelineError, lies_in_the_file
+from pipeline.errors import PipelineError, is_file_fault
 from pipeline.resources import TEMPLATES
 from pipeline.submission.complaints import Location, dotted, quote, takes_numbers
 from pipeline.submission.models import Submission
@@ -52,7 +52,7 @@ def read_text(path: Path, *, where: str, limit: int, error: type[PipelineError])
             raise error(_too_large(where, size, limit))
         raw = path.read_bytes()
     except OSError as wrong:
-        if not lies_in_the_file(wrong):
+        if not is_file_fault(wrong):
             raise
         raise error(f"{where}: cannot be read ({wrong.strerror})") from None
     return decoded(raw, where=where, limit=limit, error=error)

@@ -14,7 +14,7 @@ from pipeline.experiments.discriminate import (
     _candidates,
     _left,
     _predict,
-    _tell_apart,
+    _separate,
     propose_for,
     with_proposal,
 )
@@ -194,16 +194,16 @@ def test_of_those_that_settle_a_pair_the_best_is_proposed(proposed):
     assert proposed.proposal is not None
     known = np.full(6, np.inf)
     sigma = np.full(2, proposed.noise_floor * 0.1)
-    told: list[float] = []
+    separations: list[float] = []
     mine = 0.0
     for recording, height in _candidates(CHAIN, LIMITS):
-        found = _tell_apart([DRY, DRAG], recording, height, sigma=sigma, pinned=known)
+        found = _separate([DRY, DRAG], recording, height, sigma=sigma, pinned=known)
         if found is not None and np.abs(found[3]).max() <= LIMITS.travel:
-            told.append(found[0][0, 1])
+            separations.append(found[0][0, 1])
             entry = recording.model_dump(mode="json", exclude_defaults=True)
             if entry == proposed.proposal.recording:
-                mine = told[-1]
-    assert mine == max(told)
+                mine = separations[-1]
+    assert mine == max(separations)
 
 
 def test_what_would_not_settle_it_is_recorded_for_longer(proposed):
@@ -231,11 +231,11 @@ def test_what_acts_on_the_input_alone_shows_in_no_decay():
     softer = replace(lagged, chain=replace(CHAIN, k=CHAIN.k * 0.9))
     decay = next(r for r, _ in _candidates(CHAIN, LIMITS) if r.release)
     for other, apart in ((softer, False), (DRY, True)):
-        told = _tell_apart(
+        separations = _separate(
             [late, other], decay, 0.5, sigma=np.full(2, 1e-3), pinned=np.full(6, 1e-6)
         )
-        assert told is not None
-        assert (told[0][0, 1] > 0) == apart
+        assert separations is not None
+        assert (separations[0][0, 1] > 0) == apart
 
 
 def test_a_release_says_how_far_out_and_is_drawn_from_there():
@@ -247,11 +247,11 @@ def test_a_release_says_how_far_out_and_is_drawn_from_there():
             heights.add(height)
             assert f"{height:g} from the zero" in recording.note
             unknown = np.full(6, np.inf)
-            told = _tell_apart(
+            separations = _separate(
                 [DRY, DRAG], recording, height, sigma=np.full(2, 1e-3), pinned=unknown
             )
-            assert told is not None
-            predicted = told[3]
+            assert separations is not None
+            predicted = separations[3]
             assert predicted[:, recording.release - 1, 0] == pytest.approx(height)
     assert heights == {1.5, 0.5}
 

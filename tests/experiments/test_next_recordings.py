@@ -26,7 +26,7 @@ from pipeline.experiments.multisine import (
     optimal_tones,
     schroeder_phases,
 )
-from pipeline.experiments.next_recordings import STATISTICAL, _doubt, choose_next, tells_nothing
+from pipeline.experiments.next_recordings import STATISTICAL, _doubt, choose_next, why_useless
 from pipeline.experiments.plan import Plan, PlanLimits, Recording
 from pipeline.experiments.plan_file import load_plan
 from pipeline.experiments.propose import extend_plan, propose_plan, renamed
@@ -80,8 +80,8 @@ def multisine(known: Knowledge, goal: Goal) -> Recording:
 
 def test_what_is_known_is_what_the_fit_says(known, analysis):
     """H and S reproduce the fit's standard error of every named parameter."""
-    half = known.by_parameters() @ np.linalg.inv(known.told[0])
-    std = np.sqrt(np.diag(half @ known.told[1] @ half.T))
+    half = known.by_parameters() @ np.linalg.inv(known.information[0])
+    std = np.sqrt(np.diag(half @ known.information[1] @ half.T))
     fitted = [e.std / e.value for e in analysis.fit.parameters.values()]
     np.testing.assert_allclose(std, fitted, rtol=1e-3)  # differences of one step either way
 
@@ -162,10 +162,12 @@ def test_the_goals_are_errors_of_what_they_name(known, analysis):
     fitted = {name: e.std / e.value for name, e in analysis.fit.parameters.items()}
     for name in ("zeta_2", "K_1"):
         goal = find_goal(name, known, feedback=None)
-        assert float(goal.of(known.told)) == pytest.approx(fitted[name], rel=1e-3)
+        assert float(goal.of(known.information)) == pytest.approx(fitted[name], rel=1e-3)
     worst = find_goal("worst", known, feedback=None)
-    assert float(worst.of(known.told)) == pytest.approx(max(fitted.values()), rel=1e-3)
-    assert list(fitted)[worst.worst(known.told)] == max(fitted, key=lambda name: fitted[name])
+    assert float(worst.of(known.information)) == pytest.approx(max(fitted.values()), rel=1e-3)
+    assert list(fitted)[worst.worst(known.information)] == max(
+        fitted, key=lambda name: fitted[name]
+    )
     with pytest.raises(ConfigError, match="did you mean 'zeta_2'"):
         find_goal("zeta2", known, feedback=None)
 
@@ -174,7 +176,11 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
     """That many carts drawn from the covariance overshoot under the same controller."""
     feedback = analysis.feedback
     goal = find_goal("design", known, feedback=feedback)
-    covariance = np.linalg.inv(known.told[0]) @ known.told[1] @ np.linalg.inv(known.told[0])
+    covariance = (
+        np.linalg.inv(known.information[0])
+        @ known.information[1]
+        @ np.linalg.inv(known.information[0])
+    )
     rng, peaks, widened = np.random.default_rng(1), [], 30.0  # errors so small hide in rounding
     P, p = known.parametrisation, known.parametrisation.physical(known.chain)
     for change in rng.multivariate_normal(np.zeros(p.size), widened**2 * covariance, size=300):
@@ -187,7 +193,7 @@ def test_the_design_goal_is_the_spread_of_the_peak(known, analysis):
         )
         peaks.append(loop.x[feedback.cart - 1].max() / feedback.reference)
     # 300 draws determine a spread to 4 %; the rest is nonlinearity.
-    assert np.std(peaks) / widened == pytest.approx(float(goal.of(known.told)), rel=0.2)
+    assert np.std(peaks) / widened == pytest.approx(float(goal.of(known.information)), rel=0.2)
 
 
 def test_each_choice_serves_its_own_goal(analysis):
@@ -201,7 +207,9 @@ def test_each_choice_serves_its_own_goal(analysis):
     known = Knowledge.of(analysis)
     for goal, other in (("K_1", "zeta_2"), ("zeta_2", "K_1")):
         of = find_goal(goal, known, feedback=None).of
-        own, theirs = (float(of(known.told + known.of_recording(left[g]))) for g in (goal, other))
+        own, theirs = (
+            float(of(known.information + known.of_recording(left[g]))) for g in (goal, other)
+        )
         assert own < theirs
 
 
@@ -231,7 +239,7 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
     assert found.chosen == alone.recordings[0]
     assert found.now > found.proposed > found.best
     error = find_goal("zeta_2", known, feedback=None).of
-    assert found.proposed == pytest.approx(error(known.told + known.of_recording(mine)))
+    assert found.proposed == pytest.approx(error(known.information + known.of_recording(mine)))
     assert not found.why
 
 
@@ -257,8 +265,8 @@ def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
     """It is of a kind that the fit does not use, holds a cart, or goes too far."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
-    assert tells_nothing(mine, known, limits=LIMITS) == ""
-    assert words in tells_nothing(mine.model_copy(update=change), known, limits=LIMITS)
+    assert why_useless(mine, known, limits=LIMITS) == ""
+    assert words in why_useless(mine.model_copy(update=change), known, limits=LIMITS)
 
 
 def test_where_dwells_identify_dwells_are_chosen():
@@ -298,8 +306,8 @@ def test_a_promise_below_any_calibration_says_so(analysis):
     assert (STATISTICAL in found.recordings[0].note) == (found.errors[-1] < CALIBRATION)
     known = Knowledge.of(analysis)
     worst, names = find_goal("worst", known, feedback=None), list(known.chain.parameters())
-    after = known.told + known.of_recording(found.recordings[0])
-    assert names[worst.worst(known.told)] in found.words
+    after = known.information + known.of_recording(found.recordings[0])
+    assert names[worst.worst(known.information)] in found.words
     assert names[worst.worst(after)] in found.words
 
 

@@ -16,7 +16,7 @@ from pipeline.ingest.formats.recognise import parse_table
 from pipeline.ingest.inspect import format_inspection, inspect_file
 from pipeline.ingest.read import read_data
 from pipeline.submission import Submission, load_submission
-from pipeline.submission.complaints import MOST_TOLD
+from pipeline.submission.complaints import MOST_LISTED
 from tests.helpers.places import ROOT
 from tests.helpers.recordings import lvm, tdms_of, xlsx
 
@@ -215,5 +215,5 @@ def test_a_damaged_submission_file_is_an_error_or_a_submission(hits, tmp_path_fa
     example = ROOT / "submissions" / "two-cart" / "submission.toml"
     folder = tmp_path_factory.mktemp("toml")
     (folder / "submission.toml").write_bytes(damaged(example.read_bytes()[:3000], hits))
-    with few_lines_at_most(MOST_TOLD + 1):
+    with few_lines_at_most(MOST_LISTED + 1):
         load_submission(folder)

@@ -9,7 +9,7 @@ from pipeline.arrays import Array
 from pipeline.ingest.formats.recognise import read_table
 from pipeline.ingest.formats.table import FileTable
 from pipeline.ingest.read import read_data
-from pipeline.ingest.unnamed import Roles, tell_columns
+from pipeline.ingest.unnamed import Roles, find_roles
 from pipeline.resources import EXAMPLES
 from pipeline.results import Record
 from pipeline.submission import load_submission
@@ -49,7 +49,7 @@ def told(columns: dict[str, Array], order: np.random.Generator) -> tuple[Roles, 
     carts = iter(range(1, 10))
     named = [f"x{next(carts)}" if role[0] == "x" else role for role in roles]
     right = {role: number for number, role in enumerate(named, 1)}
-    return tell_columns(bare(*(columns[role] for role in roles))), right
+    return find_roles(bare(*(columns[role] for role in roles))), right
 
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
@@ -80,7 +80,7 @@ def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
     folder = real_data / "ecp210-ucsd"
     for name, roles in kinds_of(folder).items():
         table, _ = read_table(folder, name)
-        got = tell_columns(bare(*table.values))
+        got = find_roles(bare(*table.values))
         assert got == Roles(columns=roles), name
 
 
@@ -90,15 +90,15 @@ def test_the_input_of_a_random_record_is_told(real_data):
         table, _ = read_table(real_data / "silverbox", name)
         drive, answer = (table.values[table.index(column)] for column in ("V1", "V2"))
         clock = np.arange(drive.size) / 610.35
-        assert tell_columns(bare(clock, answer, drive)).columns == {"time": 1, "input": 3, "x1": 2}
-        assert tell_columns(bare(drive, answer, clock)).columns == {"time": 3, "input": 1, "x1": 2}
+        assert find_roles(bare(clock, answer, drive)).columns == {"time": 1, "input": 3, "x1": 2}
+        assert find_roles(bare(drive, answer, clock)).columns == {"time": 3, "input": 1, "x1": 2}
 
 
 def test_hands_are_no_inputs(real_data):
     """If a hand plucks carts, cartlab asks before it calls one the input."""
     for day in ("07-Feb-2025_11_28_21", "14-Feb-2025_09_44_21"):
         table, _ = read_table(real_data / "ecp210-2025", f"{day}.txt")
-        assert tell_columns(bare(*table.values)).doubts
+        assert find_roles(bare(*table.values)).doubts
 
 
 RING = np.exp(-0.5 * T) * np.cos(12 * T)
@@ -109,14 +109,14 @@ ANSWER = np.where(T > 1, 1 - np.cos(9 * (T - 1)), 0.0)
 def test_a_velocity_is_no_cart():
     """A column that is the rate of another gets no role."""
     rate = np.where(T > 1, 9 * np.sin(9 * (T - 1)), 0.0)
-    got = tell_columns(bare(T, STEP, ANSWER, rate))
+    got = find_roles(bare(T, STEP, ANSWER, rate))
     assert got == Roles(columns={"time": 1, "input": 2, "x1": 3})
 
 
 def test_a_reference_is_told_from_the_input_that_jumps_with_it():
     """Under feedback the reference steps and the output of the controller jumps at once."""
     effort = STEP - 0.2 * ANSWER
-    got = tell_columns(bare(T, STEP, ANSWER, effort))
+    got = find_roles(bare(T, STEP, ANSWER, effort))
     assert got == Roles(columns={"time": 1, "input": 4, "reference": 2, "x1": 3})
 
 
@@ -124,13 +124,13 @@ def test_two_columns_that_are_one_signal_are_asked_about():
     """A smooth reference and the position that follows it are nearly equal."""
     path = 10 * np.sin(2 * T) * np.sin(0.3 * T)
     drive = np.gradient(np.gradient(path, T), T) + np.sin(5 * T)
-    got = tell_columns(bare(T, drive, path, path + 0.01 * np.sin(5 * T)))
+    got = find_roles(bare(T, drive, path, path + 0.01 * np.sin(5 * T)))
     assert any("nearly equal: is one of them the reference?" in doubt for doubt in got.doubts)
 
 
 def test_a_time_in_small_units_is_said():
     """Milliseconds rise too fast for seconds: the message has the rate to state."""
-    got = tell_columns(bare(np.round(1e3 * T), STEP, ANSWER))
+    got = find_roles(bare(np.round(1e3 * T), STEP, ANSWER))
     assert got.columns == {}
     (said,) = got.doubts
     assert said.endswith(
@@ -140,8 +140,8 @@ def test_a_time_in_small_units_is_said():
 
 def test_one_column_beside_the_time_is_a_position():
     """A release needs no input."""
-    assert tell_columns(bare(T, RING)) == Roles(columns={"time": 1, "x1": 2})
-    assert tell_columns(bare(T, RING, 0.5 * RING)).columns == {"time": 1, "x1": 2, "x2": 3}
+    assert find_roles(bare(T, RING)) == Roles(columns={"time": 1, "x1": 2})
+    assert find_roles(bare(T, RING, 0.5 * RING)).columns == {"time": 1, "x1": 2, "x2": 3}
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 30])
@@ -149,4 +149,4 @@ def test_short_and_constant_columns_do_no_harm(n):
     """Too few samples give no roles, and no error."""
     rng = np.random.default_rng(n)
     for columns in ((np.zeros(n),), (T[:n], np.zeros(n)), (T[:n], *rng.normal(size=(3, n)))):
-        assert isinstance(tell_columns(bare(*columns)), Roles)
+        assert isinstance(find_roles(bare(*columns)), Roles)

@@ -358,7 +358,9 @@ def test_a_stored_model_gives_the_same_records(tmp_path):
     write_submission(tmp_path / "a", prepared, seed=5)
     write_submission(tmp_path / "b", again, seed=5)
 
-    assert again.told == tuple(text.replace(" (default)", "") for text in prepared.told)
+    assert again.effect_sentences == tuple(
+        text.replace(" (default)", "") for text in prepared.effect_sentences
+    )
     for path in sorted((tmp_path / "a" / "data").iterdir()):
         assert path.read_bytes() == (tmp_path / "b" / "data" / path.name).read_bytes()
 
@@ -497,7 +499,7 @@ def test_defaults_are_told():
     """Omitted sizes get clearly visible defaults, and a note says so."""
     prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
 
-    assert prepared.told == (
+    assert prepared.effect_sentences == (
         "presliding_friction on cart 1: force 0.002 V, distance 0.0258 cm (default)",
     )
     (spring,) = prepare_bench(preset="throne-3dof", hide=["cubic_spring"]).effects
@@ -516,7 +518,7 @@ def test_what_the_linear_chain_can_do_is_said():
     """An effect that no data of this bench can tell from the chain is hidden, and said so."""
     prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
 
-    assert prepared.told[0].endswith("here the linear chain can do the same")
+    assert prepared.effect_sentences[0].endswith("here the linear chain can do the same")
     (term,) = prepared.effects
     assert isinstance(term, EffectTerm)
     # It equals the cart's own damping.

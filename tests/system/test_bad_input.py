@@ -19,7 +19,7 @@ from pipeline.cli import main
 from pipeline.errors import SubmissionError
 from pipeline.ingest.read import read_data
 from pipeline.submission import load_submission
-from pipeline.submission.complaints import MOST_TOLD
+from pipeline.submission.complaints import MOST_LISTED
 
 HEAD = """\
 version = 1
@@ -250,7 +250,7 @@ BAD_TOML = {
 @pytest.mark.parametrize(("toml", "pattern"), BAD_TOML.values(), ids=BAD_TOML.keys())
 def test_a_broken_submission_file_is_a_line_each(toml, pattern, tmp_path):
     """Whatever is wrong in submission.toml is named by key or line, one line for each mistake."""
-    one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_TOLD)
+    one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_LISTED)
 
 
 def _replaced(line: int, text: str) -> str:

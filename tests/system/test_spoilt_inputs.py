@@ -26,7 +26,7 @@ from pipeline.report.gap.verdict import terminal_verdict
 from pipeline.resources import RUBRICS
 from pipeline.simulated.hidden import prepare_bench
 from pipeline.submission import load_submission
-from pipeline.submission.complaints import MOST_TOLD
+from pipeline.submission.complaints import MOST_LISTED
 from tests.grading.publish.test_survey import write_paper
 from tests.helpers.acquisitions import Notes, write_work
 from tests.helpers.grades import make_grade
@@ -132,7 +132,7 @@ def try_seed(name: str, seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(spoilt(name, Random(f"{name} {seed}")))
-        most = MOST_TOLD + 1 if name == "plan.toml" else 1
+        most = MOST_LISTED + 1 if name == "plan.toml" else 1
         with few_lines_at_most(most) if name != "rubric.toml" else suppress(ConfigError):
             use(name, path)
 

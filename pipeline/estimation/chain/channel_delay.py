@@ -94,7 +94,7 @@ class _Normal:
 
 
 def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> ChannelDelay | None:
-    usable = [record for record in records if _tells(record, cart)]
+    usable = [record for record in records if _shows_delay(record, cart)]
     periods = [motion_period(one.position(cart)) * one.sample_time for one in usable]
     if not usable:
         return None
@@ -130,7 +130,7 @@ def _channel_delay(records: Sequence[Record], cart: int, *, after: float) -> Cha
     )
 
 
-def _tells(record: Record, cart: int) -> bool:
+def _shows_delay(record: Record, cart: int) -> bool:
     """Return whether the record can show the delay.
 
     All forces on the cart must have been measured, and both it and the cart before must move far.

@@ -153,7 +153,7 @@ def _readings(record: Record, modes: _ModesOf) -> Iterator[tuple[Misread, Record
     # The smallest motion, in encoder steps: rounding can change a smaller motion by any factor.
     if np.any(np.ptp(window.y, axis=1) < 5.0 * np.sqrt(12) * window.stated_sigma):
         return
-    if (said := _say(window.carts, _weights(window, modes(window.free)))) is not None:
+    if (said := _describe_mistake(window.carts, _weights(window, modes(window.free)))) is not None:
         misread, factors = said
         by_cart = dict(zip(window.carts, factors, strict=True))
         rows = np.array([by_cart.get(cart, 1.0) for cart in record.carts])
@@ -174,7 +174,7 @@ def _weights(window: FitWindow, modes: Modes) -> Array:
     return np.asarray(best, dtype=np.float64)
 
 
-def _say(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
+def _describe_mistake(carts: Sequence[int], weights: Array) -> tuple[Misread, Array] | None:
     """Describe the mistake that these factors on the columns would correct; None if unknown.
 
     A wrong unit applies to the whole file. A single cart with a small motion is not a wrong unit:

@@ -46,7 +46,7 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -
         seen = [
             moment
             for window, moment in zip(windows, moments, strict=True)
-            if moment is not None and _tells_of(window, cart, n)
+            if moment is not None and _has_equation(window, cart, n)
         ]
         if not seen:
             return None
@@ -70,7 +70,7 @@ def regress_chain(windows: Sequence[FitWindow], *, bench: Bench, width: float) -
     return Chain(m=start.m, c=np.maximum(c, 2 * _SMALLEST_ZETA * omega * start.m), k=start.k)
 
 
-def _tells_of(window: FitWindow, cart: int, n: int) -> bool:
+def _has_equation(window: FitWindow, cart: int, n: int) -> bool:
     """Return whether a cart's equation can be set up: it moves, and all forces on it are known."""
     near = {j for j in (cart - 1, cart, cart + 1) if 1 <= j <= n and j in window.free}
     driven = cart > 1 or window.drive_u is not None

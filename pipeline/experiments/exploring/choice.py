@@ -47,11 +47,11 @@ def choose_recording(
     settled = gap is None or (named and not gap.contenders)
     end = "" if named else WORDS.text("undecided")
     decides = gap and gap.proposal
-    told = decides and decides.prediction
-    if gap and decides and told and decides.separation**2 * told.t[-1] > _APART:
+    predicted = decides and decides.prediction
+    if gap and decides and predicted and decides.separation**2 * predicted.t[-1] > _APART:
         recording = Recording.model_validate_json(json.dumps(decides.recording))
         disputed = [name_model(one) for one in gap.contenders]
-        names = " and ".join(f'"{disputed[i]}"' for i in told.pair)
+        names = " and ".join(f'"{disputed[i]}"' for i in predicted.pair)
         return recording, WORDS.text("differ", names=names, times=f"{decides.separation:.2g}")
     if missing and named:
         worst = max(missing, key=lambda name: missing[name])

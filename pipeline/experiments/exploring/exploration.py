@@ -16,10 +16,10 @@ from pipeline.experiments.exploring.choice import SETTLED, choose_recording
 from pipeline.experiments.exploring.error_goal import ErrorGoal
 from pipeline.experiments.exploring.turn_words import (
     WORDS,
+    describe_accuracy,
+    describe_doubt,
     list_explanations,
     relative_errors,
-    tell_doubt,
-    tell_known,
 )
 from pipeline.experiments.goal import GAP
 from pipeline.experiments.plan import Recording
@@ -199,10 +199,10 @@ class Exploration:
         gap, errors = self.gap, relative_errors(self.analysis)
         missing = self.goal.missing(errors)
         recording, why = self._choose(missing)
-        doubt = tell_doubt(gap) if gap else WORDS.text("no_look")
+        doubt = describe_doubt(gap) if gap else WORDS.text("no_look")
         if gap and not gap.complete:
             doubt += WORDS.text("search_ended", seconds=f"{_SEARCH:.0f}")
-        parts = [tell_known(missing, errors), doubt, why or WORDS.text("the_end")]
+        parts = [describe_accuracy(missing, errors), doubt, why or WORDS.text("the_end")]
         said, but = "; ".join(filter(None, parts)), ""
         if recording and not self._has_time_for([recording]):
             but = WORDS.text("time_up", time=time_words(self.seconds), name=recording.id)

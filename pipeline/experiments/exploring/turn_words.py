@@ -23,7 +23,7 @@ def relative_errors(analysis: Analysis) -> dict[str, float | None]:
     }
 
 
-def tell_known(missing: dict[str, float], errors: dict[str, float | None]) -> str:
+def describe_accuracy(missing: dict[str, float], errors: dict[str, float | None]) -> str:
     """Say how well the parameters are known."""
     if not missing:
         worst = max((error for error in errors.values() if error is not None), default=0.0)
@@ -34,7 +34,7 @@ def tell_known(missing: dict[str, float], errors: dict[str, float | None]) -> st
     return WORDS.text("known_to", name=name, error=f"{100 * missing[name]:.2g} %")
 
 
-def tell_doubt(gap: Gap) -> str:
+def describe_doubt(gap: Gap) -> str:
     """Describe the effects found, or the explanations that are still in dispute."""
     named = abridge([effect_name(found.effect, found.where) for found in gap.effects])
     times = "a gap"

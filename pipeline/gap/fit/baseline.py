@@ -92,7 +92,7 @@ def fit_baseline(
     fits = [fit_model(structure.start(chain), shots, how) for chain in starts]
     best = min(fits, key=lambda fit: fit.cost)
     noisy = measure_noise(best, shots, runs)
-    return fit_model(best.anew, noisy, replace(how, iterations=25)), noisy
+    return fit_model(best.without_nuisance, noisy, replace(how, iterations=25)), noisy
 
 
 def measure_noise(fit: GapFit, shots: Sequence[GapRun], runs: Sequence[GapRun]) -> list[GapRun]:

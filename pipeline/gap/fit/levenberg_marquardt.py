@@ -72,7 +72,7 @@ class GapFit(GapModel):
         return any(bool(np.any(nuisance.scatter != 1.0)) for nuisance in self.nuisance)
 
     @property
-    def anew(self) -> GapModel:
+    def without_nuisance(self) -> GapModel:
         """The model without nuisance parameters; a fit then starts runs at expected values."""
         return GapModel(structure=self.structure, theta=self.theta)
 

@@ -78,7 +78,9 @@ def add_shaped(follow: Follow, records: Records) -> Follow | None:
     for law in (*trials, *backlash_laws(follow, records)):
         laws, p = follow.laws.with_laws(follow.p, [law])
         trial = records.refit(follow, laws, p, iterations=8)
-        if best is None or criterion(trial, follow.news) < criterion(best, follow.news):
+        if best is None or criterion(trial, follow.n_independent) < criterion(
+            best, follow.n_independent
+        ):
             best = trial
     if best is None or not is_better(best, follow):
         return None

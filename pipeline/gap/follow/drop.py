@@ -16,8 +16,8 @@ def is_rough(follow: Follow) -> bool:
     return bool(meets) and follow.chi > limits.AT_FLOOR
 
 
-def criterion(follow: Follow, news: float) -> float:
-    """Return the Bayesian criterion for `news` independent readings, with a price per effect.
+def criterion(follow: Follow, n_independent: float) -> float:
+    """Return the Bayesian criterion for so many independent readings, with a price per effect.
 
     Two models are compared with the number of independent residuals of the fuller one, as only its
     residual is due to chance.
@@ -25,25 +25,25 @@ def criterion(follow: Follow, news: float) -> float:
     low, high, _ = follow.laws.bounds()
     size = int(np.sum(low < high))
     return (
-        news * float(np.log(max(follow.total, 1e-300) / follow.points))
-        + size * float(np.log(news))
+        n_independent * float(np.log(max(follow.total, 1e-300) / follow.points))
+        + size * float(np.log(n_independent))
         + len(follow.laws.groups()) * limits.SAME_LAW
     )
 
 
 def is_better(fuller: Follow, other: Follow) -> bool:
     """Return whether the criterion prefers the fuller of two models."""
-    return criterion(fuller, fuller.news) < criterion(other, fuller.news)
+    return criterion(fuller, fuller.n_independent) < criterion(other, fuller.n_independent)
 
 
 def drop_needless(follow: Follow, records: Records) -> Follow:
     """Drop every law that the criterion does not need, the least needed first; refit the others."""
     while order := _needless(follow, records):
-        here, rough = criterion(follow, follow.news), is_rough(follow)
+        here, rough = criterion(follow, follow.n_independent), is_rough(follow)
         while order:
             laws, p = follow.laws.without(follow.p, order)
             trial = records.refit(follow, laws, p)
-            if rough or criterion(trial, follow.news) < here:
+            if rough or criterion(trial, follow.n_independent) < here:
                 follow = trial
                 break
             if len(order) == 1:
@@ -71,7 +71,7 @@ def _needless(follow: Follow, records: Records) -> list[int]:
         if not usable[groups[g]].any():
             order.append(g)
             del groups[g]
-    count, cost, rough = follow.news, follow.total, is_rough(follow)
+    count, cost, rough = follow.n_independent, follow.total, is_rough(follow)
     active = np.flatnonzero(usable)
     while groups:
         size = np.sqrt(power[active])

@@ -23,8 +23,9 @@ _RIDGE = 1e-12  # of the diagonal of a run's own block
 class Follow:
     """A model that follows the records: laws, vector, every run's own parameters, errors.
 
-    `cost` is the sum of squared errors over their noise. `points` is the number of errors, `news`
-    the number of independent ones. `gain` is the share of each error that corrects the state.
+    `cost` is the sum of squared errors over their noise. `points` is the number of errors,
+    `n_independent` the number of independent ones. `gain` is the share of each error that corrects
+    the state.
     """
 
     laws: LawSet
@@ -33,7 +34,7 @@ class Follow:
     gain: float
     cost: float
     points: float
-    news: float = 1.0
+    n_independent: float = 1.0
     prior: float = 0.0
 
     @property
@@ -99,15 +100,15 @@ class Records:
             left = run[0] * track.weight
             prior = track.prior(own, dry)[1]
             rows = left[:, track.seen].T
-            news = sum(independent(row) for row in rows) if on_springs else rows.size
-            return float((left**2).sum()), float((prior**2).sum()), news
+            n_independent = sum(independent(row) for row in rows) if on_springs else rows.size
+            return float((left**2).sum()), float((prior**2).sum()), n_independent
 
         costs = np.array(list(self.mapper(one, zip(self.tracks, follow.own, strict=True))))
         points = sum(track.points for track in self.tracks)
-        cost, prior, news = costs.sum(axis=0).tolist()
+        cost, prior, n_independent = costs.sum(axis=0).tolist()
         # A reading counts as at most a quarter of an independent one.
-        news = min(news, points / 4.0)
-        return replace(follow, cost=cost, points=points, prior=prior, news=news)
+        n_independent = min(n_independent, points / 4.0)
+        return replace(follow, cost=cost, points=points, prior=prior, n_independent=n_independent)
 
     def slope(self, follow: Follow, *, factors: bool = True) -> Slope:
         """Return the normal equations; without `factors` dry friction is the same in all runs."""

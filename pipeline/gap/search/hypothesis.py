@@ -24,16 +24,16 @@ _BOUND_MARGIN = 0.01  # in logarithms, or in scales
 class Hypothesis:
     """A model with its fit to the training runs and its error on the held-out runs.
 
-    `at_floor` is true if only noise is left, on training and held-out runs. `news` and `held_news`
-    are the numbers of independent residuals in both.
+    `at_floor` is true if only noise is left, on training and held-out runs. `n_independent` and
+    `n_held_independent` are the numbers of independent residuals in both.
     """
 
     fit: GapFit
     held: GapFit
     error: float
     bic: float
-    news: float
-    held_news: float
+    n_independent: float
+    n_held_independent: float
     at_floor: bool
 
     @property
@@ -150,8 +150,8 @@ def judge(fit: GapFit, study: Study) -> Hypothesis:
         held=held,
         error=float(np.sqrt(sum(errors) / sum(sizes))),
         bic=fit.n_points / limits.THINNING * float(np.log(fit.cost / fit.n_points)) + size,
-        news=_news(fit, study.training),
-        held_news=_news(held, study.held_out),
+        n_independent=_count_independent(fit, study.training),
+        n_held_independent=_count_independent(held, study.held_out),
         at_floor=fit.chi < limits.AT_FLOOR and held.chi < limits.AT_FLOOR,
     )
 
@@ -164,7 +164,7 @@ def _residuals(fit: GapFit, runs: Sequence[GapRun]) -> list[Array]:
     ]
 
 
-def _news(fit: GapFit, runs: Sequence[GapRun]) -> float:
+def _count_independent(fit: GapFit, runs: Sequence[GapRun]) -> float:
     """Return the number of independent residuals.
 
     A residual beyond the noise swings with the carts, so few of its points are independent.
@@ -183,9 +183,9 @@ def evidence(fuller: Hypothesis, other: Hypothesis) -> float:
     Independent readings are counted in the residual of the fuller one, as only that is due to
     chance. Held-out runs, to which neither is fitted, count equally.
     """
-    share = fuller.news / (fuller.fit.n_points / limits.THINNING)
+    share = fuller.n_independent / (fuller.fit.n_points / limits.THINNING)
     taught = (other.bic - fuller.bic) * share
-    return taught + fuller.held_news * float(np.log(other.held.chi / fuller.held.chi))
+    return taught + fuller.n_held_independent * float(np.log(other.held.chi / fuller.held.chi))
 
 
 def lowers_error(child: Hypothesis, parent: Hypothesis, study: Study) -> bool:

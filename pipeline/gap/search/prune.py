@@ -25,7 +25,7 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
     best = chosen
     while chosen.key:
         effects = chosen.fit.structure.effects
-        sure = sureness(finish(chosen.fit, study))
+        sure = significance(finish(chosen.fit, study))
         order: list[int] = np.argsort(sure, kind="stable").tolist()
         for few in (order[:_FEW], order[_FEW:]):
             needless = []
@@ -50,12 +50,12 @@ def prune(chosen: Hypothesis, study: Study, found: list[Hypothesis]) -> Hypothes
     return chosen
 
 
-def without_nothing(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
+def without_zero_effect(chosen: Hypothesis, final: GapFit, study: Study) -> Hypothesis | None:
     """Return a hypothesis without the least certain effect, if that may be zero; or None.
 
     `final` is the fit of `chosen` with its covariance.
     """
-    sure = sureness(final)
+    sure = significance(final)
     if not sure or min(sure) >= SURE:
         return None
     return _without(chosen, chosen.fit.structure.effects[int(np.argmin(sure))], study)
@@ -74,7 +74,7 @@ def _as_good(without: Hypothesis, chosen: Hypothesis, study: Study) -> bool:
     return without.bic < chosen.bic or not lowers_error(chosen, without, study)
 
 
-def sureness(fit: GapFit) -> list[float]:
+def significance(fit: GapFit) -> list[float]:
     """Return each effect's distance from zero in standard errors (its least certain parameter)."""
     structure = fit.structure
     if fit.covariance is None:

@@ -14,7 +14,7 @@ from pipeline.gap.search.deadline import Deadline, OutOfTime
 from pipeline.gap.search.find import find_hypotheses
 from pipeline.gap.search.hypothesis import Hypothesis, Study, judge
 from pipeline.gap.search.offset import find_offset
-from pipeline.gap.search.prune import steps_to, without_nothing
+from pipeline.gap.search.prune import steps_to, without_zero_effect
 from pipeline.gap.search.verdict import reach_verdict
 from pipeline.gap.search.whole import finish, fit_whole
 from pipeline.gap.types import Verdict
@@ -55,7 +55,7 @@ class Search:
         """Choose the effects, unless the linear model already fits down to noise or repeats."""
         self.chosen, self.found = self._look(self.study)
 
-    def measure_noise_anew(self) -> None:
+    def remeasure_noise(self) -> None:
         """Search again if the remaining error is smaller than the assumed noise.
 
         The assumed noise included the misfit of the linear model.
@@ -100,7 +100,7 @@ class Search:
             with suppress(OutOfTime):
                 self._settle(self._timed(study))
             self.final = finish(self.chosen.fit, study)
-            without = without_nothing(self.chosen, self.final, study)
+            without = without_zero_effect(self.chosen, self.final, study)
             if without is None:
                 break
             # In a complete fit, an effect may turn out to be zero.
@@ -139,7 +139,7 @@ class Search:
 
     def _try(self, study: Study, *, only_at_floor: bool = False) -> bool:
         """Search with another study; keep the result if it was complete, and return whether."""
-        self.linear = fit_model(self.linear.anew, study.training, study.fitting)
+        self.linear = fit_model(self.linear.without_nuisance, study.training, study.fitting)
         chosen, found = self._look(study)
         kept = not self.deadline.cut and (chosen.at_floor or not only_at_floor)
         if kept:
@@ -170,7 +170,7 @@ class Search:
         candidate = Candidate(
             effect=effect, place=offset.cart, signs=(1.0,), scales=(abs(offset.force),)
         )
-        without = tuple(judge(fit_whole(h.fit.anew, pinned), pinned) for h in self.path)
+        without = tuple(judge(fit_whole(h.fit.without_nuisance, pinned), pinned) for h in self.path)
         fit = fit_whole(chosen.fit.with_effect(candidate, (offset.force,)), loose)
         final = judge(fit, loose)
         as_good = limits.OFFSET_AS_FREE * chosen.error

@@ -37,7 +37,7 @@ def fit_whole(start: GapModel, study: Study) -> GapFit:
     steps = {} if any(study.springs) else _FINISHED
     fit = study.fit(start, scatter_free=False, **steps)
     if fit.chi > AT_FLOOR and any(c.effect.has_play for c in structure.effects):
-        fit = min(fit, _grown_contact(start, study), key=lambda one: one.cost)
+        fit = min(fit, _fit_contact_on_pieces(start, study), key=lambda one: one.cost)
     # Two rounds with friction by run; before each, the worst runs are restarted.
     for attempt in range(2):
         if not structure.many_rests or fit.chi < AT_FLOOR:
@@ -56,10 +56,10 @@ def finish(fit: GapFit, study: Study) -> GapFit:
     if not study.whole:
         return covariance(fit, study.training, study.mapper)
     how = replace(study.fitting, scatter_free=False, **_FINISHED)
-    return covariance(fit_model(fit.anew, study.whole, how), study.whole, study.mapper)
+    return covariance(fit_model(fit.without_nuisance, study.whole, how), study.whole, study.mapper)
 
 
-def _grown_contact(start: GapModel, study: Study) -> GapFit:
+def _fit_contact_on_pieces(start: GapModel, study: Study) -> GapFit:
     """Fit a contact to pieces that grow to whole runs, from several sizes of the contact."""
     structure = start.structure
     spans = [structure.span(i) for i, c in enumerate(structure.effects) if c.effect.contact]
@@ -78,6 +78,6 @@ def _grown_contact(start: GapModel, study: Study) -> GapFit:
     grown = []
     for fit in sorted(fits, key=lambda one: one.cost)[:2]:
         for length in _LENGTHS[1:]:
-            fit = on_pieces(fit.anew, length, 8)
-        grown.append(study.fit(fit.anew, iterations=15, scatter_free=False))
+            fit = on_pieces(fit.without_nuisance, length, 8)
+        grown.append(study.fit(fit.without_nuisance, iterations=15, scatter_free=False))
     return min(grown, key=lambda one: one.cost)

@@ -15,7 +15,7 @@ from uuid import uuid4
 from distributed import Client, Security, WorkerPlugin, as_completed, get_worker
 from distributed.worker import Worker as DaskWorker
 
-from pipeline.errors import ConfigError, lacks_room
+from pipeline.errors import ConfigError, is_disk_full
 from pipeline.grading.batch.runner import Executor, Grader, code_version
 from pipeline.grading.batch.worker import Setup, Task, failed
 from pipeline.grading.gradings import Grading
@@ -157,4 +157,4 @@ def _through(
         else:
             reason = f"the cluster gave up on it: {error}"
             outcome = failed(task, reason, out_of=out_of, settled=False)
-            yield replace(outcome, lacks_room=isinstance(error, OSError) and lacks_room(error))
+            yield replace(outcome, is_disk_full=isinstance(error, OSError) and is_disk_full(error))

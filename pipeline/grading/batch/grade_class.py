@@ -44,7 +44,7 @@ class Summary:
     failed : submission and reason, for those that could not be graded.
     sharing : number of submissions with recordings that another one also contains.
     unsettled : number of failed submissions that the next run tries again.
-    lacks_room : number of submissions that failed because the disk was full.
+    is_disk_full : number of submissions that failed because the disk was full.
     remarks : further messages for the command line.
     changes : differences from the last class list.
     """
@@ -53,7 +53,7 @@ class Summary:
     failed: tuple[tuple[str, str], ...]
     sharing: int
     unsettled: int = 0
-    lacks_room: int = 0
+    is_disk_full: int = 0
     remarks: tuple[str, ...] = ()
     changes: tuple[str, ...] = ()
 
@@ -158,7 +158,7 @@ def grade_class(
         failed=tuple(sorted(failed)),  # sorted, because the order of grading would reveal the names
         sharing=len(batch.shared),
         unsettled=len(batch.unsettled),
-        lacks_room=len(batch.lacks_room),
+        is_disk_full=len(batch.is_disk_full),
         remarks=(*remarks, *(f"{double}: see class.html" for double in doubles)),
         changes=tuple(changes),
     )

@@ -62,7 +62,7 @@ def grade_batch(
         rows[outcome.submission] = outcome.member
         if outcome.status == "failed" and not outcome.settled:
             unsettled.add(outcome.submission)
-        if outcome.lacks_room:
+        if outcome.is_disk_full:
             no_room.add(outcome.submission)
         progress(len(rows), total, outcome.submission)
     progress(total, total, "comparing the recordings")
@@ -74,7 +74,7 @@ def grade_batch(
         shared=_shared(in_order, book, examples=examples),
         failed=tuple((row.submission, row.reason) for row in in_order if row.reason),
         unsettled=frozenset(unsettled),
-        lacks_room=frozenset(no_room),
+        is_disk_full=frozenset(no_room),
         kept=tuple(before.kept),
         moved=before.moved,
         taken_over=before.taken_over,

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from pipeline.errors import PipelineError, lacks_room
+from pipeline.errors import PipelineError, is_disk_full
 from pipeline.grading.grade import Grade, grade_text
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
@@ -110,7 +110,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
         reason = str(error)
     except OSError as error:  # the cause may be this computer: a full disk or a lost folder
         reason = f"cannot be read ({error.strerror or error}); the next run tries again"
-        settled, no_room = False, lacks_room(error)
+        settled, no_room = False, is_disk_full(error)
     except MemoryError:
         reason, settled = OUT_OF_MEMORY, False
     except Exception as error:  # a bug in cartlab or a library: the next run tries again
@@ -119,7 +119,7 @@ def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = Fal
     outcome = failed(
         task, reason, authors=authors, out_of=rubric.out_of, settled=settled, detail=detail
     )
-    return replace(outcome, lacks_room=no_room)
+    return replace(outcome, is_disk_full=no_room)
 
 
 def named_authors(folder: Path) -> tuple[str, ...]:

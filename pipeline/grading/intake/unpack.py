@@ -17,7 +17,7 @@ from mmap import ACCESS_READ, mmap
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from pipeline.errors import SubmissionError, lies_in_the_name
+from pipeline.errors import SubmissionError, is_name_fault
 from pipeline.submission.complaints import quote
 
 _CHUNK = 1 << 16
@@ -179,7 +179,7 @@ _TROUBLE = (
 
 def _let_through(error: Exception) -> None:
     """Raise the error again if this computer caused it, not the archive."""
-    if isinstance(error, OSError) and not lies_in_the_name(error):
+    if isinstance(error, OSError) and not is_name_fault(error):
         raise error
 
 

@@ -44,7 +44,9 @@ def read_mat(raw: bytes, *, source: str) -> FileTable:
     if any(bench <= used for bench in _BENCH):
         form = "bench_mat"
     made = tuple(
-        v.told(read=True) if v in record else v.told(read=False, advice=_advice(v, longest=longest))
+        v.entry(read=True)
+        if v in record
+        else v.entry(read=False, advice=_advice(v, longest=longest))
         for v in variables
     )
     notes += not_read([variable for variable in made if not variable.read])

@@ -69,12 +69,12 @@ class MatVariable:
         """Whether it is a single signal."""
         return self.numbers.size > 1 and min(self.numbers.shape) == 1
 
-    def told(self, *, read: bool, advice: str = "") -> Variable:
+    def entry(self, *, read: bool, advice: str = "") -> Variable:
         """Return the variable's entry in an inspection."""
         return Variable(name=self.name, size=self.size, kind=self.kind, read=read, advice=advice)
 
     def __str__(self) -> str:
-        return str(self.told(read=False))
+        return str(self.entry(read=False))
 
 
 def is_mat(raw: bytes) -> bool:

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Collection
 from pathlib import Path
 
-from pipeline.errors import SubmissionError, lies_in_the_file
+from pipeline.errors import SubmissionError, is_file_fault
 from pipeline.ingest.formats.lvm import is_lvm, read_lvm
 from pipeline.ingest.formats.mat import read_mat
 from pipeline.ingest.formats.mat_variables import is_mat
@@ -69,7 +69,7 @@ def read_table(
     try:
         raw = (folder / name).read_bytes()
     except OSError as error:
-        if not lies_in_the_file(error):
+        if not is_file_fault(error):
             raise
         raise SubmissionError(f"{source}: cannot be read ({error.strerror})") from None
     return parse_table(raw, source=source), hashlib.sha256(raw).hexdigest()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pipeline import __version__
 from pipeline.arrays import Array
-from pipeline.estimation.interventions import but_releases
+from pipeline.estimation.interventions import without_releases
 from pipeline.gap.types import FoundEffect, Gap, RecordGap, Trace
 from pipeline.gap.verdict.residual_force import ResidualForce, residual_forces
 from pipeline.plant.nonlinear.effects.base import AugmentedChain
@@ -260,7 +260,7 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
 
 
 def _hands(page: Page, gap: Gap) -> list[Block]:
-    hands = but_releases(gap.interventions, list(page.records.values()))
+    hands = without_releases(gap.interventions, list(page.records.values()))
     return [intervention_table(page, hands)] if hands else []
 
 

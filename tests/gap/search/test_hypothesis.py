@@ -11,7 +11,9 @@ from pipeline.plant.nonlinear.effects import find_effect
 from tests.gap.search.begun import CUBIC, DELAY
 
 
-def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0) -> Hypothesis:
+def judged(
+    *keys: tuple[str, int], chi: float, held: float, n_independent: float = 100.0
+) -> Hypothesis:
     """Return a hypothesis with its errors at 1000 training and 1000 held-out points."""
     effects = [SimpleNamespace(key=key, effect=find_effect(key[0])) for key in keys]
     fit: Any = SimpleNamespace(chi=chi, structure=SimpleNamespace(effects=effects), n_points=1000.0)
@@ -21,8 +23,8 @@ def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0)
         held=left,
         error=held**0.5,
         bic=100.0 * float(np.log(chi)),
-        news=news,
-        held_news=news,
+        n_independent=n_independent,
+        n_held_independent=n_independent,
         at_floor=max(chi, held) < 1.15,
     )
 
@@ -31,7 +33,10 @@ def judged(*keys: tuple[str, int], chi: float, held: float, news: float = 100.0)
     ("child", "worth"),
     [
         ({"chi": 2.0, "held": 2.0}, True),  # 100 ln 3 on either side
-        ({"chi": 2.0, "held": 2.0, "news": 5.0}, False),  # what is left swings: little is news
+        (
+            {"chi": 2.0, "held": 2.0, "n_independent": 5.0},
+            False,
+        ),  # what is left swings: little is n_independent
         ({"chi": 1.0, "held": 7.0}, False),  # of the runs fitted only
         ({"chi": 5.6, "held": 5.7}, False),  # too little for the criterion
     ],

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.gap.search.hypothesis import judge
-from pipeline.gap.search.prune import SURE, prune, sureness
+from pipeline.gap.search.prune import SURE, prune, significance
 from pipeline.gap.search.translate import make_candidate
 from pipeline.gap.search.whole import fit_whole
 from pipeline.plant.nonlinear.effects import find_effect
@@ -48,6 +48,6 @@ def test_what_is_nothing_within_its_error_is_told(value, nothing):
     known = replace(fit, structure=model.structure, theta=model.theta)
     sure = np.diag(np.full(model.theta.size, (1e-3 / delay.scales[0]) ** 2))
 
-    (found,) = sureness(replace(known, covariance=sure))
+    (found,) = significance(replace(known, covariance=sure))
     assert (found < SURE) == nothing
-    assert sureness(known) == [np.inf]  # without an error no statement is made
+    assert significance(known) == [np.inf]  # without an error no statement is made

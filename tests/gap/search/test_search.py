@@ -18,7 +18,7 @@ def searched(*hidden: Hidden, seconds: float | None = None) -> Search:
     fit, study = begun(*hidden)
     search = Search(study, fit, Deadline(map, seconds=seconds))
     search.find_effects()
-    search.measure_noise_anew()
+    search.remeasure_noise()
     search.change_sides()
     search.add_constant_force()
     search.reach_verdict()
@@ -64,7 +64,7 @@ def test_noise_that_was_taken_for_too_much_is_measured_anew():
     search = Search(loud, fit, Deadline(map, seconds=None))
 
     search.find_effects()
-    search.measure_noise_anew()
+    search.remeasure_noise()
 
     assert search.study.floor == pytest.approx(study.floor, rel=0.1)
     assert search.chosen.fit.chi > 0.7

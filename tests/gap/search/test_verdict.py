@@ -29,8 +29,8 @@ def hypothesis(*keys: tuple[str, int], error: float, bic: float, held: float = 1
         at_floor=False,
         fit=SimpleNamespace(chi=1.0, n_points=100_000, structure=structure),
         held=SimpleNamespace(chi=held, n_points=10_000),
-        news=10_000.0,
-        held_news=1_000.0,
+        n_independent=10_000.0,
+        n_held_independent=1_000.0,
     )
 
 

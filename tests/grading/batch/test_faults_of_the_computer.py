@@ -119,7 +119,7 @@ hard = resource.getrlimit(which)[1]
 
 def grade():
     outcome = grade_task(task, rubric=rubric, scratch=Path(scratch))
-    return [outcome.settled, outcome.lacks_room, outcome.reason, outcome.grade]
+    return [outcome.settled, outcome.is_disk_full, outcome.reason, outcome.grade]
 
 told = [grade()]
 for most in map(int, soft):
