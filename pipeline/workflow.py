@@ -185,6 +185,6 @@ def _hardware(submission: Submission, analysis: Analysis, *, log: Log) -> list[H
         )
         checks += log.attempt(Stage.HARDWARE_CHECK, compare_run, of=experiment.id) or ()
     log.warn(
-        by_note((f"{c.experiment}, cart {c.cart}", c.note) for c in checks if not c.contradicted)
+        by_note((f"{c.experiment} (cart {c.cart})", c.note) for c in checks if not c.contradicted)
     )
     return checks

@@ -25,7 +25,7 @@ NEGLIGIBLE = 0.02
 def check_carts(fit: ChainFit | None, *, bench: Bench) -> list[Check]:
     """Check the fit, and the chain against laws of a real one: signs, redundancies, orders."""
     if fit is None:
-        message = "No model was identified: the reasons are among what was skipped."
+        message = "No model was identified. The list of what was skipped has the reasons."
         return [Check(kind="fit", part="identified", outcome="fail", message=message)]
     chain = fit.chain
     values = {name: estimate.value for name, estimate in fit.parameters.items()}
@@ -43,7 +43,7 @@ def _fit_checks(fit: ChainFit) -> list[Check]:
     found = (
         "and the noise explain the data."
         if fit.explains_data
-        else "leave more than the noise; look where model and measurement differ."
+        else "leave a residual above the noise; look where model and measurement differ."
     )
     return [
         Check(
@@ -153,8 +153,8 @@ def _ask_if_there(name: str, *, bench: Bench) -> str:
     if read.symbol == "c":
         alone = f", carts = [{i}]" if n > 1 else ""
         return (
-            f"Do the recordings tell the damping of cart {i}? A decay of it does: add one to "
-            f'submission.toml, [[experiments]] with kind = "decay"{alone}.'
+            f"Do the recordings show the damping of cart {i}? A decay of that cart would: add one "
+            f'to submission.toml, [[experiments]] with kind = "decay"{alone}.'
         )
     if read.symbol == "m":
         fewer = f"carts = {n - 1}, or " if n > 1 else ""

@@ -60,13 +60,13 @@ def _advice(row: ParameterRow) -> str:
     response = after.source == "bode_fit"
     if name.is_ratio:
         seen = (
-            "a steady sine of amplitude A sees ζ + 2d/(πA)"
+            "a steady sine of amplitude A gives ζ + 2d/(πA)"
             if response
-            else "small swings see more of it"
+            else "it adds more to the damping ratio of small swings"
         )
         return (
             f" Dry friction makes damping ratios differ: {seen}. Check which of the two methods "
-            "saw the larger amplitude."
+            "used the larger amplitude."
         )
     looks = {
         "step": "the rest and settled levels of {runs}",
@@ -96,7 +96,7 @@ def check_decays(
         found = (
             "is not exponential: dry friction can hold the cart within "
             f"±{test.drop:.3g} {bench.units.position} of its rest. The envelope's ζ = "
-            f"{decay.zeta:.3g} is biased; ζ = {test.zeta:.3g} once friction is taken out."
+            f"{decay.zeta:.3g} is biased; without the friction, ζ = {test.zeta:.3g}."
             if test.present
             else "is exponential within the noise "
             f"(F = {test.f_statistic:.1f}; above {test.threshold:.1f} would mean dry friction)."
@@ -148,7 +148,7 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
             "fail",
             (  # the shift of the rest points gives the least friction that can hold the cart
                 f"sticks: its rest points put the static gain between {low:.4g} and {high:.4g} "
-                f"{bench.units.gain}, and it may be further off."
+                f"{bench.units.gain}, and the true gain may be outside."
             ),
         )
     elif shown:
@@ -156,8 +156,8 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         outcome, found = (
             "skip",
             (
-                f"shows one gain, but dry friction shows on this cart in {runs}: it may hold "
-                "the cart off its level here too, equally on both sides."
+                f"has the same gain at every edge, but shows dry friction in {runs}. Friction may "
+                "hold it off its level here too, by the same distance on both sides."
             ),
         )
     elif edges < 2:
@@ -170,7 +170,8 @@ def _step_check(step: StepGain, *, shown: Sequence[str], bench: Bench) -> Check:
         )
     else:
         back = "" if step.rest_shift is None else ", and it returns to its first rest"
-        outcome, found = "pass", f"shows one gain at all {edges} edges of the input{back}."
+        all_edges = "both edges" if edges == 2 else f"all {edges} edges"
+        outcome, found = "pass", f"has the same gain at {all_edges} of the input{back}."
     return Check(
         kind="step",
         run=step.experiment,

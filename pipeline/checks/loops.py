@@ -31,9 +31,9 @@ def design_margins(chain: Chain, design: FeedbackDesign) -> Margins:
     try:
         found = stability_margins(chain, design.controller(chain), sample_time=design.sample_time)
     except np.linalg.LinAlgError:
-        raise DataError("margins need a loop whose numbers lie closer together") from None
+        raise DataError("no margins: the numbers of this loop differ too much in size") from None
     if found is None:
-        raise DataError("margins need a stable loop, found one that is not")
+        raise DataError("no margins: the loop is unstable")
     return found
 
 
@@ -45,11 +45,11 @@ def verify_design(chain: Chain, design: FeedbackDesign) -> Check:
     designed loop. The other one belongs to the requested poles or, with LQR, to the loop that
     scipy's Riccati solver gives.
     """
-    asked = "the poles asked for" if design.Q is None else "the loop of scipy's Riccati solver"
+    asked = "the requested poles" if design.Q is None else "the loop of scipy's Riccati solver"
     try:
         ours, wanted, level = _loops(chain, design)
     except (np.linalg.LinAlgError, ValueError, ZeroDivisionError):
-        return _check("skip", None, "so extreme a plant cannot be verified")
+        return _check("skip", None, "not verified: the plant's numbers differ too much in size")
     value = float(np.max(np.append(np.abs(ours - wanted), abs(level - 1))).round(_LAST_DIGIT))
     if not np.isfinite(value):
         return _check("fail", None, "the designed loop has no finite polynomial: do not run it")

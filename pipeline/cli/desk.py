@@ -40,7 +40,7 @@ def desk(
     if (host is None) != (users is None):
         raise ConfigError("--host and --users need each other: others may only enter by name")
     if folder is not None and users is not None:
-        raise ConfigError("with --users, the file lists the folders: give none here")
+        raise ConfigError("with --users, the file lists the folders: do not give one here")
     collect_for_hours()
     server = DeskServer(folder=folder, port=port, host=host or "127.0.0.1", users=users)
     with Ending(say=say) as ending, server:

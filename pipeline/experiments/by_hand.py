@@ -103,7 +103,7 @@ def _count_periods(seconds: float, frequency: float) -> int:
     most = floor(_LONGEST * frequency * (1 + _ROUNDING))
     if not most:
         raise ConfigError(
-            f"frequency: expected at least {1 / _LONGEST:.2g} Hz, of which a period fits into "
+            f"frequency: expected at least {1 / _LONGEST:.2g} Hz, so that a period fits into "
             f"{_LONGEST:g} s, found {frequency:g}"
         )
     return min(ceil(seconds * frequency * (1 - _ROUNDING)), most)

@@ -66,8 +66,8 @@ def bench_scales(submission: Submission, *, bench: Description, analysis: Analys
     ):
         if scale.per_count is None and scale.unit != unit:
             raise DataError(
-                f"a loop needs to know what a count is: state system.{key}.per_count in "
-                f"{scale.unit}, the bench has it in {unit}"
+                f"a closed loop needs the size of a count: state system.{key}.per_count in "
+                f"{scale.unit} (the bench states it in {unit})"
             )
     if any(record.u is not None for record in analysis.records):
         sign = -1 if is_reversed(analysis.records) else 1
@@ -189,7 +189,7 @@ def _law(loop: StateLoop, design: FeedbackDesign | None) -> StateFeedback:
         raise DataError("there is no controller to run; `cartlab report` says why")
     if design.cart != loop.cart:
         raise DataError(
-            f"the controller is designed for cart {design.cart}, the plan has cart "
+            f"the controller is designed for cart {design.cart}, but the plan has cart "
             f"{loop.cart}: change one, or state the gains"
         )
     return StateFeedback(gains=design.gains, prefilter=design.prefilter)
@@ -217,7 +217,7 @@ class _Trial:
     ) -> Self:
         fit = analysis.fit
         if fit is None or not fit.converged:
-            raise DataError("a loop is closed on identified carts only")
+            raise DataError("a closed loop needs identified carts")
         return cls(
             recording=recording,
             chain=fit.chain,
@@ -250,7 +250,7 @@ class _Trial:
         if overshoot > most or not settling <= longest + design.sample_time:
             raise DataError(
                 f"on the bench the step would overshoot by {overshoot:.2g} % and settle in "
-                f"{settling:.2g} s, the design has {most:.2g} % and {longest:.2g} s"
+                f"{settling:.2g} s, but the design has {most:.2g} % and {longest:.2g} s"
                 f"{self._advice(goal)}"
             )
 
@@ -297,12 +297,12 @@ class _Trial:
         asked, reached = np.abs(motion.u).max(), np.abs(motion.x).max()
         if asked > self.limits.input:
             raise DataError(
-                f"the step takes an input of {asked:.3g}, the limit is "
+                f"the step needs an input of {asked:.3g}, but the limit is "
                 f"{self.limits.input:g}: make the amplitude or the gains smaller"
             )
         if reached > self.limits.travel:
             raise DataError(
-                f"the step moves a cart by {reached:.3g}, the travel limit is "
+                f"the step moves a cart by {reached:.3g}, but the travel limit is "
                 f"{self.limits.travel:g}: make the amplitude smaller"
             )
         return motion.t, motion.x

@@ -31,7 +31,7 @@ from pipeline.workflow import analyse
 
 _ALONE = 4  # number of planned recordings whose own benefit is listed
 STATISTICAL = (
-    f"that counts the noise alone: no bench is calibrated better than to {100 * CALIBRATION:g} %"
+    f"these errors count noise alone: no bench is calibrated to better than {100 * CALIBRATION:g} %"
 )
 
 
@@ -89,7 +89,7 @@ class NextPlan:
         alone = [f"{name} alone ± {_percent(error)}" for name, error in self.planned.items()]
         notes = (
             ", ".join(steps),
-            f"of the plan so far, {first_few(alone, _ALONE)}" if alone else "",
+            f"recordings of the plan so far: {first_few(alone, _ALONE)}" if alone else "",
             STATISTICAL if self.errors[-1] < CALIBRATION else "",
             self.doubt,
         )
@@ -140,7 +140,7 @@ def plan_next(
     wrote = f"{path}: {count(n, 'recording')} added"
     if new and old.recordings:
         usual = count(len(old.recordings), "recording")
-        wrote = f"wrote {path}: the {usual} that a bench begins with, and {n} chosen beside"
+        wrote = f"wrote {path}: the {usual} that every plan begins with, and {n} chosen ones"
     return replace(found, plan=plan, recordings=plan.recordings[-n:], wrote=wrote)
 
 
@@ -150,7 +150,7 @@ def _doubt(analysis: Analysis, folder: Path) -> str:
     if fit is None or fit.explains_data:
         return ""
     return (
-        f"the linear carts leave more than the noise (χ² per degree of freedom "
+        f"the linear carts leave a residual above the noise (χ² per degree of freedom "
         f"{fit.chi_square_per_dof:.3g}), so parameters may be off by more than these errors; "
         f"`cartlab gap {folder}` looks for the missing effect"
     )
@@ -221,7 +221,7 @@ def why_useless(recording: Recording, known: Knowledge, *, limits: PlanLimits) -
     if recording.kind not in kinds:
         used = "dwells" if known.dwells else "steps and sweeps"
         what = "dwell" if recording.kind == "sine" else recording.kind.replace("_", " ")
-        return f"the carts are identified from {used} here, and this is a {what}"
+        return f"the carts are identified from {used} here, but this is a {what}"
     if len(recording.carts) < known.chain.n:
         return "the carts are identified from records with all of them free"
     most = known.at_its_limits(recording, limits=limits, share=1.0)
@@ -247,8 +247,8 @@ def _decisive(submission: Submission, limits: PlanLimits) -> tuple[Recording, fl
         found = read_gap(text)
         if found.proposal is None:
             raise DataError(
-                "--for gap: gap/gap.json proposes no recording: there is nothing that one would "
-                f'decide (its verdict is "{found.verdict}")'
+                "--for gap: gap/gap.json proposes no recording, because there is nothing to decide "
+                f'(its verdict is "{found.verdict}")'
             )
         recording = Recording.model_validate_json(json.dumps(found.proposal.recording))
     except (ConfigError, ValidationError):

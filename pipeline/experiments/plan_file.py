@@ -210,19 +210,19 @@ def recording_problems(
         yield "release", f"expected a cart that is free, found {recording.release}"
     yield from _time_problems(recording)
     if recording.duration > LONGEST_RUN:
-        yield "cycles", f"the run takes {recording.duration:,.0f} s, at most {LONGEST_RUN:g} s do"
+        yield "cycles", f"the run takes {recording.duration:,.0f} s; the limit is {LONGEST_RUN:g} s"
     yield from _amplitude_problems(recording, limits, system)
     if (recording.kind == "sine") != (wave == "sine"):
         yield "wave", f'a dwell of kind "sine" and the wave "sine" go together, found {wave!r}'
     if wave != "chirp" and recording.frequency_end is not None:
         yield "frequency_end", "belongs to a chirp"
     if wave == "chirp" and recording.frequency_end in (None, recording.frequency):
-        yield "frequency_end", "a chirp needs another frequency to end at than it starts at"
+        yield "frequency_end", "a chirp must end at a different frequency from the one it starts at"
     if (wave == "multisine") != bool(recording.tones) or len(recording.tones) > MOST_TONES:
         found = len(recording.tones)
         yield "tones", f"expected 1 to {MOST_TONES} for a multisine, else none, found {found}"
     elif recording.tones and _peak(recording) > 1.01:  # the true peak may lie between the points
-        yield "tones", f"their sum reaches {_peak(recording):.3g} times `amplitude`, at most 1 does"
+        yield "tones", f"their sum reaches {_peak(recording):.3g} times `amplitude`; 1 is the limit"
     yield from _loop_problems(recording, n)
 
 
@@ -258,7 +258,7 @@ def _amplitude_problems(
     if abs(size) > limit:
         yield "amplitude", f"expected at most the limit of {limit:g} {unit}, found {size:g}"
     if size == 0 and recording.release is None:
-        yield "amplitude", "0 moves nothing; a decay that a hand starts needs `release`"
+        yield "amplitude", "0 moves nothing; a decay started by hand needs `release`"
     if size != 0 and 1 not in recording.carts:
         yield "amplitude", "the motor drives cart 1, which is held: expected 0"
 
@@ -272,8 +272,8 @@ def _loop_problems(recording: Recording, n: int) -> Iterator[tuple[str, str]]:
         if len(loop.gains) not in (0, 2 * n):
             yield "controller.gains", f"expected {2 * n} gains or none, found {len(loop.gains)}"
         if bool(loop.gains) != (loop.prefilter is not None):
-            yield "controller", "gains and prefilter come together, or both from the design"
+            yield "controller", "state both gains and prefilter, or neither to use the design"
     if loop is not None and not 1 <= loop.cart <= n:
         yield "controller.cart", f"there is no cart {loop.cart}, the system has {n}"
     if closed and recording.carts != tuple(range(1, n + 1)):
-        yield "carts", "a loop is closed with all carts free"
+        yield "carts", "a closed loop needs all carts free"

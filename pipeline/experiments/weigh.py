@@ -11,8 +11,8 @@ from pipeline.results import Analysis
 # The fit treats the error of each sample as independent, but for a cart that hardly moves the
 # rounding error is the same in many samples.
 _WHY_WORSE = (
-    "the fit would be worse: while carts rest, or move by few counts, the rounding errors of their "
-    "encoders do not average out; try a larger motion, or a shorter run"
+    "the fit would be worse: the rounding errors of encoders do not average out while carts rest, "
+    "or move by few counts; try a larger motion, or a shorter run"
 )
 
 

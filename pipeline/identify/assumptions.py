@@ -48,10 +48,12 @@ def _springs(
         std = fit.std.get(name) if fit and value is not None else None
         support: Support = "open"
         if fit is None or not fit.converged:
-            reason = "no carts were identified that tell it"
+            reason = "no carts were identified"
         elif not present:
             support = "supported" if fit.explains_data else "open"
-            explains = "explains the data" if fit.explains_data else "does not fit to the noise"
+            explains = (
+                "explains the data" if fit.explains_data else "leaves a residual above the noise"
+            )
             reason = f"the fit without it {explains}"
         elif name in vanishing:
             support = "contradicted"
@@ -120,7 +122,7 @@ def _scales(submission: Submission, records: Sequence[Record]) -> Iterator[Assum
                 origin="stated" if stated else "default",
                 support="open",
                 experiments=tuple(used),
-                reason="no recording tells what a count is",
+                reason="no recording shows the size of a count",
             )
 
 
@@ -138,10 +140,10 @@ def _sign(system: System, data: Ingested, *, failed: Sequence[Check]) -> Iterato
     if wrong:
         support, reason = "contradicted", wrong
     elif told:
-        but = f", but {abridge(others)} {'count' if others[1:] else 'counts'} the other way"
-        support, reason = "supported", f"{abridge(told)} tell it{but if others else ''}"
+        but = f"; the opposite sign: {abridge(others)}"
+        support, reason = "supported", f"shown by {abridge(told)}{but if others else ''}"
     else:
-        reason = "no recording tells it"
+        reason = "no recording shows it"
     yield Assumption(
         key="system.input.sign",
         value=float(sign),
@@ -169,13 +171,13 @@ def _free_carts(
         if contrary := [name for name in names if name in wrong]:
             support, reason = "contradicted", f"in {abridge(contrary)} another cart moves"
         elif still:
-            reason = f"in {abridge(still)} a cart said to be free stands still"
+            reason = f"in {abridge(still)} a cart stated as free does not move"
         elif unseen:
             what = "a held cart" if held else "a cart"
             reason = f"in {abridge(unseen)} {what} was not measured"
         else:
             support = "supported"
-            reason = "the held carts move little or not" if held else "all carts move"
+            reason = "the held carts hardly move" if held else "all carts move"
         yield Assumption(
             key="experiments.carts",
             value=free,

@@ -94,9 +94,9 @@ def identify(
     sines = _sine_points(used, log=log)
     # A note is dropped if a check of the same decay or step says the same in full.
     notes = [
-        *((f"{d.name}, cart {d.cart}", d.note) for d in decays if not _sticks(d)),
-        *((f"{g.experiment}, cart {g.cart}", g.note) for g in gains if not g.interval),
-        *((f"{p.experiment}, cart {p.cart}", p.note) for p in sines),
+        *((f"{d.name} (cart {d.cart})", d.note) for d in decays if not _sticks(d)),
+        *((f"{g.experiment} (cart {g.cart})", g.note) for g in gains if not g.interval),
+        *((f"{p.experiment} (cart {p.cart})", p.note) for p in sines),
     ]
     log.warn(by_note(notes))
     progress("frequency response")

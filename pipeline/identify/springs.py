@@ -98,7 +98,7 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
     every = (True,) * (n + 1)
     steps = [r for r in records if r.kind == "step" and len(r.free) == len(r.carts) == n]
     if not steps:
-        return Springs(present=every, why="no step of all carts", open=(1, n + 1))
+        return Springs(present=every, why="there is no step with all carts free", open=(1, n + 1))
     if all(map(_stays_away, steps)):
         inside = (False, *every[1:-1], False)
         return Springs(present=inside, why="no cart comes back after a step", open=())
@@ -106,14 +106,18 @@ def decide_springs(records: Sequence[Record], *, n: int) -> Springs:
     if not any(gains):
         return Springs(present=every, why="no cart settles after a step", open=(1, n + 1))
     if n == 1:
-        return Springs(present=every, why="a step is held; only their sum can be known", open=())
+        return Springs(
+            present=every,
+            why="the cart stays displaced under a step; only the sum of the springs can be known",
+            open=(),
+        )
     ratios = [_ratio(*one[-2:]) for one in gains if one]
     low, high = np.median(ratios, axis=0)
     if low > NEGLIGIBLE:
-        return Springs(present=every, why="static gains cannot tell", open=(1,))
+        return Springs(present=every, why="static gains do not show it", open=(1,))
     # On a bench, a spring is at least a tenth as stiff as the one before it.
     if high < 0.1:
-        why = "static gains are equal, so none at the far wall"
+        why = "static gains are equal, so no spring ties the last cart to the wall"
         return Springs(present=(*every[:-1], False), why=why, open=())
     return Springs(present=every, why="static gains are too uncertain", open=(1, n + 1))
 

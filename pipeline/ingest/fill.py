@@ -256,7 +256,7 @@ class _Filling:
             if posix(str(table["file"])) == found.file:
                 return self._complete(table, found, found.inspection)
         if (same := self._same(found.file)) is not None:
-            told = f"is a copy of {same}, whose entry stands for both"
+            told = f"is a copy of {same}; one entry is enough"
             return replace(found, state="copy", remarks=(told,))
         if found.kind is None:
             self._say_unknown(found)

@@ -198,7 +198,7 @@ def _name_them(told: Roles) -> str:
     said = "the columns have no names: state their roles in submission.toml"
     line = ", ".join(f"{role} = {number}" for role, number in told.columns.items())
     if line and not told.doubts:
-        return f"the columns have no names; what they do says columns = {{ {line} }}"
+        return f"the columns have no names; their signals suggest columns = {{ {line} }}"
     if line:
         return f"{said}, perhaps columns = {{ {line} }}: {'; '.join(told.doubts)}"
     return (

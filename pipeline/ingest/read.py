@@ -383,6 +383,6 @@ def _reference(opened: _Opened, keep: slice) -> Array | None:
         and holds_counts(table, column)
         and mirrors(values, table.values[first.index])
     ):
-        opened.notes.append(f"{column.name!r} only mirrors {first.name!r} and is no reference")
+        opened.notes.append(f"{column.name!r} only copies {first.name!r}, so it is not a reference")
         return None
     return values[keep] * _position_scale(opened, column)

@@ -263,8 +263,8 @@ def _read_model(path: Path) -> SimulatedBench:
         document = json.loads(read_text(path, where=where, limit=10_000_000, error=ConfigError))
     except json.JSONDecodeError as error:
         raise ConfigError(
-            f"{where}: no JSON from line {error.lineno}, character {error.colno} on: give a file "
-            "as `cartlab gap` writes it, gap.json, whole"
+            f"{where}: not valid JSON from line {error.lineno}, character {error.colno}: give a "
+            "complete gap.json, as `cartlab gap` writes it"
         ) from None
     except (RecursionError, ValueError):
         raise ConfigError(f"{where}: not the JSON of a gap.json") from None

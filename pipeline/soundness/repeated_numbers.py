@@ -249,18 +249,15 @@ def _check(
     if undecided:
         outcome, said = (
             "fail",
-            (
-                f"contradict each other, {apart}, and nothing shows which is right: "
-                "none of them is used"
-            ),
+            (f"contradict each other, {apart}, and nothing shows which is right: no run is used"),
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
         outcome, said = "fail", f"contradict each other, {apart}. {runs} is left out"
     elif np.any(_contradictions(readings)):
-        outcome, said = "fail", f"lie {apart}, by the size of the step, as if a cart sticks"
+        outcome, said = "fail", f"range {apart}, depending on the step's size, as if a cart sticks"
     elif spread > readings[0].tolerance:
-        outcome, said = "skip", f"lie {apart}, no further apart than their errors"
+        outcome, said = "skip", f"range {apart}, no further apart than their standard errors"
     else:
         outcome, said = "pass", f"agree within {spread:.2g} %"
     return Check(

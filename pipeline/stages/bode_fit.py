@@ -183,7 +183,7 @@ def _solve(P: Parametrisation, data: Points, theta: Array, scale: Scale) -> _Fit
     # A bad step may overflow; `least_squares` then takes a shorter one.
     with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
         if not np.isfinite(np.sum(evaluate(theta)[0] ** 2)):
-            raise DataError("Bode fit: no chain comes near responses as far apart as these")
+            raise DataError("Bode fit: no chain comes near these responses; they differ too much")
         solution = minimise(
             evaluate,
             theta,
@@ -230,7 +230,7 @@ def _fit_phases(fitted: _Fitted, data: Points) -> tuple[_Fitted, str]:
     # because the fit does not predict phases then.
     limit = 3.0 * max(1.0, fitted.chi_square_per_dof**0.5)
     if fitted.dof > 0 and _phase_misfit(fitted, data) > limit:
-        return fitted, "magnitudes alone: the phases do not agree with them"
+        return fitted, "only magnitudes are fitted: the phases do not agree with them"
     return _solve(fitted.parametrisation, data, fitted.theta, "polar"), ""
 
 
@@ -341,8 +341,8 @@ def _result(
     told = [f"c_{cart}" for cart in data.decays]
     if told:
         remarks.append(
-            "the response has too few points to tell the damping and puts it at zero, its bound: "
-            f"the damping ratio of the decays is fitted along ({', '.join(told)})"
+            "the points of the response alone give zero, the bound, for a damping; so the damping "
+            f"ratio of the decays is part of the fit ({', '.join(told)})"
         )
     parameters = named_estimates(chain, names=names, covariance=covariance, source="bode_fit")
     for cart in data.decays:
@@ -350,8 +350,8 @@ def _result(
         parameters[name] = replace(parameters[name], source=data.decays[cart].source)
     if share > 0:
         remarks.append(
-            f"the points lie {100 * share:.2g} % off the model, beyond their errors: "
-            "the standard errors allow for it"
+            f"the points are {100 * share:.2g} % off the model, more than their errors; the "
+            "standard errors of the parameters include this"
         )
     if not fitted.converged:
         remarks.append(f"not converged after {_EVALUATIONS} evaluations")

@@ -153,8 +153,8 @@ def response_from_records(records: Sequence[Record]) -> tuple[FrequencyResponse,
             responses.append(replace(response, experiments=measured))
     if not responses:
         raise DataError(
-            "frequency response: at no frequency does the motion in "
-            f"{', '.join(run.id for run in runs)} stand out of its noise"
+            f"frequency response: the motion in {', '.join(run.id for run in runs)} is not above "
+            "its noise at any frequency"
         )
     return tuple(responses)
 

@@ -109,7 +109,7 @@ def _open(run: MeasuredRun) -> _Simulated:
     note = (
         f"the logged input explains the motion only if multiplied by {scale:.3g}, as done here: "
         f"the difference over all carts falls from {100 * as_logged:.0f} % to {100 * scaled:.0f} % "
-        "(input or positions of this run are in another unit, or of another sign, than stated)"
+        "(the unit or sign of this run's input or positions is not the stated one)"
     )
     return _Simulated(
         y=unforced + scale * forced,

@@ -207,18 +207,18 @@ def _note(record: Record, decay: FreeDecay, *, zeta: float, n_peaks: int) -> str
     notes = []
     level = decay.stretch.level
     if level and record.u is not None and abs(level) > 0.02 * float(np.max(np.abs(record.u))):
-        notes.append(f"the cart swings about its new rest point while the input holds {level:.4g}")
+        notes.append(f"the cart oscillates about its new rest point, at an input of {level:.4g}")
     if n_peaks < _PEAKS_FOR_REGRESSION:
         notes.append(
-            f"{n_peaks} turning points are too few for a logarithmic decrement of their own: it is "
-            "that of the exponential fit"
+            f"{n_peaks} turning points are too few for a logarithmic decrement; the value is that "
+            "of the exponential fit"
         )
     test = decay.friction.test if decay.friction else None
     if test and test.present:
         notes.append(
-            "the decay is not exponential: dry friction, which stops the cart within "
-            f"{test.drop:.3g} of its rest point. Viscous damping alone would be zeta = "
-            f"{test.zeta:.3g}; the {zeta:.3g} fitted without it holds for these amplitudes only"
+            "the decay is not exponential: dry friction stops the cart within "
+            f"{test.drop:.3g} of its rest point. Without the friction, zeta would be "
+            f"{test.zeta:.3g}; the fitted {zeta:.3g} holds for these amplitudes only"
         )
     # Worth a note if the damping of large amplitudes is larger by 5 %.
     elif test and test.f_statistic > test.threshold and test.zeta > 1.05 * zeta:

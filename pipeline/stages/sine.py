@@ -361,7 +361,7 @@ def _frequency(t: Array, u: Array, *, stated: float | None) -> tuple[float, str]
         return stated, ""
     return fitted, (
         f"the input oscillates at {fitted / (2 * np.pi):.4g} Hz, not at the "
-        f"{stated / (2 * np.pi):.4g} Hz stated; the former is used"
+        f"stated {stated / (2 * np.pi):.4g} Hz; the frequency of the input is used"
     )
 
 
@@ -389,11 +389,11 @@ def _windows(t: Array, *, omega: float) -> list[tuple[int, int]]:
 def _note_small(amplitude: float, *, step: float) -> str:
     if step == 0 or amplitude >= FEW_COUNTS * step:
         return ""
-    return f"the amplitude is {amplitude / step:.1f} encoder counts only"
+    return f"the amplitude is only {amplitude / step:.1f} encoder counts"
 
 
 def _note_off_sine(fit: _Sine, *, floor: float) -> str:
     # A residual below 1 % of the amplitude is good.
     if fit.rms <= max(2 * floor, 0.01 * abs(fit.z)):
         return ""
-    return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not a sine of this frequency"
+    return f"{100 * fit.rms / abs(fit.z):.1f} % of the motion is not at the drive frequency"

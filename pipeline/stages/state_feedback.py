@@ -322,19 +322,19 @@ def _message(plant: SampledPlant, goal: _Goal, design: FeedbackDesign) -> str:
     if not design.reachable and abs(goal.reference) > held:
         said.append(
             f"an input of ±{goal.limit:.3g} cannot hold cart {plant.cart} at "
-            f"{goal.reference:.3g}: reachable is {held:.3g}"
+            f"{goal.reference:.3g}; it reaches at most {held:.3g}"
         )
     elif not design.reachable:
         settling = design.settling_time
-        settles = "no settling" if settling is None else f"settling in {settling:.3g} s"
+        settles = "does not settle" if settling is None else f"settles in {settling:.3g} s"
         said.append(
-            f"{goal} cannot be met: reachable is overshoot {design.overshoot_percent:.2g} % and "
-            f"{settles} with an input of {design.peak_input:.3g}"
+            f"{goal} cannot be met: the best design overshoots by {design.overshoot_percent:.2g} % "
+            f"and {settles}, with an input of {design.peak_input:.3g}"
         )
     if not plant.stays_stable(design.gains):
         said.append(
-            f"the loop may be unstable where masses or springs are {100 * MASS_SPRING_ERROR:g} % "
-            f"or dampings {100 * DAMPING_ERROR:g} % off"
+            f"the loop may be unstable if masses or springs are off by {100 * MASS_SPRING_ERROR:g} "
+            f"%, or dampings by {100 * DAMPING_ERROR:g} %"
         )
     error = float(level_error_percent(plant.chain, design.gains, cart=plant.cart))
     if error > 5.0:

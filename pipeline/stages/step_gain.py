@@ -81,12 +81,12 @@ def fit_step_gain(record: Record, *, cart: int) -> StepGain:
         found = [_settle(record, y, part, size=size, step=step) for part in parts]
     found, notes = _with_unseen_start(t, y, found, size=size, step=step)
     if drift:
-        notes.append(f"a drift of {drift:.3g} per second is taken out")
+        notes.append(f"a drift of {drift:.3g} per second was removed")
     edges = _edges(t, found)
     if not edges:
         raise DataError(
-            f"{record.id}: step gain needs a step on whose two sides cart {cart} settles, found "
-            f"{len(found) - 1} edges, but none with both"
+            f"{record.id}: step gain needs an edge before and after which cart {cart} settles, "
+            "found no such edge"
         )
     moving = [edge for edge in edges if abs(edge.level_after - edge.level_before) > _MOVED * size]
     if not moving:
@@ -343,14 +343,16 @@ def _notes(
 ) -> list[str]:
     notes = []
     if shift is not None:
-        notes.append(f"the rest point did not return by {shift:.3g}: the cart sticks")
+        notes.append(
+            f"the cart came back to rest {abs(shift):.3g} away from where it began: it sticks"
+        )
     notes += [
         f"at the edge to {edge.u_after:.3g} the cart did not move: it sticks"
         for edge in edges
         if edge not in moving
     ]
     if any(p.level and p.level.extrapolated for p in found):
-        notes.append("still ringing where a level ends: it is that of damped sinusoids fitted")
+        notes.append("the cart still oscillates where a level ends: a fitted oscillation gives it")
     if any(p.level is None for p in found):
-        notes.append("where the cart never settles, the edge is left out")
+        notes.append("edges after which the cart never settles are left out")
     return notes

@@ -66,13 +66,13 @@ def fit_records(records: Sequence[Record], *, bench: Bench, start: Chain | None 
         attempt = descend(windows, parametrisation, theta, tolerance=_TOLERANCE)
         covariance = _covariance(attempt)
     if not explained:
-        remarks.insert(0, "no chain follows the records")
+        remarks.insert(0, "no chain reproduces the recordings")
     elif found.cut_short:
         remarks.insert(
-            0, f"the search was ended after {found.n_starts} starts: another may do better"
+            0, f"the search ended after {found.n_starts} starts; more might find a better fit"
         )
     elif not attempt.converged:
-        remarks.insert(0, "the search did not settle")
+        remarks.insert(0, "the search did not converge")
     return _result(attempt, explained=explained, n_starts=found.n_starts, remarks=remarks)
 
 

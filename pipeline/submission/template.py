@@ -12,8 +12,8 @@ from pipeline.submission.models import MOST_CARTS
 _NOTES = """\
 <!-- What you write here becomes the discussion of the report (Markdown). Comments like this do not.
 
-     `cartlab report` asks what your data raise, say about zeta_b. Answer under a heading with that
-     name; the report shows the answer below the question:
+     `cartlab report` asks the questions that your data raise, for example about zeta_b. Answer
+     under a heading with that name; the report shows the answer below the question:
 
      ## zeta_b
      The decay saw …

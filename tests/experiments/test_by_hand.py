@@ -53,7 +53,7 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
         (
             "sweep",
             {"amplitude": 0.1, "frequency": 1.0, "frequency_end": 1.0},
-            "to: a chirp needs another",
+            "to: a chirp must end at a different",
         ),
         ("decay", {"cart": 1, "seconds": 1e-320}, "seconds: expected 1 to 120 s"),
         ("decay", {"cart": 1, "seconds": 121.0}, "seconds: .* found 121"),

@@ -203,12 +203,12 @@ def test_what_the_submission_states_wins_over_what_the_bench_says(identified):
     [
         (PidLoop(kp=0.1, kd=20.0), LIMITS, 1.0, "the loop is unstable"),
         (PidLoop(kp=0.01, kd=-0.05), LIMITS, 1.0, "the loop is unstable"),
-        (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "takes an input of"),
-        (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "takes an input of .* is 0.01"),
+        (PidLoop(kp=3.0, kd=0.02), PlanLimits(input=0.1, travel=2.5), 1.0, "needs an input of"),
+        (StateLoop(), PlanLimits(input=0.01, travel=2.5), 1.0, "needs an input of .* is 0.01"),
         (StateLoop(), PlanLimits(input=0.5, travel=0.9), 1.0, "moves a cart by 1.* travel limit"),
-        (StateLoop(), LIMITS, 40.0, "(moves a cart|takes an input|would overshoot)"),
+        (StateLoop(), LIMITS, 40.0, "(moves a cart|needs an input|would overshoot)"),
         (StateLoop(gains=(0.0, -1.0), prefilter=1.0), LIMITS, 1.0, "unstable"),
-        (StateLoop(cart=2), LIMITS, 1.0, "designed for cart 1, the plan has cart 2"),
+        (StateLoop(cart=2), LIMITS, 1.0, "designed for cart 1, but the plan has cart 2"),
     ],
 )
 def test_a_loop_that_would_do_harm_is_refused(loop, limits, amplitude, message):
@@ -297,5 +297,5 @@ def test_a_scale_that_nobody_states_is_asked_for(identified):
 def test_without_a_model_no_loop_is_closed(identified):
     """Without identified carts there are no gains."""
     submission, analysis = identified
-    with pytest.raises(DataError, match="identified carts only"):
+    with pytest.raises(DataError, match="needs identified carts"):
         gains_of((submission, replace(analysis, fit=None)), StateLoop())

@@ -256,7 +256,7 @@ def test_what_makes_the_fit_know_worse_says_so(analysis):
     ("change", "words"),
     [
         ({"kind": "decay", "wave": "delta", "amplitude": 0.0, "release": 1}, "this is a decay"),
-        ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, and this is a dwell"),
+        ({"kind": "sine", "wave": "sine"}, "from steps and sweeps here, but this is a dwell"),
         ({"carts": (1,)}, "all of them free"),
         ({"amplitude": 0.5}, "stopped at the travel limit: an amplitude up to"),
     ],
@@ -407,7 +407,7 @@ def test_what_is_written_is_counted(work):
     """Including the recordings that every bench begins with, if there was no plan."""
     done = cartlab_here("plan", work, "--next", 2, "--for", "zeta")
     usual = len(propose_plan(load_submission(work)).recordings)
-    assert f"the {usual} recordings that a bench begins with, and 2 chosen beside" in done.stderr
+    assert f"the {usual} recordings that every plan begins with, and 2 chosen ones" in done.stderr
     done = cartlab_here("plan", work, "--next", 1, "--for", "zeta")
     assert "plan.toml: 1 recording added" in done.stderr
     assert ", 1 new (+); " in done.stdout

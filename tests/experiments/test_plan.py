@@ -395,7 +395,7 @@ def with_run(**changes) -> str:
         (with_run(more="cycles = 61"), r"cycles .*takes 610 s"),
         (with_run(more="release = 3"), r"release .*a cart that is free, found 3"),
         (with_run(wave="sine"), r"wave .*go together"),
-        (with_run(wave="chirp"), r"frequency_end .*another frequency"),
+        (with_run(wave="chirp"), r"frequency_end .*a different frequency"),
         (with_run(more="frequency_end = 9"), r"frequency_end .*belongs to a chirp"),
         (with_run(more='controller = {type = "pid", kp = 1}'), "controller .*belongs to a closed"),
         (with_run(**LOOP), "controller .*a closed loop needs one"),
@@ -414,7 +414,7 @@ def with_run(**changes) -> str:
         ),
         (
             with_run(**LOOP, more='controller = {type = "state_feedback", prefilter = 1.0}'),
-            r"gains and prefilter come together",
+            r"state both gains and prefilter",
         ),
         (
             with_run(**LOOP, more='controller = {type = "state_feedback", cart = 3}'),

@@ -158,7 +158,7 @@ def test_columns_without_names_get_a_line_to_use(tmp_path):
     scipy.io.savemat(tmp_path / "a.mat", {"data": matrix})
     got = inspect_file(tmp_path / "a.mat")
     (said,) = [problem for problem in got.problems if "no names" in problem]
-    assert said.endswith("says columns = { time = 2, input = 6, x1 = 4, x2 = 5 }")
+    assert said.endswith("suggest columns = { time = 2, input = 6, x1 = 4, x2 = 5 }")
     assert [column.name for column in got.columns] == ["1", "2", "3", "4", "5", "6"]
     assert "-0 " not in format_inspection(got)
     assert not format_inspection(got).endswith("-0")

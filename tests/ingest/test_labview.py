@@ -117,8 +117,8 @@ BAD_LVM = {
         GOOD + "\r\n" + lvm_segment({"time": TIME + 1, "x1": X1}), r"line 66: other channels",
     ),
     "two clocks": (multi(TIME + 0.001), r"line 18: the channels were sampled at different times"),
-    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X differently for each"),
-    "no interval": (no_times(Delta_X=["a", "b"]), r"states Delta_X 'a, b', which is no number"),
+    "two intervals": (no_times(Delta_X=["0.1", "0.2"]), r"states Delta_X, but channels differ"),
+    "no interval": (no_times(Delta_X=["a", "b"]), r"states Delta_X 'a, b', which is not a number"),
     "no number": (GOOD.replace("0.030000", "0.03x"), r"line 22: 'time' is not a number: '0.03x'"),
     "a gap": (GOOD.replace("\r\n0.030000\t", "\r\n0.030000\t\t"), r"line 22: 'input' is empty"),
     "text between": (GOOD.replace("\r\n0.03", "\r\nhere\r\n0.03"), r"line 22: expected 3 columns"),
@@ -127,7 +127,7 @@ BAD_LVM = {
         HEAD + "***Start_Special***\r\n" + GOOD[len(HEAD) :], r"line 13: the special block",
     ),
     "no rows": (GOOD[: GOOD.index("0.000000\t")], r"holds no rows of numbers"),
-    "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), r"ends behind the header"),
+    "no names": (GOOD[: GOOD.index("X_Value")].rstrip("\r\n"), r"ends after the header"),
     "unknown X": (GOOD.replace("X_Columns\tOne", "X_Columns\tTwo"), r"X_Columns is 'two'"),
     "infinite": (GOOD.replace("0.030000", "inf"), r"line 22: 'time' is not a finite number"),
     "name twice": (GOOD.replace("\tinput\t", "\tx1\t"), r"the heading 'x1' appears twice"),
@@ -243,7 +243,7 @@ BAD_TDMS = {
     "negative data": (lead_in(14, 50, 2**63) + bytes(50), r"too many pieces|broken"),
     "fewer values than bytes": (GOOD_TDMS.replace(COUNT, struct.pack("<Q", 33)), r"damaged"),
     "a million objects": (
-        lead_in(6, 8, 8) + struct.pack("<II", 10**6, 0), r"in too many pieces",
+        lead_in(6, 8, 8) + struct.pack("<II", 10**6, 0), r"too many pieces",
     ),
     "objects times segments": (
         lead_in(6, len(MANY), len(MANY)) + MANY + lead_in(0, 0, 0) * 9_000, r"too many pieces",

@@ -378,7 +378,7 @@ def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
     copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
     record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
     assert record.reference is None
-    assert any("only mirrors 'Encoder 1 Pos'" in note for note in record.notes)
+    assert any("only copies 'Encoder 1 Pos'" in note for note in record.notes)
 
 
 def test_a_stated_reference_goes_before_the_file(tmp_path):
@@ -407,7 +407,7 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
     (check,) = check_signs(data.signs, without=())
     assert (check.id, check.outcome, check.value) == ("input.sign", "fail", 1.0)
     assert "sign = -1 of the input contradicts" in check.message
-    assert "set sign = 1 there" in check.message
+    assert "Set sign = 1 there" in check.message
     own = STEP + "\ninput = { sign = 1, per_count = 2.0 }"
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', own, content)
     assert_array_equal(data.records[0].u, 2 * U)
@@ -424,7 +424,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
     signs = read_data(load_submission(tmp_path)).signs
     (check,) = check_signs(signs, without=())
     assert check.value == 2.0
-    assert "one, two (2 of the 3 that show a sign): set sign = -1 there" in check.message
+    assert "one, two (2 of the 3 that show a sign). Set sign = -1 there" in check.message
 
 
 def test_signs_may_differ_between_experiments(tmp_path):

@@ -125,7 +125,7 @@ def test_what_is_not_read_is_said():
     assert got.place(0) == "row 8"
     (said,) = table(sheet(typed)).notes
     assert said == (
-        "80 numbers that are kept as text were read; the comma in '0,00' is taken as a decimal mark"
+        "80 numbers that are stored as text were read; the comma in '0,00' is taken as a decimal mark"
     )
 
 
@@ -180,7 +180,7 @@ def test_percent_is_read_as_kept_and_said():
 
     got = table(sheet(fill))
     assert_array_equal(got.values[1], U)
-    assert got.notes == ("'input' is shown in percent, but read as it is kept: 50 % as 0.5",)
+    assert got.notes == ("'input' is shown in percent, but its stored value is used: 0.5 for 50 %",)
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ BOMBS = {
             b'<Relationships><Relationship Id="a" Type="x/officeDocument" '
             b'Target="word/document.xml"/></Relationships>'
         )}),
-        r"no Excel workbook",
+        r"not an Excel workbook",
     ),
     "bits": (package(b"\xff\xfe\0\0"), r"broken, cut short"),
 }  # fmt: skip

@@ -395,7 +395,7 @@ def test_carts_of_a_step_are_told_apart_without_colour():
     marks = {str(line.get_label()): line.get_marker() for line in lines}
     assert [marks[name] for name in ("x₁", "x₂", "x₃")] == [mark for _, _, mark, _ in CARTS[:3]]
     (picture,) = (b for b in step_blocks(Page(analysis)) if isinstance(b, Picture))
-    assert "Cart 1 circles, cart 2 squares, cart 3 triangles;" in plain(picture.caption)
+    assert "Circles: cart 1. Squares: cart 2. Triangles: cart 3." in plain(picture.caption)
 
 
 @pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])

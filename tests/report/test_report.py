@@ -610,7 +610,7 @@ def test_a_good_result_is_called_so():
     points = tuple(replace(point, settled=True) for point in analysis.sine_points)
     good = replace(analysis, rows=rows, checks=checks, sine_points=points, skipped=(), warnings=())
     text = terminal_summary(good)
-    assert "all 3 parameters estimated in two ways." in text
+    assert "all 3 parameters that were estimated in two ways." in text
     assert text.count("statistical error") == 1
     assert "Nothing stands out" in text
     assert good.feedback is not None

@@ -47,7 +47,10 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
     assert "identified from 5 steps" in text
     assert "The initial estimates come from the same recordings" in text
     assert [row.independent for row in analysis.rows] == [False] * 3
-    assert "all 3 parameters estimated in two ways. Both estimates use the same recordings" in text
+    assert (
+        "all 3 parameters that were estimated in two ways. Both estimates use the same recordings"
+        in text
+    )
     assert "shows in the ringing of cart 1 after a step (step-1, step-3 and step-4)" in text
     assert "decays of" not in text
     assert not any("the decay of cart" in check.message for check in analysis.checks)

@@ -252,7 +252,7 @@ def test_a_record_of_nothing_but_noise_is_refused():
     """If no frequency stands out, there is no response to report."""
     t = np.arange(0, 5, 0.01)
     still = record(PRESETS["throne-1dof"], t, 1e-7 * pulse(t + 0.4), noise=COUNT_NOISE)
-    with pytest.raises(DataError, match="step-0 stand out of its noise"):
+    with pytest.raises(DataError, match="step-0 is not above its noise"):
         response_from_records([still])
 
 

@@ -154,7 +154,7 @@ def test_a_frequency_that_the_input_contradicts_is_not_believed():
     got = fit_sine(replace(run, omega=2 * np.pi * 3.0 * 1.01), cart=1)
     assert_allclose(got.omega, 2 * np.pi * 3.0, rtol=1e-6)
     assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
-    assert "3.03 Hz stated" in got.note
+    assert "stated 3.03 Hz" in got.note
 
 
 def test_a_noisy_input_leaves_the_stated_frequency():

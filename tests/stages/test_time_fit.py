@@ -309,7 +309,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
     assert record.u is not None
     fit = fit_records([replace(record, u=-record.u)], bench=Bench(springs=(True, True)))
     assert not fit.converged
-    assert "no chain follows the records" in fit.message
+    assert "no chain reproduces the recordings" in fit.message
 
 
 def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():

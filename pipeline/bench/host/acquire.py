@@ -129,8 +129,8 @@ class _Acquisition:
             )
         if not line.knows("k"):
             self._observer.remark(
-                f"the bench {bench.name!r} has no watchdog: if this program or the cable dies in "
-                "a run, the motor runs on; keep a hand on its switch"
+                f"the bench {bench.name!r} has no watchdog: if this program stops or the cable "
+                "fails in a run, the motor runs on; keep a hand on its switch"
             )
         for sentence in (*cart_remarks(submission, bench), *scale_remarks(submission, bench)):
             self._observer.remark(sentence)
@@ -199,8 +199,8 @@ class _Acquisition:
                 else "pull the cart out less far"
             )
             self._observer.remark(
-                f"{name} is not tried again now; if a limit was passed, {less}, or raise the limit "
-                "in plan.toml if the bench has the room"
+                f"{name} is not tried again now. If a limit was passed, {less}; or, if the bench "
+                "has room for it, raise the limit in plan.toml"
             )
             return "skip"
         wish = self._buttons.pressed or self._answer(run)

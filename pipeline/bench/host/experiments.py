@@ -93,12 +93,12 @@ def prepare_submission(folder: Path, bench: Description, *, stock: bool) -> Subm
     system = submission.system
     if system.carts > bench.encoders:
         raise ConfigError(
-            f"{folder}: has {system.carts} carts, the bench has {bench.encoders} encoders"
+            f"{folder}: has {system.carts} carts, but the bench has {bench.encoders} encoders"
         )
     if not stock and system.carts > bench.carts:
         raise ConfigError(
-            f"{folder}: has {system.carts} carts, the bench {bench.name!r} has {bench.carts}: is "
-            "this the right port, the right folder?"
+            f"{folder}: has {system.carts} carts, but the bench {bench.name!r} has {bench.carts}: "
+            "are port and folder right?"
         )
     missing: dict[str, float] = {}
     if system.position.per_count is None:
@@ -122,8 +122,8 @@ def scale_remarks(submission: Submission, bench: Description) -> list[str]:
     }
     # A smaller difference can come from a number typed with fewer digits.
     return [
-        f"{NAME} has {name}.per_count = {own.per_count:g}, the bench states {stated:g} {unit}; "
-        f"that of {NAME} is used"
+        f"{NAME} has {name}.per_count = {own.per_count:g}, but the bench states {stated:g} {unit}; "
+        f"the value in {NAME} is used"
         for name, (own, unit, stated) in pairs.items()
         if own.per_count and own.unit == unit and abs(own.per_count / stated - 1) > 1e-3
     ]
@@ -135,9 +135,9 @@ def cart_remarks(submission: Submission, bench: Description) -> list[str]:
     if not bench.commands or bench.carts <= carts:
         return []
     return [
-        f"{NAME} has carts = {carts}, the bench {bench.name!r} has {bench.carts}: if this is not "
-        f"the wrong bench, hold the cart{'s' if bench.carts - carts > 1 else ''} after cart "
-        f"{carts} throughout"
+        f"{NAME} has carts = {carts}, but the bench {bench.name!r} has {bench.carts}: if it is the "
+        f"right bench, hold the cart{'s' if bench.carts - carts > 1 else ''} after cart {carts} "
+        "throughout"
     ]
 
 
@@ -154,14 +154,14 @@ def limit_words(limits: PlanLimits, submission: Submission, bench: Description) 
     full = FULL_SCALE * abs(system.input.per_count or bench.input_per_count)
     if limits.input > 1.01 * full:  # the limit may be typed with fewer digits
         raise ConfigError(
-            f"plan.toml: limits.input is {limits.input:g} {unit}, the bench gives at most "
-            f"{full:g} {unit}: the plan was made for another bench; delete plan.toml and a new "
-            "one is proposed, or lower limits.input and every amplitude"
+            f"plan.toml: limits.input is {limits.input:g} {unit}, but this bench gives at most "
+            f"{full:g} {unit}: the plan was made for another bench. Delete plan.toml to get a new "
+            "plan, or lower limits.input and every amplitude"
         )
     counts = limits.travel / abs(system.position.per_count or bench.position_per_count)
     return (
-        f"limits: {limits.input:g} {unit} of {full:g} {unit} that the bench gives, "
-        f"{limits.travel:g} {position} ({counts:.0f} counts) from where it is zeroed"
+        f"limits: {limits.input:g} {unit} of the {full:g} {unit} that the bench can give, and "
+        f"{limits.travel:g} {position} ({counts:.0f} counts) from each cart's zero"
     )
 
 
@@ -173,8 +173,9 @@ def _scale(folder: Path, name: str, unit: str, stated: tuple[str, float]) -> flo
     stated_unit, per_count = stated
     if unit != stated_unit and not (_is_count(unit) and _is_count(stated_unit)):
         raise ConfigError(
-            f"{folder.resolve().name}/{NAME}: the bench counts {stated_unit}: say how many {unit} "
-            f'one count is: {name} = {{ unit = "{unit}", per_count = … }} under [system]'
+            f"{folder.resolve().name}/{NAME}: the bench states its counts in {stated_unit}; state "
+            f"how many {unit} one count is, under [system]: "
+            f'{name} = {{ unit = "{unit}", per_count = … }}'
         )
     return per_count
 

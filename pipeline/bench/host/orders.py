@@ -179,7 +179,7 @@ def _count_amplitude(
     )
     where = f"plan.toml: amplitude {recording.amplitude:g} {unit}"
     if abs(recording.amplitude) > limit:
-        raise ConfigError(f"{where} passes the limit of {limit:g} {unit}")
+        raise ConfigError(f"{where} is above the limit of {limit:g} {unit}")
     full = FULL_SCALE * per_count
     if not closed and abs(recording.amplitude) > full + 0.5 * per_count:
         raise ConfigError(f"{where} is more than the bench can give: {full:g} {unit}; lower it")
@@ -228,6 +228,6 @@ def _list_commands(
 def _check_known(letter: str, name: str, bench: Description) -> None:
     if letter not in bench.commands:
         raise HardwareError(
-            f"the bench {bench.name!r} knows no {name}; take its table out of plan.toml or "
-            "change it"
+            f"the bench {bench.name!r} does not know the command {name}; remove this recording "
+            "from plan.toml, or change it"
         )

@@ -56,8 +56,8 @@ class LineWatch:
             strays = order.strays(reading, period=self._period)
             if self._strays.lasts(strays, ms=reading.ms):
                 return (
-                    f"the bench follows another wave than ordered, {reading.target} counts "
-                    f"at {1e-3 * reading.ms:.3f} s: a digit changed on the line"
+                    f"the bench does not follow the wave that was ordered: {reading.target} counts "
+                    f"at {1e-3 * reading.ms:.3f} s; a digit changed on the line"
                 )
         if self._drives_off.lasts(off, ms=reading.ms):
             self.is_astray = True

@@ -140,7 +140,7 @@ class SerialLine:
             proven = self._is_cleared
             self.stop()
             if proven:
-                self._run_away(f"drives its motor with {duty} duty counts while it should rest")
+                self._run_away(f"drives its motor with {duty} duty counts although it should rest")
             return data
 
     def _run_away(self, why: str) -> None:
@@ -329,10 +329,10 @@ class SerialLine:
         readings = [parse_reading(line) for line in heard.split(b"\n")]
         encoders = [len(reading.counts) for reading in readings if reading is not None]
         if not encoders:
-            what = "nothing" if not heard else f"{heard[:40]!r}, which is not a line of a bench"
+            what = f"{heard[:40]!r}, which is not a line of a bench" if heard else "nothing"
             raise HardwareError(
-                f"{self._name}: answers {what}; is this the bench's port, is the bench switched "
-                "on, is the baud rate of plan.toml its own, is another program connected to it?"
+                f"{self._name}: answers {what}. Check that this is the bench's port, the bench is "
+                "on, its baud rate is that in plan.toml, and no other program uses the port"
             )
         usual = max(set(encoders), key=encoders.count)
         self.bench = Description(name="stock", encoders=usual, carts=usual)
@@ -408,7 +408,7 @@ def _why(failure: str) -> str:
     if any(word in small for word in ("lock", "busy", "resource temporarily")):
         return "another program has this port open; close it (a serial monitor, a second cartlab)"
     if any(word in small for word in ("access", "permission", "denied")):
-        return f"this port may not be opened by you or is open in another program ({failure})"
+        return f"you may not open this port, or another program has it open ({failure})"
     if any(word in small for word in ("no such file", "filenotfound", "cannot find", "not exist")):
         return "there is no such port; is the bench plugged in?"
     if "refused" in small:
@@ -418,7 +418,7 @@ def _why(failure: str) -> str:
 
 def _say_ports() -> str:
     ports = port_names()
-    return f"ports here: {', '.join(ports)}" if ports else "this machine shows no serial port"
+    return f"ports here: {', '.join(ports)}" if ports else "no serial port was found here"
 
 
 def port_names() -> Sequence[str]:

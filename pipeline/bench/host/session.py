@@ -117,8 +117,9 @@ class Session:
                 time.sleep(1.7)  # s that a virtual hand takes to pull a cart out
         elif recording.release:
             self._observer.confirm(
-                f"Pull cart {recording.release} out and hold it still, nearer than limits.travel "
-                f"({self._limits.travel:g}) to its zero; let it go once the recording has begun"
+                f"Pull cart {recording.release} out, by less than limits.travel "
+                f"({self._limits.travel:g}), and hold it still. Let it go once the recording has "
+                "begun"
             )
         return restless
 
@@ -202,9 +203,9 @@ class Session:
             return
         if abs(period / stated - 1) > OTHER_PERIOD:
             self._observer.remark(
-                f"the bench states a line every {stated:.3g} ms and sends one every {period:.3g} "
-                "ms: the times in the data are right, but its controller uses the stated period; "
-                "correct that period"
+                f"the bench states that it sends a line every {stated:.3g} ms, but it sends one "
+                f"every {period:.3g} ms. The times in the data are right, but its controller uses "
+                "the stated period: correct that period"
             )
 
     def _stream(self, free: Sequence[int], *, closed: bool = False) -> Stream:
@@ -406,7 +407,9 @@ class Session:
                 else:
                     unread = now if unread is None else unread
                     if now - unread > 0.25:  # s; the motor may be on while nothing is checked
-                        return watch.stop("the bench's lines cannot be read, so nothing is watched")
+                        return watch.stop(
+                            "the bench's lines cannot be read, so no limit is watched"
+                        )
             if why := self._by_hand():  # after the limits, whose messages are more important
                 return why
             quiet = now - last

@@ -177,8 +177,8 @@ class Stream:
             return []
         if held.ms - last > 1000:
             return self._break(
-                f"the bench's stamps leap from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
-                "its clock, or a second in which no line came"
+                f"the bench's time stamps jump from {1e-3 * last:.3f} to {1e-3 * held.ms:.3f} s: "
+                "its clock jumped, or no line came for a second"
             )
         self._keep(held)
         if self.lines > 500:
@@ -186,7 +186,7 @@ class Stream:
             # If 500 lines take half of the expected time, the period may be another. If they take a
             # quarter, the clock stands still.
             if went_on < 0.25 * 500 * self._expected:
-                self._break(f"the bench's clock stands still: 500 lines in {went_on} ms of it")
+                self._break(f"the bench's clock hardly moves: {went_on} ms in 500 lines")
         return [held]
 
     def _break(self, why: str) -> list[Reading]:

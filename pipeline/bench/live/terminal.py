@@ -61,10 +61,13 @@ class Terminal:
         ConfigError : nobody is at the keyboard.
         """
         if self._yes:
-            self.remark(f"{instruction}: taken as done")
+            self.remark(f"{instruction}: counts as done (--yes)")
             return
         if not sys.stdin.isatty():
-            raise ConfigError(f"{instruction}: nobody is at the keyboard (--yes: it is done)")
+            raise ConfigError(
+                f"{instruction}: nobody is at the keyboard to confirm it; with --yes it counts as "
+                "done"
+            )
         self._ask(instruction, keys="then press Enter")
 
     def settling(self, recording: Recording, seconds: float) -> None:

@@ -137,8 +137,8 @@ class Exploration:
         if not known:
             if first > self.seconds:
                 raise ConfigError(
-                    f"--time: the first sweep takes {time_words(first)}, "
-                    f"{time_words(self.seconds)} are allowed"
+                    f"--time: the first sweep alone takes {time_words(first)}, "
+                    f"more than the {time_words(self.seconds)} allowed"
                 )
             self._record([_FIRST])
         submission = load_submission(self.folder)

@@ -182,8 +182,9 @@ def _refuse_another_class(out: Path, *, assignment: str) -> None:
         return  # the folder has no class yet
     if before != assignment:
         raise ConfigError(
-            f"{out}: holds the class of {before}.toml, and a rubric with another name is another "
-            f"class: name the rubric {before}.toml to continue this class, or choose another --out"
+            f"{out}: holds the class of {before}.toml, and a rubric with another name means "
+            f"another class. To continue this class, name the rubric {before}.toml; else choose "
+            "another --out"
         )
 
 

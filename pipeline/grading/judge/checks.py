@@ -83,7 +83,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         reasons = [s.reason for s in work.analysis.skipped]
         if off_scale(work.analysis):
             reasons = [OFF_SCALE]
-        why = reasons[0] if reasons else "these are first guesses, which no recording decides"
+        why = reasons[0] if reasons else "these are first guesses that no recording can confirm"
         return Verdict(share=None, message=f"Not checked: {why}.")
     deviations, off, wrong = [], [], set()
     for name in judged:
@@ -100,7 +100,7 @@ def _parameters(criterion: asked.Parameters, work: Work) -> Verdict:
         deviations.append(_deviation(error, name))
         if earned_by(criterion, deviations[-1]) < 1:
             wrong.add(name)
-            there = f", your recordings give {known[name].said}" if name in known else ""
+            there = f", but your recordings give {known[name].said}" if name in known else ""
             off.append(f"{name}: you report {as_typed(table[name])}{there}")
     left = (
         f" Not judged: {first_few(guessed, _NAMED)}."

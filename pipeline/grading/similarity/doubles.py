@@ -41,9 +41,9 @@ class Double:
         are = "are" if several else "is"
         where = listing([clean(name) for name in self.submissions], most=_NAMED)
         if not (self.recordings or self.compared):
-            return f"{who} {are} in {where}, whose recordings could not be compared"
+            return f"{who} {are} in {where}; their recordings could not be compared"
         common = count(self.recordings, "recording") if self.recordings else "no recording"
-        return f"{who} {are} in {where}, which have {common} in common"
+        return f"{who} {are} in {where}, and these share {common}"
 
 
 def find_doubles(authors: Mapping[str, Sequence[str]]) -> list[Double]:

@@ -193,15 +193,15 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
     recordings : those of a flag's evidence; an older gradebook may have some without times.
     """
     experiments = list(dict.fromkeys(one["experiment"] for one in recordings))
-    stand = "stands" if len(experiments) == 1 else "stand"
+    are = "is" if len(experiments) == 1 else "are"
     best = max(recordings, key=lambda one: (one.get("equal_rows", 0), one["sigmas"]))
-    when = "of {:g} s to {:g} s".format(*best["time"]) if "time" in best else "there"
+    when = " from {:g} s to {:g} s".format(*best["time"]) if "time" in best else ""
     rows = best.get("equal_rows", 0)
-    same = f"{rows} rows in turn are equal" if rows else "the noise is the same"
+    same = f"{rows} consecutive rows are equal" if rows else "the noise is the same"
     return (
-        f"{first_few(experiments, 4)} also {stand} in {', '.join(others)}: "
-        f"{same}, those {when} in {best['experiment']}. "
-        "This does not show whose they are; if they were shared for a reason, say so."
+        f"{first_few(experiments, 4)} {are} also in {', '.join(others)}: "
+        f"in {best['experiment']}{when}, {same}. "
+        "This does not show whose recording it is; if it was shared for a reason, say so."
     )
 
 

@@ -123,7 +123,7 @@ def _segments(lines: Sequence[str], at: int, dialect: _Dialect) -> tuple[list[_S
         else:
             header, behind = _header(lines, at, dialect)
             if behind >= len(lines):
-                raise SubmissionError(f"{dialect.source}: ends behind the header of a segment")
+                raise SubmissionError(f"{dialect.source}: ends after the header of a segment")
             names = dialect.fields(lines[behind])
             segments.append(_Segment(header=header, names=names, line=behind + 1))
             at = behind + 1
@@ -231,10 +231,10 @@ def _stated(tag: str, segment: _Segment, dialect: _Dialect) -> float | None:
     said = [value for value in segment.header.get(tag, []) if value]
     numbers = [value.replace(dialect.decimal, ".") for value in said]
     if not all(map(is_number, numbers)):
-        raise SubmissionError(f"{place} {first_few(said, 3)[:60]!r}, which is no number")
+        raise SubmissionError(f"{place} {first_few(said, 3)[:60]!r}, which is not a number")
     found = set(map(float, numbers))
     if len(found) > 1 or not all(map(np.isfinite, found)):
-        raise SubmissionError(f"{place} differently for each channel: {first_few(said, 3)[:60]}")
+        raise SubmissionError(f"{place}, but channels differ: {first_few(said, 3)[:60]}")
     return found.pop() if found else None
 
 

@@ -143,8 +143,8 @@ def _refuse_endless(raw: bytes, *, source: str) -> None:
         visits += objects
         if named > _MOST_OBJECTS or visits > _MOST_VISITS or metadata > _MOST_METADATA:
             raise SubmissionError(
-                f"{source}: in too many pieces, or of too many channels; keep one recording and "
-                "write it again with TDMS Defragment in LabVIEW"
+                f"{source}: has too many pieces or channels; keep one recording and write it again "
+                "with TDMS Defragment in LabVIEW"
             )
         at = end
 

@@ -54,7 +54,7 @@ def _not_read(sheets: Sequence[str]) -> list[str]:
     if not sheets:
         return []
     shown = first_few([repr(name) for name in sheets], _MOST_NAMED)
-    return [f"not read: the sheets {shown}; save another recording in a workbook of its own"]
+    return [f"not read: the sheets {shown}; save each recording in a separate workbook"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -242,14 +242,14 @@ class _Sheet:
         looks, values = self._looks[cells], self._values[cells]
         is_time = (looks == "date") | (looks == "time")
         if not is_time.any():
-            said = f"{name!r} is shown in percent, but read as it is kept: 50 % as 0.5"
+            said = f"{name!r} is shown in percent, but its stored value is used: 0.5 for 50 %"
             return None, said if (looks == "percent").any() else ""
         if not is_time.all():
             at = int(self._rows[cells[np.argmax(is_time)]]), column
             raise SubmissionError(
                 f"{self._where} cell {_cell(*at)}: {name!r} is a date or a time among numbers; "
-                "spreadsheet programs make dates of numbers such as 1.5: import the recording "
-                "again, its columns as text or with the other decimal mark"
+                "spreadsheet programs turn numbers such as 1.5 into dates: import the recording "
+                "again with its columns as text, or with the other decimal mark"
             )
         start = values[0] if (looks == "date").any() else 0.0
         what = "dates" if start else "times of day"
@@ -268,7 +268,7 @@ class _Sheet:
             return []
         comma = next((text for text in read if "," in text), None)
         mark = f"; the comma in {comma[:30]!r} is taken as a decimal mark" if comma else ""
-        return [f"{len(read)} numbers that are kept as text were read{mark}"]
+        return [f"{len(read)} numbers that are stored as text were read{mark}"]
 
     def _left_out(self, block: _Block, used: Sequence[int]) -> list[str]:
         """Return a note on rows and columns of the sheet that the table does not contain."""

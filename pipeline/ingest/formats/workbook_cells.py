@@ -95,7 +95,7 @@ class Book:
         main = office[0] if office else "xl/workbook.xml"
         if not main.startswith("xl/") or main not in self._members:
             raise SubmissionError(
-                f"{self._source}: no Excel workbook; save its table as .xlsx or CSV"
+                f"{self._source}: not an Excel workbook; save its table as .xlsx or CSV"
             )
         related = self._related(main)
         named: list[tuple[str, str]] = []
@@ -345,13 +345,13 @@ class _Sheet:
         else:
             self._row, self._column = self._read(reference)
         if not (0 < self._row <= _MOST_ROWS and 0 < self._column <= _MOST_COLUMNS):
-            raise _Broken("a cell that no sheet has")
+            raise _Broken("a cell outside the sheet")
 
     def _read(self, reference: str) -> tuple[int, int]:
         """Return (row, column) of a reference such as "B12"."""
         match = _REFERENCE.fullmatch(reference)
         if match is None:
-            raise _Broken("a cell without a place")
+            raise _Broken("a cell without a valid reference")
         letters = match[1]
         column = self._numbers.get(letters)
         if column is None:

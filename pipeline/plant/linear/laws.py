@@ -12,8 +12,7 @@ from pipeline.names import MODES, NULLS, omega_names, read_name
 
 _GAINS = "a cart further from the motor is moved less by a constant input"
 _ALONE = (
-    "a cart alone swings faster than all together at the first resonance, and slower than at the "
-    "last"
+    "a cart alone oscillates faster than the first resonance of all carts and slower than the last"
 )
 _NULLS = "each null of cart 1 lies between two resonances"
 _INNER = "carts 2 and 3 alone lie between the nulls of cart 1"

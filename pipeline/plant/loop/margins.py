@@ -86,7 +86,7 @@ def stability_margins(
     if np.abs(closed).max() >= 1:
         return None
     if np.any((np.abs(np.abs(opened) - 1) < 1e-9) & (opened.imag != 0)):
-        raise DataError("margins need damped carts, found a mode without damping")
+        raise DataError("no margins: a mode of the carts has no damping")
     poles = np.append(opened, closed).astype(np.complex128)
     omega = _frequencies(poles, sample_time=sample_time)
 

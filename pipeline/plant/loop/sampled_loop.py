@@ -202,8 +202,8 @@ def check_ticks(duration: float, sample_time: float) -> None:
     """Raise DataError if a run has more ticks than a simulation can handle."""
     if not duration <= MOST_TICKS * sample_time:
         raise DataError(
-            f"a loop needs at most {MOST_TICKS:,} ticks to be simulated, found "
-            f"{duration / sample_time:.3g} in {duration:.3g} s at {sample_time:.3g} s a tick"
+            f"a loop can be simulated over at most {MOST_TICKS:,} samples, found "
+            f"{duration / sample_time:.3g}: {duration:.3g} s at {sample_time:.3g} s per sample"
         )
 
 

@@ -170,7 +170,7 @@ class SteppedBench:
         DataError : the simulation diverges, or the motor acts earlier by more than the interval.
         """
         if -self._tables.drive[Drive.INPUT_DELAY_DELAY] > interval * (1 + 1e-9):
-            raise DataError("in a closed loop the input cannot lead its log by over one sample")
+            raise DataError("in a closed loop the input cannot lead its log by more than a sample")
         self._inputs.append((self._now, arriving(self._tables.drive, u)))
         upcoming = (self._now + interval, arriving(self._tables.drive, following))
         on = 1.0 if u != 0.0 else 0.0

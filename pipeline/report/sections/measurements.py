@@ -170,7 +170,7 @@ def step_blocks(page: Page) -> list[Block]:
         )
         carts = zip(range(1, page.analysis.bench.n + 1), CARTS, strict=False)
         said = {
-            "styles": ", ".join(f"cart {cart} {mark}" for cart, (*_, mark) in carts).capitalize(),
+            "styles": " ".join(f"{mark.capitalize()}: cart {cart}." for cart, (*_, mark) in carts),
             "more": left_out(len(runs) - len(drawn)),
             "records": count(len(drawn), "record"),
         }

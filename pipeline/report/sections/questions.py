@@ -323,7 +323,6 @@ def open_questions(
         ]
     raised = _WORDS.spans(
         "raised",
-        questions=count(len(asked), "question"),
         ids=tuple(links),
         state=_WORDS.text(state, count=len(missing)),
     )

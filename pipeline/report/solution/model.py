@@ -54,7 +54,7 @@ def transfer_blocks(page: Page) -> list[Block]:
             Paragraph(said),
             symbolic or _written([Equation("X_1/U", "1/(m*s**2+c*s)")]),
         ]
-    last = f"carts 1 and {n}" if n > 2 else "the two carts"
+    last = "Neighbouring carts" if n > 2 else "The two carts"
     blocks: list[Block] = [
         paragraph(_WORDS.text("carts_alone")),
         _written(derivation.single_carts(springs)),

@@ -19,12 +19,12 @@ HOLD = 0.05  # s of the bench's clock for which a late chunk is held back
 
 KINDS = {
     "drop": "the line never comes",
-    "garble": "one character of the line is another, one that no line has",
-    "merge": "the line's end is lost: the next line stands right behind it",
-    "delay": f"this line and those behind it come in a lump, {1e3 * HOLD:g} ms late",
-    "reset": "the bench's clock begins again in mid-run",
+    "garble": "one character of the line becomes one that no line contains",
+    "merge": "the line's end is lost, so the next line follows without a break",
+    "delay": f"this line and those after it arrive together, {1e3 * HOLD:g} ms late",
+    "reset": "the bench's clock restarts during the run",
     "disconnect": "the cable is pulled: the connection ends",
-    "stuck": "from then on the encoder stands still",
+    "stuck": "from then on the encoder no longer changes",
 }
 _SYNTAX = re.compile(r"(?P<kind>[a-z]+)(?:=(?P<value>[0-9.e-]+))?(?:@(?P<at>[0-9.]+))?")
 _NOISE = b"#?xZ~ \x80\xff"  # no reading has these, so a garbled line is never taken for one

@@ -82,7 +82,7 @@ def open_link(port: str, *, remote: bool = False) -> Link:
     if not (remote or ip_address(address[0]).is_loopback):
         raise ConfigError(
             f"{where}: anyone who reaches this port can drive the bench; "
-            "take 127.0.0.1, or add --remote if you mean it"
+            "use 127.0.0.1, or add --remote if you mean it"
         )
     listener = socket.socket(family, socket.SOCK_STREAM)
     if sys.platform != "win32":  # on Windows it would let two emulators share a port

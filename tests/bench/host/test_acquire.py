@@ -508,11 +508,11 @@ def test_nobody_at_the_keyboard_confirms_nothing(monkeypatch):
     """Without a keyboard an instruction ends the session; `--yes` takes it as done and says so."""
     monkeypatch.setattr("sys.stdin", StringIO())
     view, _ = shown(terminal=False)
-    with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard \(--yes"):
+    with pytest.raises(ConfigError, match=r"Hold cart 2: nobody is at the keyboard to confirm it"):
         view.confirm("Hold cart 2")
     view, out = shown(terminal=False, yes=True)
     view.confirm("Hold cart 2")
-    assert out.getvalue() == "Hold cart 2: taken as done\n"
+    assert out.getvalue() == "Hold cart 2: counts as done (--yes)\n"
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_a_bench_of_more_carts_is_said(tmp_path):
     submission = load_submission(write_work(tmp_path, []))
     bench = Description(name="three", encoders=3, carts=3, commands=EXTENSIONS)
     (remark,) = cart_remarks(submission, bench)
-    assert "carts = 2, the bench 'three' has 3: if this is not the wrong bench" in remark
+    assert "carts = 2, but the bench 'three' has 3: if it is the right bench" in remark
     assert cart_remarks(submission, Description(name="stock", encoders=3, carts=3)) == []
 
 
@@ -150,7 +150,7 @@ def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
         _, said = process.communicate()
     assert process.returncode == 1
     assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
-    assert "again: taken as done" not in said
+    assert "again: counts as done" not in said
     assert "cartlab report" not in said
 
 

@@ -118,7 +118,7 @@ def test_a_motor_that_is_on_while_no_run_is_ends_the_session(tmp_path, wrong, co
         partial, error = session(work, bench)
     assert_over(bench)
     (said,) = {*partial, error} - {""}
-    assert said.startswith("stopped: the bench drives its motor with 4096 duty counts while it")
+    assert said.startswith("stopped: the bench drives its motor with 4096 duty counts although it")
     done = {before_start: 0, between: 1, at_the_end: 2}[wrong]
     assert len(load_submission(work).experiments) == done
 
@@ -197,7 +197,7 @@ def test_a_stop_that_is_not_heeded_is_sent_again(tmp_path):
         (partial,), error = session(work, bench)
     assert_over(bench)
     assert partial.startswith("stopped: cart 2 was ")
-    assert error.startswith("stopped: the bench drives its motor with 4096 duty counts while it")
+    assert error.startswith("stopped: the bench drives its motor with 4096 duty counts although it")
 
 
 @pytest.mark.parametrize("period", [1, 2, 5, 10])

@@ -59,7 +59,7 @@ def test_lines_that_cannot_be_read_end_a_run(tmp_path):
     with emulator("--fault", "garble=1") as bench:
         (outcome,) = acquire(work, port=bench.address, observers=[Alone()], only=["dwell"])
         sent = bench.event("run")
-    assert outcome.partial == "stopped: the bench's lines cannot be read, so nothing is watched"
+    assert outcome.partial == "stopped: the bench's lines cannot be read, so no limit is watched"
     assert sent["ended"] == "stopped"
     assert sent["lines"] < 5000
 
@@ -79,7 +79,7 @@ def test_a_plan_for_a_stronger_bench_moves_nothing(tmp_path, real):
     strong = PlanLimits(input=5.0, travel=2.5)
     work = write_work(tmp_path, [sine("dwell", seconds=1)], limits=strong)
     with pytest.raises(
-        ConfigError, match=r"input is 5 V, the bench gives at most 0\.5 V.*delete plan\.toml"
+        ConfigError, match=r"input is 5 V, but this bench gives at most 0\.5 V.*Delete plan\.toml"
     ):
         acquire(work, port=real.address, observers=[Notes()])
     with pytest.raises(queue.Empty):
@@ -95,7 +95,7 @@ def test_the_numbers_are_said_before_anything_moves(tmp_path, fast):
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     notes = Notes()
     acquire(work, port=fast.address, observers=[notes], only=["dwell"])
-    said = "limits: 0.5 V of 0.5 V that the bench gives, 2.5 cm (1101 counts) from where it is"
+    said = "limits: 0.5 V of the 0.5 V that the bench can give, and 2.5 cm (1101 counts) from each"
     assert any(remark.startswith(said) for remark in notes.remarks)
 
 
@@ -124,7 +124,7 @@ def test_what_a_bench_cannot_do_is_left_out_and_the_rest_recorded(tmp_path):
         with host(work, bench.address, "--yes") as process:
             _, said = process.communicate()
     assert process.returncode == 1
-    assert "knows no chirp; take its table out of plan.toml or change it" in said
+    assert "does not know the command chirp; remove this recording from plan.toml" in said
     assert "sweep: the bench" in said
     assert "sweep: sweep:" not in said
     assert "less than half a count of the bench" in said
@@ -176,7 +176,7 @@ def test_a_changed_digit_of_a_start_is_noticed(tmp_path, monkeypatch, change, re
         monkeypatch.undo()
         sent = real.event("run")
         again = session.record(order, tmp_path / "dwell-2.raw")
-    assert outcome.partial.startswith("the bench follows another wave than ordered")
+    assert outcome.partial.startswith("the bench does not follow the wave that was ordered")
     assert sent["ended"] == "stopped"
     assert sent["lines"] < 1000
     assert again.partial == ""

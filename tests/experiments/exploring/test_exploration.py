@@ -158,7 +158,7 @@ def test_less_time_than_the_sweep_takes_moves_no_cart(tmp_path):
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     virtual = VirtualBench(bench, seed=1)
     session = VirtualSession(tmp_path / "work", virtual)
-    with pytest.raises(ConfigError, match="the first sweep takes"):
+    with pytest.raises(ConfigError, match="the first sweep alone takes"):
         Exploration(
             folder=tmp_path / "work",
             record=session,
@@ -190,7 +190,7 @@ def test_a_wish_for_what_a_rigid_cart_has_is_heard(tmp_path):
     """Nobody knows yet whether springs hold the carts, so the first sweep is made."""
     bench = prepare_bench(preset="throne-1dof", model=None, hide=[])
     session = VirtualSession(tmp_path / "work", VirtualBench(bench, seed=1))
-    with pytest.raises(ConfigError, match="the first sweep takes"):
+    with pytest.raises(ConfigError, match="the first sweep alone takes"):
         Exploration(
             folder=tmp_path / "work",
             record=session,

@@ -332,7 +332,7 @@ def test_a_flag_names_what_can_be_checked(teams):
     assert evidence["equal_rows"] == np.count_nonzero(rows)
     assert evidence["other_time"] == pytest.approx((first - 3.0, last - 3.0))
     said = shared_flag([record]).message
-    assert f"{evidence['equal_rows']} rows in turn are equal" in said
+    assert f"{evidence['equal_rows']} consecutive rows are equal" in said
     assert f"{first:g} s to {last:g} s" in said
 
 
