@@ -56,8 +56,8 @@ def _entry(effect: Effect) -> Iterator[str]:
     facts = {
         f"Parameters ({effect.place})": f"{parameters}, as in `{hiding_option(term)}`",
         "Fingerprint": effect.fingerprint,
-        "Deciding run": effect.deciding_run,
-        "Easily taken for": effect.equivalent,
+        "Deciding experiment": effect.deciding_run,
+        "Easily mistaken for": effect.equivalent,
         "Read": effect.reference,
     }
     yield "\n".join(_wrapped(f"- **{name}**: {fact}") for name, fact in facts.items() if fact)

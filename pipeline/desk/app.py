@@ -262,7 +262,7 @@ def _answer(desk: Desk, handler: Handler, *, path: str) -> Callable[[Request], A
     async def answer(request: Request) -> Response:
         user, room = request.scope["user"], path.split("/")[1]
         if not user.may(room):
-            raise HTTPException(403, f"this room is not for a {user.role}")
+            raise HTTPException(403, f"this page is not for the role {user.role}")
         form = FormData()
         if request.method == "POST":
             form = await request.form(max_files=HAND_IN.members, max_fields=5_000)

@@ -371,7 +371,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
     os.utime(folder / load_submission(folder).experiments[0].file, (1e9, 1e9))
     page = visitor.get(HERE + "hand-in").text
     assert "system.springs" not in page
-    assert page.count("Not known without a report of these files.") == 2
+    assert page.count("Known when the report of these files is made.") == 2
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
@@ -381,7 +381,7 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     page = handed_in(visitor)
     assert "is a link" in page
     assert "There is no report yet, so the zip has none." in page
-    assert page.count("Not known without a report of these files.") == 2  # not: none, nothing
+    assert page.count("Known when the report of these files is made.") == 2  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 
 

@@ -125,7 +125,8 @@ def test_what_is_not_read_is_said():
     assert got.place(0) == "row 8"
     (said,) = table(sheet(typed)).notes
     assert said == (
-        "80 numbers that are stored as text were read; the comma in '0,00' is taken as a decimal mark"
+        "80 numbers that are stored as text were read; "
+        "the comma in '0,00' is taken as a decimal mark"
     )
 
 
