@@ -8,7 +8,7 @@ static volatile Quadrature encoders[MOST_ENCODERS];
 
 #if defined(__AVR__)
 
-/* digitalRead takes 60 cycles to find a pin's register; found once beforehand, it takes two. */
+/* digitalRead needs 60 cycles to find a pin's register. Found once, a read needs two. */
 static struct {
     volatile uint8_t *port;
     uint8_t mask;
@@ -40,7 +40,7 @@ static inline uint8_t channels(uint8_t encoder)
 
 #endif
 
-/* An interrupt does not tell whose it is, so each encoder has a handler of its own. */
+/* An interrupt handler is not told which pin changed, so each encoder has its own handler. */
 template <uint8_t encoder> static void edge()
 {
     quadrature_update((Quadrature *)&encoders[encoder], channels(encoder));

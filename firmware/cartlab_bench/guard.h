@@ -1,7 +1,7 @@
-/* The processor's own watchdog: it resets the board, which lets go of the motor, where ticks stop.
+/* The processor's own watchdog: if the ticks stop, it resets the board, which cuts the motor.
  *
- * A broken encoder wire beside the motor's can change so often that its interrupts leave no time
- * for anything else, nor for the watchdog of the core, which lives in the tick. */
+ * A broken encoder wire near the motor's wires can change so often that its interrupts leave no
+ * time for anything else. The watchdog of the core cannot help then: it runs in the tick. */
 #ifndef CARTLAB_GUARD_H
 #define CARTLAB_GUARD_H
 
@@ -9,14 +9,14 @@
 
 #include <avr/wdt.h>
 
-/* After a reset of its own it is on already and eight times as quick: begin with this. */
+/* After a reset by the watchdog it is still on, and eight times as fast: call this first. */
 static void guard_begin() { wdt_enable(WDTO_120MS); }
 
 static void guard_feed() { wdt_reset(); }
 
 #else
 
-/* Other boards have many times the pace, and no guard here. */
+/* Other boards are many times as fast, and have no guard here. */
 static void guard_begin() {}
 
 static void guard_feed() {}

@@ -1,4 +1,4 @@
-/* Duty counts on their way to the amplifier. */
+/* Output of duty counts to the amplifier. */
 #ifndef CARTLAB_MOTOR_H
 #define CARTLAB_MOTOR_H
 
@@ -35,7 +35,7 @@ static void motor_begin()
     pinMode(MOTOR_DIRECTION, OUTPUT);
     ICR4 = FULL_SCALE - 1;
     TCCR4A = _BV(WGM41);                          /* fast PWM up to ICR4 ... */
-    TCCR4B = _BV(WGM43) | _BV(WGM42) | _BV(CS40); /* ... at the processor's own pace */
+    TCCR4B = _BV(WGM43) | _BV(WGM42) | _BV(CS40); /* ... at the processor's clock rate */
     motor_drive(0);
 }
 
@@ -53,7 +53,7 @@ static void motor_begin()
     pinMode(MOTOR_DIRECTION, OUTPUT);
     analogWriteResolution(12);
 #if defined(TEENSYDUINO)
-    analogWriteFrequency(MOTOR_PWM, 10000); /* Hz; unasked it may be as low as 488 */
+    analogWriteFrequency(MOTOR_PWM, 10000); /* Hz; the default may be as low as 488 */
 #endif
     motor_drive(0);
 }

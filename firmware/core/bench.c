@@ -6,12 +6,12 @@
 
 #define LONGEST_LINE (6 * (LONGEST_INTEGER + 1)) /* three counts, target, duty, time */
 
-/* ------------------------------------------------------------------ what goes out */
+/* ------------------------------------------------------------------ output */
 
 static uint8_t room(const Ring *ring) { return (uint8_t)(ring->taken - ring->written - 1); }
 
-/* Send a whole text or nothing: the host can tell a missing line from the time stamps, but not
- * half a line from a whole one. */
+/* Send a whole text or nothing: the time stamps show the host a missing line, but nothing would
+ * show it that a line is only half of one. */
 static void send(Bench *bench, const char *text, size_t length)
 {
     if (length > room(&bench->output))
@@ -43,9 +43,9 @@ static void send_line(Bench *bench, const int32_t *counts, int32_t target, int16
     send(bench, line, (size_t)(end - line));
 }
 
-/* ------------------------------------------------------------------ what comes in */
+/* ------------------------------------------------------------------ input */
 
-/* Forget everything but who we are and what is still to be sent. */
+/* Forget everything except the settings and the bytes not yet sent. */
 static void reset(Bench *bench)
 {
     bench->state = STOPPED;
@@ -162,7 +162,7 @@ int16_t bench_tick(Bench *bench, const int32_t *counts, uint32_t stamp_ms, uint3
         memcpy(bench->zero, counts, encoders * sizeof *counts);
     bench->zeroed = true;
     int32_t y[MOST_ENCODERS];
-    for (uint8_t i = 0; i < encoders; ++i) /* unsigned, as a counter may go round */
+    for (uint8_t i = 0; i < encoders; ++i) /* unsigned, because a counter may overflow */
         y[i] = (int32_t)((uint32_t)counts[i] - (uint32_t)bench->zero[i]);
 
     if (bench->heard)

@@ -1,8 +1,8 @@
 /* A bench's controller between its serial line and its motor.
  *
  * The hardware around it calls bench_receive for each byte that arrives and bench_tick once a
- * period, and sends what bench_take hands out. Nothing here knows a pin, a clock or an interrupt,
- * so the same code runs on an 8-bit controller, on a Teensy, and in the tests on a computer. */
+ * period, and sends the bytes from bench_take. This code uses no pin, clock or interrupt, so it
+ * runs unchanged on an 8-bit controller, on a Teensy, and in the tests on a computer. */
 #ifndef CARTLAB_BENCH_H
 #define CARTLAB_BENCH_H
 
@@ -18,7 +18,7 @@ extern "C" {
 #endif
 
 #define FULL_SCALE 4096 /* duty counts: the motor's full voltage */
-#define WATCHDOG_MS 100 /* ms after the last heartbeat the motor is cut */
+#define WATCHDOG_MS 100 /* ms without a heartbeat until the motor is cut */
 
 typedef struct {
     uint8_t encoders;        /* two or three */
@@ -26,7 +26,7 @@ typedef struct {
     const char *description; /* the answer to a query, its line feed included */
 } BenchSettings;
 
-/* Bytes on their way out. The indices count on for ever; 8 bits of them are a place. */
+/* Bytes to send. The 8-bit indices wrap around with the buffer. */
 typedef struct {
     uint8_t bytes[256];
     uint8_t written, taken;
@@ -34,7 +34,7 @@ typedef struct {
 
 typedef enum { OPEN_LOOP, PID_LOOP, STATE_LOOP } Loop;
 
-/* What follows the target: the gains that came last, and what the law remembers in a run. */
+/* The control law: the gains received last, and the law's state during a run. */
 typedef struct {
     Loop loop;
     Pid pid;
@@ -46,10 +46,10 @@ typedef struct {
     CommandReader reader;
     Ring output;
 
-    bool zeroed; /* false: the next counts are called zero */
+    bool zeroed; /* false: the next counts become the zero */
     int32_t zero[MOST_ENCODERS];
-    Law gains;        /* of the runs to come */
-    double chirp_end; /* Hz; 0: not told */
+    Law gains;        /* of the next runs */
+    double chirp_end; /* Hz; 0: not set */
 
     enum { STOPPED, STARTING, RUNNING } state;
     Wave wave;
@@ -64,14 +64,14 @@ typedef struct {
 
 void bench_init(Bench *bench, const BenchSettings *settings);
 
-/* Take a byte from the line; what it asks for happens at the next tick. */
+/* Take a byte from the line. Its command is carried out at the next tick. */
 void bench_receive(Bench *bench, uint8_t byte);
 
-/* Return the duty that acts from now on, within +-FULL_SCALE.
+/* Return the duty that is to act from now on, within +-FULL_SCALE.
  *
- * counts:   of the encoders since they had power; a reset makes the next ones zero.
- * stamp_ms: of the bench's clock, which lines, waves and run times go by.
- * now_ms:   of wall time, for the watchdog alone; a real bench has one clock for both. */
+ * counts:   of the encoders since power-on; after a reset, the next counts become the zero.
+ * stamp_ms: the bench's clock, used for lines, waves and run times.
+ * now_ms:   wall time, used for the watchdog only; a real bench has one clock for both. */
 int16_t bench_tick(Bench *bench, const int32_t *counts, uint32_t stamp_ms, uint32_t now_ms);
 
 /* The next byte to send; -1: there is none. */

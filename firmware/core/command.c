@@ -5,9 +5,9 @@
 
 #include "number.h"
 
-#define NOISE '#' /* stands in no field */
+#define NOISE '#' /* is in no valid field */
 
-/* What a field may be: one of some letters, or a number within limits. */
+/* The valid values of a field: one of some letters, or a number within limits. */
 typedef struct {
     char kind;
     const char *letters; /* NULL: a number */
@@ -32,15 +32,15 @@ static const struct {
 } COMMANDS[] = {
     {'d', "WLEfan"},  /* start: wave, loop, encoder, frequency, amplitude, cycles */
     {'g', "ggg"},     /* PID: kp, ki, kd */
-    {'f', "ggggggg"}, /* state feedback: two gains an encoder, prefilter */
-    {'c', "f"},       /* where the next chirps end */
+    {'f', "ggggggg"}, /* state feedback: two gains per encoder, prefilter */
+    {'c', "f"},       /* last frequency of the next chirps */
     {'z', ""},        /* reset */
     {'s', ""},        /* stop */
     {'k', ""},        /* heartbeat */
     {'?', ""},        /* query */
 };
 
-/* The fields behind a letter; NULL: it begins no command. */
+/* The fields after a letter; NULL: it does not begin a command. */
 static const char *fields_of(char letter, uint8_t encoders)
 {
     for (size_t i = 0; i < sizeof COMMANDS / sizeof *COMMANDS; ++i)
@@ -62,7 +62,7 @@ static bool read_field(char kind, const char *text, double *value)
            *value <= field->highest;
 }
 
-/* Which command a field begins; 0: none. */
+/* The command that a field begins; 0: no command. */
 static char letter_of(const char *text, uint8_t encoders)
 {
     const size_t length = strlen(text);
@@ -73,12 +73,12 @@ static char letter_of(const char *text, uint8_t encoders)
     return known ? last : '\0';
 }
 
-/* Take a field as the next of the command begun; false: it cannot stand there. */
+/* Take a field as the next one of the current command; false: it is wrong in this place. */
 static bool take_next(CommandReader *reader, const char *text)
 {
     Command *command = &reader->command;
     const char *kinds = fields_of(command->letter, reader->encoders);
-    if (!kinds || !kinds[reader->count]) /* none is begun, or the last one is complete */
+    if (!kinds || !kinds[reader->count]) /* no command is begun, or the last one is complete */
         return false;
     if (!read_field(kinds[reader->count], text, &command->fields[reader->count]))
         return false;
@@ -119,10 +119,10 @@ uint8_t command_receive(CommandReader *reader, uint8_t byte)
     }
     if (reader->length == 0 && is_blank((char)byte))
         return 0;
-    if (reader->length == LONGEST_FIELD) { /* too long for anything: only its end may matter yet */
+    if (reader->length == LONGEST_FIELD) { /* too long for a field: only its end may still matter */
         text[0] = NOISE;
         --reader->length;
     }
-    text[reader->length++] = byte ? (char)byte : NOISE; /* nothing ends a text but a semicolon */
+    text[reader->length++] = byte ? (char)byte : NOISE; /* only a semicolon ends a text */
     return 0;
 }

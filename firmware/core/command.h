@@ -1,11 +1,11 @@
-/* Commands, cut from the bytes that arrive.
+/* Read commands from the bytes that arrive.
  *
- * A command is a letter and the fields that follow it, a semicolon behind each. What is no command
- * is dropped. A lost byte must never swallow the stop that follows it, therefore
+ * A command is a letter and its fields, each with a semicolon after it. Anything else is dropped.
+ * A lost byte must never hide the stop that follows it. Therefore
  *
- * - a field that cannot stand where it stands ends the command before it and may begin another;
- * - a field that cannot stand anywhere but ends in the letter of a stop or a reset is that;
- * - an `s` that stood where a start has its wave was a stop, if that start then breaks off. */
+ * - a field that is wrong in its place ends the command before it, and may begin another;
+ * - a field that is wrong in any place but ends in the letter of a stop or a reset is that command;
+ * - an `s` in the place of a start's wave was a stop, if that start then breaks off. */
 #ifndef CARTLAB_COMMAND_H
 #define CARTLAB_COMMAND_H
 
@@ -17,21 +17,21 @@
 #define LONGEST_FIELD 32 /* characters */
 
 typedef struct {
-    char letter;                /* which command; 0: none */
-    double fields[MOST_FIELDS]; /* of a field that is a letter, its code */
+    char letter;                /* of the command; 0: no command */
+    double fields[MOST_FIELDS]; /* numbers, or the codes of letters */
 } Command;
 
 typedef struct {
-    uint8_t encoders; /* tells how many gains state feedback has */
+    uint8_t encoders; /* state feedback has two gains for each */
     uint8_t length;   /* of the text so far */
     uint8_t count;    /* of the command's fields so far */
     char text[LONGEST_FIELD + 1];
     Command command; /* the one under way */
 } CommandReader;
 
-/* What a byte can bring about: neither, one or both, and the stop comes first. */
+/* What a byte can complete: neither, one or both; the stop is carried out first. */
 #define STOP_FOUND 1    /* a start that broke off was a stop */
-#define COMMAND_FOUND 2 /* a command is complete and stands in reader->command */
+#define COMMAND_FOUND 2 /* reader->command is complete */
 
 uint8_t command_receive(CommandReader *reader, uint8_t byte);
 

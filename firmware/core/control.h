@@ -1,6 +1,6 @@
-/* The laws between target and motor: none, PID on one encoder, state feedback on all.
+/* Control laws from target to motor: none, PID on one encoder, state feedback on all encoders.
  *
- * They are sampled once a period T and give an effort in duty counts. */
+ * A law is computed once per period T and gives an effort in duty counts. */
 #ifndef CARTLAB_CONTROL_H
 #define CARTLAB_CONTROL_H
 
@@ -19,13 +19,13 @@ double pid_effort(Pid *pid, double error, double period);
 
 /* Effort = prefilter target - gains [x1, v1, x2, v2, ...].
  *
- * Encoders give positions. An observer finds the velocities: it predicts each position one tick
- * ahead at constant velocity, and at the next tick puts half of what the prediction missed down to
- * the velocity. A half keeps three quarters of the encoder's rounding noise out, and forgets a
- * wrong start in a few ticks.
+ * Encoders give positions. An observer estimates the velocities: it predicts each position one
+ * tick ahead at constant velocity, and at the next tick corrects the velocity by half of the
+ * prediction error. A half removes three quarters of the encoder's rounding noise, and a wrong
+ * start is forgotten in a few ticks.
  *
- * The effort acts from the next tick on, so that there is a whole period to compute it, and the
- * gains multiply the prediction: the state at the moment the effort begins to act. */
+ * The effort acts from the next tick on, so there is a whole period to compute it. Therefore the
+ * gains multiply the predicted state: the one at the moment when the effort begins to act. */
 #define VELOCITY_CORRECTION 0.5
 
 typedef struct {

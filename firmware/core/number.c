@@ -4,9 +4,9 @@
 #include <stddef.h>
 
 #define MOST_DIGITS                                                                                \
-    UINT64_C(100000000000000000) /* with one digit more it still fits in 64 bits                   \
+    UINT64_C(100000000000000000) /* with one more digit it still fits in 64 bits                   \
                                   */
-#define LARGEST_EXPONENT 1000    /* beyond it everything is infinite or nothing */
+#define LARGEST_EXPONENT 1000    /* above it, every number is infinite or zero */
 
 static bool is_digit(char c) { return c >= '0' && c <= '9'; }
 
@@ -28,8 +28,8 @@ static double power_of_ten(uint16_t exponent)
     return power;
 }
 
-/* Step over digits with or without a point among them: the number is digits times ten to the
- * exponent. False: there are none. */
+/* Step over digits, with or without a point: the number is digits times ten to the exponent.
+ * False: there are no digits. */
 static bool take_digits(const char **text, bool whole, uint64_t *digits, int16_t *exponent)
 {
     bool any = false, fraction = false;
@@ -41,7 +41,7 @@ static bool take_digits(const char **text, bool whole, uint64_t *digits, int16_t
                 *digits = 10 * *digits + (uint64_t)(c - '0');
                 *exponent -= fraction;
             } else {
-                *exponent += !fraction; /* one more than fits: only its place counts */
+                *exponent += !fraction; /* no room for this digit: only its place counts */
             }
         } else if (c == '.' && !fraction && !whole) {
             fraction = true;
@@ -80,7 +80,7 @@ bool read_number(const char *text, bool whole, double *value)
     if (*text)
         return false;
     double size = (double)digits;
-    if (digits) { /* zero times an infinite power would be no number */
+    if (digits) { /* zero times an infinite power would be NaN */
         const double power = power_of_ten((uint16_t)(exponent < 0 ? -exponent : exponent));
         size = exponent < 0 ? size / power : size * power;
     }
@@ -92,8 +92,8 @@ bool read_number(const char *text, bool whole, double *value)
 
 uint8_t write_integer(char *text, int32_t value)
 {
-    /* Counting how often each power of ten fits spares ten divisions of 32 bits, some 600 cycles
-     * each on a processor that cannot divide. */
+    /* Count how often each power of ten fits. This saves ten 32-bit divisions, of about 600 cycles
+     * each on a processor without a division instruction. */
     static const uint32_t POWERS[] = {1000000000, 100000000, 10000000, 1000000, 100000,
                                       10000,      1000,      100,      10,      1};
     uint32_t rest = value < 0 ? 0 - (uint32_t)value : (uint32_t)value;

@@ -5,7 +5,7 @@
  *     A  0 1 1 0 0          forwards: 00 -> 10 -> 11 -> 01 -> 00 ...
  *     B  0 0 1 1 0          backwards the other way round
  *
- * and every step along this ring is a count, four in a period. A and B never change together: where
+ * and every step along this ring is a count, four in a period. A and B never change together: if
  * they seem to, an edge was missed. */
 #ifndef CARTLAB_QUADRATURE_H
 #define CARTLAB_QUADRATURE_H
@@ -16,11 +16,11 @@
 extern "C" {
 #endif
 
-#define MISSED 2 /* what quadrature_step says of a state that is no neighbour of the last */
+#define MISSED 2 /* result of quadrature_step if the new state is not next to the old one */
 
 typedef struct {
     int32_t count;
-    uint16_t missed; /* transitions that cannot be: the count is two off, either way */
+    uint16_t missed; /* impossible transitions: each puts the count off by two, up or down */
     uint8_t state;   /* 2 A + B, as last seen */
 } Quadrature;
 

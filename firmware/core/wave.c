@@ -4,8 +4,8 @@
 
 #define TWO_PI 6.283185307179586
 
-/* How many turns a sweep has made after t: the integral of a frequency that grows by the same
- * factor in every second. */
+/* The turns of a sweep until t: the integral of a frequency that grows by the same factor in every
+ * second. */
 static double chirp_turns(const Wave *wave, double t)
 {
     const double span = wave->end / wave->frequency;
@@ -29,7 +29,7 @@ static double shape_at(const Wave *wave, double t)
         return sin(TWO_PI * phase);
     case 't': /* up to 1, down to -1, up to zero */
         return 1.0 - 4.0 * fabs(phase < 0.75 ? phase - 0.25 : phase - 1.25);
-    case 'w': /* up to 1, at once to -1, up to zero */
+    case 'w': /* up to 1, jump to -1, up to zero */
         return phase < 0.5 ? 2.0 * phase : 2.0 * phase - 2.0;
     default:
         return sin(TWO_PI * chirp_turns(wave, t));

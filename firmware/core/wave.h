@@ -1,11 +1,11 @@
-/* The shapes a target takes over a run. */
+/* The target over a run, by its wave. */
 #ifndef CARTLAB_WAVE_H
 #define CARTLAB_WAVE_H
 
 #include <stdint.h>
 
-#define PULSE_TIME 0.05 /* s a delta is on */
-#define CHIRP_SPAN 20.0 /* unless told, a chirp ends at so many times the frequency it starts at */
+#define PULSE_TIME 0.05 /* s for which a delta is on */
+#define CHIRP_SPAN 20.0 /* default ratio of a chirp's last frequency to its first */
 
 typedef struct {
     char shape; /* d delta, q square, s sine, t triangle, w sawtooth, c chirp */
@@ -18,7 +18,7 @@ typedef struct {
 /* The target t seconds into the run, to the nearest count. */
 int32_t wave_target(const Wave *wave, double t);
 
-/* Round to a whole count, halves up. */
+/* Round to the nearest count, halves up. */
 int32_t nearest_count(double value);
 
 #endif

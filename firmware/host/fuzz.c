@@ -1,8 +1,8 @@
-/* Feed the core what a noisy line may bring, in a build that watches every access to memory.
+/* Feed the core with bytes as from a noisy line, in a build that checks every access to memory.
  *
  *     fuzz SEED ROUNDS
  *
- * It ends with an error if a duty leaves the full scale or a line is cut short. */
+ * The program fails if a duty is beyond full scale or a line is cut short. */
 #include <assert.h>
 #include <stdlib.h>
 #include <string.h>
@@ -26,7 +26,7 @@ static void receive_text(Bench *bench, const char *text)
         bench_receive(bench, (uint8_t)*text++);
 }
 
-/* A field that may stand somewhere, or noise. */
+/* A valid field, or noise. */
 static void receive_field(Bench *bench)
 {
     static const char *FIELDS[] = {"d", "g",        "f",   "c",   "z",     "s",    "k",

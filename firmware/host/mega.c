@@ -1,5 +1,5 @@
-/* A simulated Arduino Mega whose pins a test holds: encoders to turn, a motor to look at, and the
- * serial line. Time is the processor's own, so that a run is the same on any computer. */
+/* A simulated Arduino Mega for tests: a test turns the encoders, reads the motor's pins, and uses
+ * the serial line. Time is that of the simulated processor, so a run is the same everywhere. */
 #include <stdint.h>
 #include <string.h>
 
@@ -28,7 +28,7 @@ static const struct {
 static avr_t *avr;
 static int phase[3] = {2, 2, 2}; /* steps turned; both channels begin high, as pulled up */
 static uint8_t to_board[1 << 16], from_board[1 << 16];
-static uint16_t sent, arrived, said, heard; /* they go round with the buffers */
+static uint16_t sent, arrived, said, heard; /* they overflow, as indices of ring buffers */
 
 static void hear(struct avr_irq_t *irq, uint32_t byte, void *unused)
 {
@@ -48,7 +48,7 @@ static void set_channels(int encoder)
                       (uint32_t)levels[i]);
 }
 
-/* Load a program; 0: it is one. */
+/* Load a program; 0: it was loaded. */
 int mega_power_on(const char *elf)
 {
     elf_firmware_t program;
@@ -61,7 +61,7 @@ int mega_power_on(const char *elf)
     if (!avr || avr_init(avr) != 0)
         return 1;
     avr_load_firmware(avr, &program);
-    uint32_t flags = 0; /* no printing of what it sends, no sleeping where it waits */
+    uint32_t flags = 0; /* do not print what it sends, do not sleep while it waits */
     avr_ioctl(avr, AVR_IOCTL_UART_SET_FLAGS('0'), &flags);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), hear,
                             NULL);
@@ -70,7 +70,7 @@ int mega_power_on(const char *elf)
     return 0;
 }
 
-/* Let so much time pass on the board; 0: it is still going. */
+/* Let this time pass on the board; 0: it still runs. */
 int mega_run(uint32_t us)
 {
     static avr_cycle_count_t next_byte;
@@ -88,7 +88,7 @@ int mega_run(uint32_t us)
     return 0;
 }
 
-/* Turn an encoder by so many counts, edge by edge; 0: the board is still going. */
+/* Turn an encoder by this number of counts, edge by edge; 0: the board still runs. */
 int mega_turn(int encoder, int32_t counts)
 {
     const int step = counts < 0 ? -1 : 1;
@@ -101,7 +101,7 @@ int mega_turn(int encoder, int32_t counts)
     return 0;
 }
 
-/* Have one channel of an encoder flicker, an edge every few microseconds, as a broken wire does. */
+/* Make one channel of an encoder flicker, an edge every few microseconds, like a broken wire. */
 int mega_flicker(int encoder, uint32_t us, uint32_t us_per_edge)
 {
     for (uint32_t at = 0; at < us; at += us_per_edge) {
@@ -113,7 +113,7 @@ int mega_flicker(int encoder, uint32_t us, uint32_t us_per_edge)
     return 0;
 }
 
-/* Microseconds since it had power. */
+/* Microseconds since power-on. */
 uint64_t mega_clock(void) { return avr->cycle / CYCLES_PER_US; }
 
 /* Have a byte go to the board as the line carries it. */
