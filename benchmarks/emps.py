@@ -19,12 +19,13 @@ from tests.helpers.places import REAL_DATA
 
 TITLE = "EMPS, a positioning axis"
 WORDS = """
-**Can a model of a whole machine axis run freely for 25 s?** A prismatic drive axis under feedback,
-as in robots and machine tools (A. Janot, M. Gautier, M. Brunot, *Data set and reference models of
-EMPS*, Workshop on Nonlinear System Identification Benchmarks 2019). No spring pulls it back, so all
-errors of the force add up. By the rule of
-[nonlinearbenchmark.org](https://www.nonlinearbenchmark.org) a model learns from one record and
-simulates the other, in which pulses disturb the drive, from its first readings to its end.
+**Can a model of a whole machine axis run freely for 25 s?** EMPS is a prismatic drive axis under
+feedback, as in robots and machine tools (A. Janot, M. Gautier, M. Brunot, *Data set and reference
+models of EMPS*, Workshop on Nonlinear System Identification Benchmarks 2019). No spring pulls it
+back, so errors of the force add up. By the rule of
+[nonlinearbenchmark.org](https://www.nonlinearbenchmark.org), a model learns from one record. Then
+it simulates the other record, in which pulses disturb the drive, from its first readings to its
+end.
 """
 TOOLS = ()
 FILES = {"train": "DATA_EMPS.mat", "test": "DATA_EMPS_PULSES.mat"}
@@ -90,10 +91,10 @@ def tables(*, quick: bool) -> list[Table]:
 
 _NOTE = """
 The test record was looked at more than once during development: while the start of a free run was
-designed, and by a test that bounds the error on it. The fit has the training record alone. Its end
-is held out to choose the effects; then the numbers are fitted to the whole record. "Cogging" is a
-force that repeats over 33 mm of travel.
+designed, and by a test that limits the error on it. The fit uses the training record only. The
+end of that record is held out to choose the effects; then the numbers are fitted to the whole
+record. "Cogging" is a force that repeats over 33 mm of travel.
 
-*Published*: the same rule and measure, not run here, quoted from papers that cite the baselines
-(see the Silverbox).
+*Published*: results with the same rule and measure, not run here, from papers that cite the
+baselines (see the Silverbox).
 """

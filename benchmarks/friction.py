@@ -19,11 +19,11 @@ from tests.helpers.ucsd import ecp_record
 
 TITLE = "Which friction laws a servo needs"
 WORDS = """
-**Which laws of friction are worth having?** Robot simulators mostly have Coulomb and viscous
-friction alone. M. Duclusaud, G. Passault, V. Padois, O. Ly, *Extended Friction Models for the
-Physics Simulation of Servo Actuators*, [arXiv 2410.08650](https://arxiv.org/abs/2410.08650)
-([their code](https://github.com/Rhoban/bam)) climb a ladder of six models, M1 to M6, on four
-servos. Here is the part of that ladder that exists without an outer load, on two real axes.
+**Which laws of friction are worth having?** Most robot simulators have only Coulomb and viscous
+friction. M. Duclusaud, G. Passault, V. Padois, O. Ly, *Extended Friction Models for the Physics
+Simulation of Servo Actuators*, [arXiv 2410.08650](https://arxiv.org/abs/2410.08650) ([their
+code](https://github.com/Rhoban/bam)), compare six models, M1 to M6, on four servos. Here are
+those of their models that need no outer load, on two real axes.
 """
 TOOLS = ()
 COULOMB = ("coulomb_friction",)
@@ -100,15 +100,14 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 _NOTE = """
-Beyond Coulomb no friction law of the ladder helps much here. On EMPS a force that repeats along the
-travel does more than Stribeck and load, and the numbers of the Stribeck law are as uncertain as
-they are large. On the cart presliding does more. The search is greedy, so a step can take a law
-that an earlier one did not.
+Beyond Coulomb friction, no friction law of these models helps much here. On EMPS, a force that
+repeats along the travel helps more than Stribeck and load; the numbers of the Stribeck law are as
+uncertain as they are large. On the cart, presliding helps more. The search is greedy, so a larger
+model can use a law that a smaller one did not.
 
-The error is that of free runs over records, or the part of a record, held out from the fit, as a
-share of the motion. Every step after the first may add a
-constant force. A law on offer is taken only if it
-lowers the held-out error. M5 tells motor load from outer load and M6 adds its square: both axes lie
-flat and carry no outer load, so both laws would equal M4. "Load" is the drive's command. Their
-paper measures servos with gearboxes under a pendulum, where load matters most.
+The error is that of free runs over held-out records, or the held-out part of a record, as a share
+of the motion. All models except the first may add a constant force. A law is used only if it
+lowers the held-out error. M5 separates motor load from outer load, and M6 adds its square. Both
+axes are horizontal and carry no outer load, so M5 and M6 would equal M4. "Load" is the drive's
+command. Their paper measures servos with gearboxes under a pendulum, where load matters most.
 """

@@ -34,10 +34,10 @@ from tests.truth.cases import EFFECTS, further_records, make_case, make_rig
 
 TITLE = "Hidden effects, and nonlinear models of them"
 WORDS = """
-**Which tool predicts a cart with a hidden effect, and can a person read the answer?** One cart on a
-spring. All tools learn from the same records and choose their settings by the same held-out
+**Which tool predicts a cart with a hidden effect, and can a person read its answer?** One cart on
+a spring. All tools learn from the same records and choose their settings by the same held-out
 records. Then they predict **further records that no tool has seen**: other steps, another sweep,
-other releases. "Linear" is cartlab's best linear cart.
+other releases. "Linear" is the best linear cart.
 """
 TOOLS = ("pysindy", "sysidentpy", "scikit-learn", "jax-sysid")
 RATE = 113.1  # Hz, the ECP's usual
@@ -156,6 +156,7 @@ def each(found: Sequence[Bench]) -> Table:
         rows=rows,
         note=_TOOLS_NOTE,
         picture=lambda: picture(found),
+        in_file=True,
     )
 
 
@@ -225,7 +226,13 @@ def summary(found: Sequence[Bench]) -> Table:
         "s of a core",
         "can a person read the effect?",
     ]
-    return Table(title="All benches together", head=head, rows=rows, note=_SUMMARY_NOTE)
+    return Table(
+        title="All benches together",
+        head=head,
+        rows=rows,
+        better=_SUMMARY_BETTER,
+        note=_SUMMARY_NOTE,
+    )
 
 
 def equations(found: Sequence[Bench]) -> Table:
@@ -272,38 +279,40 @@ def real_rigs(*, quick: bool) -> Table:
 
 
 _TOOLS_NOTE = f"""
-Errors are of free runs (from the first readings on, a model has only the input), root mean square
-over the motion. Each tool tries several settings and keeps the smallest model whose held-out error
-is within a tenth of the best.
+Errors are those of free runs: after the first readings, a model has only the input. They are root
+mean square, as a share of the motion. Each tool tries several settings and keeps the smallest
+model whose held-out error is within a tenth of the best.
 
-- PySINDy has position and velocity as states, {len(FEATURES)} terms that an engineer would write
-  (up to the third degree, sign v, v|v|, |u| sign v); smoothed differences over 5 to 15 samples;
-  STLSQ with normalised columns at six thresholds. The library has no past inputs, so it cannot
-  express a delay or a lag.
-- SysIdentPy has a polynomial NARX up to the third degree with 2 to 6 lags of every second, fourth
-  or eighth sample. FROLS chooses up to 15 terms by the Akaike criterion (its defaults).
-- The network (scikit-learn) has two layers of eight. It sees 2 to 6 lags of every, every second or
-  every fourth sample. Its documentation recommends L-BFGS for few data.
-- The recurrent network (jax-sysid) has {STATES} states and {CELLS} cells beside a linear part, on
-  every fourth sample. As in its documentation, {ADAM} steps of Adam come before at most {LBFGS} of
-  L-BFGS. A group lasso on the states has two strengths. The first 48 readings give its start.
+- PySINDy: position and velocity as states; {len(FEATURES)} terms that an engineer would write (up
+  to the third degree, sign v, v|v|, |u| sign v); smoothed differences over 5 to 15 samples; STLSQ
+  with normalised columns at six thresholds. Without past inputs it cannot express a delay or a
+  lag.
+- SysIdentPy: a polynomial NARX up to the third degree, 2 to 6 lags of every second, fourth or
+  eighth sample. FROLS chooses up to 15 terms by the Akaike criterion (its defaults).
+- scikit-learn: a network with two layers of eight, 2 to 6 lags of every, every second or every
+  fourth sample. Its documentation recommends L-BFGS for few data.
+- jax-sysid: a recurrent network with {STATES} states and {CELLS} cells, and a linear part, on
+  every fourth sample. As in its documentation, {ADAM} steps of Adam, then at most {LBFGS} of
+  L-BFGS; two strengths of a group lasso on the states. The first 48 readings give the initial
+  state.
 """
-_SUMMARY_NOTE = """
+_SUMMARY_BETTER = """
 **Others are better** outside this lab: they model systems that are not carts. PySINDy accepts any
 term that you add to its library, and the networks need no idea of the effect. On the real decays
-below, jax-sysid is nearer than cartlab. In simulation cartlab has an advantage: its catalogue
-contains every effect that is hidden. With several carts, some held, the other tools would need a
-model for each arrangement.
-
+below, jax-sysid has a smaller error than cartlab. In simulation cartlab has an advantage: its
+catalogue contains every hidden effect. With several carts, some held, the other tools would need
+a model for each arrangement.
+"""
+_SUMMARY_NOTE = """
 Error over the noise: median and quartiles over all benches. "Exactly the effects" counts the
-verdict `named` with nothing missing or added, or `none` if nothing is hidden. Seconds include all
-settings tried.
+verdict `named` with no effect missing or added, or `none` if nothing is hidden. Seconds include
+all settings tried.
 """
 _RIGS_NOTE = """
-The last of five runs is the further record. Decays begin where the hand lets go. `partial` means
-that an effect outside cartlab's catalogue remains. All five steps have the same input, so this
-table cannot tell a tool that memorised the motion from one that knows the cart. Friction on this
-bench also changes from run to run, and no model of other runs can know it.
+The last of five runs is the further record. Decays begin where the hand lets go. `partial`: an
+effect outside cartlab's catalogue remains. All five steps have the same input, so a tool that
+memorised the motion would look as good as one that knows the cart. Friction on this bench also
+changes from run to run, which no model of other runs can predict.
 """
 
 

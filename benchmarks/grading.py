@@ -35,8 +35,8 @@ from tests.helpers.grading_slips import DOUBLE, OF_SEVERAL_CARTS, ONE_NUMBER, SL
 
 TITLE = "Grading"
 WORDS = """
-**Is an honest team left alone, and does a mistake get its right name?** The classes are simulated,
-so every mistake is known.
+**Does an honest team keep all its points, and is each mistake named correctly?** The classes are
+simulated, so every mistake is known.
 """
 TOOLS = ("nbgrader", "otter-grader")
 
@@ -131,12 +131,12 @@ def _is_right(row: dict[str, Any]) -> bool:
 
 _MISTAKES = """
 {benches} different benches, {slight} of them slightly nonlinear (dry friction up to 2 % of the
-force of a small step). They have 1 to 3 carts, ζ from 0.003 to 0.15, 6 to 22 dwells, coarse or fine
-encoders and two to four digits. Each team is graded honest and with up to four mistakes, made with
-its own recordings. Right means that every planted mistake has its flag, and that an honest team has
-no flag (interval of Clopper and Pearson, 1934). "The alternative": the number fits two mistakes,
-and the flag names the planted one second. Not always right: {missed}. A grading took {seconds} s of
-a core after the analysis.
+force of a small step). They have 1 to 3 carts, ζ from 0.003 to 0.15, 6 to 22 dwells, coarse or
+fine encoders and two to four digits. Each team is graded without mistakes, and with up to four
+mistakes made with its own recordings. Right: every planted mistake has its flag, and a team
+without mistakes has no flag (interval of Clopper and Pearson, 1934). "Named as the alternative":
+two mistakes explain the number, and the flag names the planted one second. Not always right:
+{missed}. A grading took {seconds} s of a core after the analysis.
 """
 
 
@@ -234,8 +234,9 @@ def costs(base: Path, *, teams: int, ways: Sequence[tuple[str, dict[str, Any]]])
         head=["command", "carts", "s of a core each", "of it in the client"],
         rows=rows,
         note="""
-One worker, with its start. The client copies, hashes and stores submissions, compares recordings
-and writes the pages of the class. [scaling.md](scaling.md) has more workers and clusters.
+One worker, its start included. The client copies, hashes and stores submissions, compares
+recordings and writes the pages of the class. [scaling.md](scaling.md) has more workers, and
+clusters.
 """,
     )
 
@@ -257,16 +258,17 @@ def other_graders(base: Path, *, honest: int, each: int) -> Table:
         head=["grader", "s of a core each", "wrong numbers cost points", "said which mistake",
               "copied recordings found", "honest teams that lost points"],
         rows=rows,
+        better="""
+**Others are better** at variety: they grade any question for which a test can be written, in
+several languages. Students can run tests before they submit, and nbgrader has a page for grading
+by hand. Their tests do not name mistakes and do not compare submissions.
+""",
         note=f"""
-**Others are better** at variety: they grade any question that a test can be written for, in
-several languages; students can run tests before they submit, and nbgrader has a page to grade by
-hand. Their tests name no mistake and compare no submissions.
-
-One cart; {honest} honest teams, {each} each with {codes}, and {each} that submit two decays of
-another team. The notebook has the six numbers of the two tables. Its tests recompute each from the
-team's recordings (`benchmarks/lab_reference.py`) and allow 5 to 15 %. The class runs through
-nbgrader's `autograde` and `generate_feedback`. For otter, `otter run` runs for each submission, as
-`otter grade` needs Docker. Only cartlab grades the state model, the controller and the closed loop.
+One cart: {honest} honest teams, {each} each with {codes}, and {each} that submit two decays of
+another team. The notebook has the six numbers of the two tables. Its tests recompute each number
+from the team's recordings (`benchmarks/lab_reference.py`) and allow 5 to 15 %. nbgrader runs
+`autograde` and `generate_feedback`; otter runs `otter run` for each submission, because `otter
+grade` needs Docker. Only cartlab also grades the state model, the controller and the closed loop.
 """,
     )  # fmt: skip
 

@@ -216,9 +216,9 @@ def copies(base: Path, *, teams: int) -> Table:
         rows=rows,
         note=f"""
 {teams} honest teams on one bench of two carts, a third of them with hidden friction: {false} of
-{pairs} pairs were flagged. Then {min(teams - 1, 20)} of them are copied, in a class of
-{min(teams, IN_CLASS + 2)}: all recordings, or one among six of the copying team's own. Noise is
-added in encoder counts.
+{pairs} pairs were flagged. Then {min(teams - 1, 20)} teams are copied, each in a class of
+{min(teams, IN_CLASS + 2)}. The copying team takes all recordings, or one that it puts among six
+of its own. Added noise is in encoder counts.
 """,
     )
 

@@ -4,9 +4,12 @@ The page is its own store. Each section is between two comments; a run replaces 
 that it made, and notes the machine and the versions.
 """
 
+import csv
+import io
 import os
 import platform
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError
@@ -28,6 +31,7 @@ NOT_INSTALLED = "not installed"
 _BASIC = ("numpy", "scipy", "numba")
 _SECTION = re.compile(r"<!-- (\w+) -->\n.*?<!-- end of \1 -->\n", re.DOTALL)
 _HEAD = "# Benchmarks\n"
+WIDTH = 118  # characters in a line of the page
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,15 +41,19 @@ class Table:
     Attributes
     ----------
     rows : cells as text; a row of `missing` for a tool that is not installed.
-    note : strengths of the other tools, and how each was used: Markdown, below the table.
+    better : where other tools are better: Markdown, above the table.
+    note : the method, and how each tool was used: Markdown, below the table.
     picture : draws the figure, in the style of the reports.
+    in_file : the page has only the figure; the rows are in a CSV file beside it.
     """
 
     title: str
     head: Sequence[str]
     rows: Sequence[Sequence[str]]
+    better: str = ""
     note: str = ""
     picture: Callable[[], Figure] | None = None
+    in_file: bool = False
 
 
 def installed(tool: str) -> bool:
@@ -103,9 +111,15 @@ def section(
     name: str, module: ModuleType, tables: Sequence[Table], *, seconds: float, figures: Path | None
 ) -> str:
     """Return a benchmark's part of the page; its figures go into a folder, if there is one."""
-    parts = [f"<!-- {name} -->", f"## {module.TITLE}", module.WORDS.strip()]
+    parts = [f"<!-- {name} -->", f"## {module.TITLE}", wrapped(module.WORDS)]
     for number, table in enumerate(tables, start=1):
-        parts += [f"### {table.title}", markdown(table)]
+        parts += [f"### {table.title}", wrapped(table.better)]
+        file = f"{name}-{number}.csv"
+        if table.in_file and figures is not None:
+            write_rows(table, figures / file)
+            parts.append(f"The numbers are in [{file}](figures/{file}).")
+        else:
+            parts.append(markdown(table))
         if table.picture is not None:
             with drawing():
                 drawn = plain_svg(to_svg(table.picture(), name=f"{name}-{number}", alt=table.title))
@@ -113,14 +127,37 @@ def section(
                 figures.mkdir(parents=True, exist_ok=True)
                 write_file(figures / f"{name}-{number}.svg", drawn)
                 parts.append(f"![{table.title}](figures/{name}-{number}.svg)")
-        if table.note:
-            parts.append(table.note.strip())
+        parts.append(wrapped(table.note))
     tools = ", ".join(f"{tool} {version(tool)}" for tool in (*_BASIC, *module.TOOLS))
     parts.append(
-        f"*Again: `python -m benchmarks {name}`. Made in {seconds:.0f} s of one core on "
+        f"*To repeat: `python -m benchmarks {name}`. It took {seconds:.0f} s of one core on "
         f"{machine()}; cartlab {__version__}, {tools}.*"
     )
-    return "\n\n".join(parts) + f"\n\n<!-- end of {name} -->\n"
+    return "\n\n".join(filter(None, parts)) + f"\n\n<!-- end of {name} -->\n"
+
+
+def wrapped(text: str) -> str:
+    """Return Markdown with its paragraphs and list items wrapped to the width of the page."""
+    blocks = [re.split(r"\n(?=- )", block) for block in text.strip().split("\n\n")]
+    return "\n\n".join("\n".join(map(_filled, items)) for items in blocks)
+
+
+def _filled(text: str) -> str:
+    return textwrap.fill(
+        " ".join(text.split()),
+        WIDTH,
+        subsequent_indent="  " if text.startswith("- ") else "",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def write_rows(table: Table, file: Path) -> None:
+    """Write the rows of a table as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([table.head, *table.rows])
+    file.parent.mkdir(parents=True, exist_ok=True)
+    write_file(file, text.getvalue())
 
 
 def markdown(table: Table) -> str:

@@ -25,9 +25,9 @@ from pipeline.submission.models import MOST_EXPERIMENTS
 
 TITLE = "Report"
 WORDS = """
-**How long does a report take?** Each is a `cartlab report` command of its own, start and imports
-included. "First" is the first after an installation from source: no compiled Python files and no
-font list of matplotlib.
+**How long does a report take?** Each number is for a separate `cartlab report` command, with its
+start and imports. "First" is the first report after an installation from source, without compiled
+Python files and without matplotlib's list of fonts.
 """
 TOOLS = ("matplotlib", "typst", "nbconvert", "quarto-cli")
 EVERY = ("one-cart", "two-cart", "three-cart")
@@ -137,7 +137,7 @@ def by_records(base: Path, *, records: Sequence[int]) -> Table:
 
     each = 1e3 * np.diff(seconds) / np.diff(records)
     said = f"{each.min():.0f} to {each.max():.0f} ms of a core" if each.size else ""
-    said = said and f"Each further record costs {said} along the table."
+    said = said and f"Each further record costs {said}."
     return Table(
         title="By records",
         head=["records", "s of a core", "s on the clock", "MB"],
@@ -146,10 +146,11 @@ def by_records(base: Path, *, records: Sequence[int]) -> Table:
             for n, cost in zip(records, costs, strict=True)
         ],
         note=f"""
-One cart; steps, decays and dwells of many sessions on one bench, up to the limit of a submission.
+One cart: steps, decays and dwells of many sessions on one bench, up to the limit of a submission.
 {said}
 """,
         picture=picture if len(records) > 1 else None,
+        in_file=len(records) > 1,
     )
 
 
@@ -214,12 +215,15 @@ def documents(base: Path, *, runs: int) -> Table:
         title="Beside a document of the same figures",
         head=["document", "s of a core", "s on the clock", "MB"],
         rows=rows,
+        better="""
+**Others are better** if you want your own words: a document contains what its author writes.
+""",
         note="""
-**Others are better** if you want your own words: a document says what its author writes. The one
-here (`benchmarks/lab_document.py`, some forty lines) draws the decays, steps, dwells, frequency
-response with a fit and closed loop of `submissions/one-cart`. It has no checks, standard errors or
-controller design. nbconvert runs it in a Jupyter kernel; Quarto also sets the page with pandoc (its
-installation downloads a program). MB are of the largest process.
+The document (`benchmarks/lab_document.py`, about forty lines) draws the decays, steps, dwells,
+frequency response with a fit, and closed loop of `submissions/one-cart`. It has no checks,
+standard errors or controller design. nbconvert runs it in a Jupyter kernel; Quarto also uses
+pandoc to make the page (its installation downloads a program). MB are those of the largest
+process.
 """,
     )
 

@@ -12,7 +12,7 @@ from tests.helpers.time_records import random_chain, step_record
 
 TITLE = "The fit on time records"
 WORDS = """
-**Without sine dwells, does the fit of steps find the masses, and are its standard errors honest?**
+**Without sine dwells, does the fit of steps find the masses, and are its standard errors correct?**
 Other tools are compared in the [benchmarks](README.md).
 """
 TOOLS = ()
@@ -62,7 +62,7 @@ def coverage(seeds: int) -> Table:
                 ]
             )
     return Table(
-        title="Are the standard errors honest?",
+        title="Are the standard errors correct?",
         head=["plant", "noise, cm", "inside, all", "worst parameter", "rms z", "χ²/dof"],
         rows=rows,
         note=_COVERAGE.format(seeds=seeds),
@@ -108,5 +108,5 @@ Random chains, three steps of 4 to 8 s each. Right: every mass within 10 %.
 _COVERAGE = """
 Two steps (1 and 0.6 cm, 6 to 10 s, 113 to 500 Hz), {seeds} fits a line, read by an encoder of
 0.00227 cm with white noise before its rounding. "Inside": the share of parameters within 1.96
-standard errors of the truth; 95 % is honest. "rms z": the error in standard errors.
+standard errors of the truth; 95 % is correct. "rms z": the error in standard errors.
 """

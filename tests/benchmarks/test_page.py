@@ -62,6 +62,34 @@ def test_a_figure_is_written_beside_the_page_and_shown(tmp_path):
     assert (tmp_path / "first-1.svg").read_text(encoding="utf-8").startswith("<svg")
 
 
+def test_rows_may_be_in_a_file_beside_the_figure(tmp_path):
+    """The page links to the file in place of the table; without a folder it has the table."""
+    table = Table(
+        title="Times",
+        head=["what", "s"],
+        rows=[["ours, new", "1.0"]],
+        better="Theirs.",
+        in_file=True,
+    )
+
+    text = section("first", _Module, [table], seconds=1.0, figures=tmp_path)  # type: ignore[arg-type]
+    printed = section("first", _Module, [table], seconds=1.0, figures=None)  # type: ignore[arg-type]
+
+    assert (tmp_path / "first-1.csv").read_text(encoding="utf-8") == 'what,s\n"ours, new",1.0\n'
+    assert "[first-1.csv](figures/first-1.csv)" in text
+    assert "| ours, new |" not in text
+    assert printed.index("Theirs.") < printed.index("| ours, new | 1.0 |")
+
+
+def test_text_is_wrapped_to_the_width_of_the_page():
+    """Paragraphs stay apart, and the lines of a list item are indented."""
+    text = page.wrapped("\none\ntwo\n\n- " + "word " * 40 + "\n- end\n")
+
+    assert text.startswith("one two\n\n- word")
+    assert text.endswith("\n  " + "word " * 16 + "word\n- end")
+    assert max(map(len, text.split("\n"))) <= page.WIDTH
+
+
 @pytest.mark.parametrize("name", CHEAP)
 def test_quick_ones_run_and_leave_the_page_alone(name, monkeypatch, capsys):
     """`--quick` prints its tables on stdout only."""
@@ -83,7 +111,7 @@ def test_a_stored_section_has_the_words_of_its_module(name):
     text = command.page_of(name).read_text(encoding="utf-8")
 
     stored = text.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
-    assert stored.strip().startswith(f"## {module.TITLE}\n\n{module.WORDS.strip()}\n")
+    assert stored.strip().startswith(f"## {module.TITLE}\n\n{page.wrapped(module.WORDS)}\n")
     assert all(f"{tool} " in stored for tool in module.TOOLS)
 
 
