@@ -380,7 +380,7 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
     (folder / "report").symlink_to(folder.parent)
     page = handed_in(visitor)
     assert "is a link" in page
-    assert "There is no report yet, so the zip has none." in page
+    assert "There is no report yet, so the zip will not contain one." in page
     assert page.count("Known when the report of these files is made.") == 2  # not: none, nothing
     assert "report/report.pdf" not in zipped(visitor).namelist()
 

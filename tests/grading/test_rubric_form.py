@@ -126,7 +126,7 @@ def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
 def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
     """A message may show a line of TOML."""
     text = SHIPPED["throne-1dof"].replace(
-        'title = "the pieces asked for"\npoints = 1',
+        'title = "everything the lab asks for"\npoints = 1',
         'title = """the pieces\npoints = 7\n"""\npoints = 1',
     )
     new = typed_into(text, criteria__pieces__points="2")

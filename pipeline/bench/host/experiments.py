@@ -173,9 +173,8 @@ def _scale(folder: Path, name: str, unit: str, stated: tuple[str, float]) -> flo
     stated_unit, per_count = stated
     if unit != stated_unit and not (_is_count(unit) and _is_count(stated_unit)):
         raise ConfigError(
-            f"{folder.resolve().name}/{NAME}: the bench states its counts in {stated_unit}; state "
-            f"how many {unit} one count is, under [system]: "
-            f'{name} = {{ unit = "{unit}", per_count = … }}'
+            f"{folder.resolve().name}/{NAME}: state how many {unit} one count is (the bench states "
+            f'{stated_unit}): {name} = {{ unit = "{unit}", per_count = … }} under [system]'
         )
     return per_count
 

@@ -389,7 +389,7 @@ def test_what_is_no_bench_is_said():
         pass_fds=[controller],
     )  # fmt: skip
     try:
-        with pytest.raises(HardwareError, match="which is not a line of a bench; is this"):
+        with pytest.raises(HardwareError, match="which is not a line of a bench. Check"):
             open_line(os.ttyname(device), baud=115_200)
     finally:
         echo.kill()
@@ -443,7 +443,7 @@ def test_more_carts_than_encoders_is_refused(tmp_path):
     """Three carts cannot be measured with two encoders."""
     text = 'version = 1\n[system]\ncarts = 3\nposition = { unit = "cm" }\n'
     (tmp_path / "submission.toml").write_text(text, encoding="utf-8")
-    with pytest.raises(ConfigError, match="has 3 carts, the bench has 2 encoders"):
+    with pytest.raises(ConfigError, match="has 3 carts, but the bench has 2 encoders"):
         prepare_submission(tmp_path, BENCH, stock=False)
 
 

@@ -27,7 +27,7 @@ def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
     """A submission of two carts refuses data from a bench with one cart."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
-        with pytest.raises(ConfigError, match=r"has 2 carts, the bench 'throne-1dof' has 1: is"):
+        with pytest.raises(ConfigError, match=r"has 2 carts, but the bench 'throne-1dof' has 1: are"):
             acquire(work, port=bench.address, observers=[Notes()])
     assert not (work / "raw").exists()
 
@@ -149,7 +149,7 @@ def test_where_nothing_was_recorded_no_report_is_offered(tmp_path, fast):
     with host(work, fast.address, "--only", "dwell", "--yes") as process:
         _, said = process.communicate()
     assert process.returncode == 1
-    assert "divide its amplitude in plan.toml by four, or raise the limit in plan.toml" in said
+    assert "divide its amplitude in plan.toml by four; or, if the bench" in said
     assert "again: counts as done" not in said
     assert "cartlab report" not in said
 

@@ -49,18 +49,18 @@ def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
     (double,) = told(tmp_path, recordings)
     assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
     assert double.recordings >= 3
-    said = f"bob is in team-1 and team-9, which have {double.recordings} recordings in common"
+    said = f"bob is in team-1 and team-9, and these share {double.recordings} recordings"
     assert str(double) == said
     assert said in re.sub(r"<[^>]+>", "", (tmp_path / "class.html").read_text(encoding="utf-8"))
     feedback = (tmp_path / "feedback/team-9/feedback.html").read_text(encoding="utf-8")
-    assert "in common" not in feedback
+    assert "these share" not in feedback
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
     """Submissions have their stand-in names; the person has no name at all."""
     (double,) = told(tmp_path, recordings, anonymous=True)
     assert re.fullmatch(
-        r"One person is in anon-\w+ and anon-\w+, which have \d+ recordings in common", str(double)
+        r"One person is in anon-\w+ and anon-\w+, and these share \d+ recordings", str(double)
     )
 
 
@@ -103,4 +103,4 @@ def test_one_submission_each_is_nothing_to_tell():
     assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
     (double,) = find_doubles({f"t{i}": ("S\n1",) for i in range(10)})
     assert str(double).startswith("S 1 is in t0, t1, ")
-    assert str(double).endswith("and 2 more, which have no recording in common")
+    assert str(double).endswith("and 2 more, and these share no recording")
