@@ -389,7 +389,7 @@ def test_what_is_no_bench_is_said():
         pass_fds=[controller],
     )  # fmt: skip
     try:
-        with pytest.raises(HardwareError, match="which is not a line of a bench. Check"):
+        with pytest.raises(HardwareError, match="which is not a line of a bench"):
             open_line(os.ttyname(device), baud=115_200)
     finally:
         echo.kill()

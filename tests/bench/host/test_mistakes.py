@@ -27,7 +27,9 @@ def test_another_bench_than_the_submission_is_of_is_refused(tmp_path):
     """A submission of two carts refuses data from a bench with one cart."""
     work = write_work(tmp_path, [sine("dwell", seconds=1)])
     with emulator("--speed", "20", preset="throne-1dof") as bench:
-        with pytest.raises(ConfigError, match=r"has 2 carts, but the bench 'throne-1dof' has 1: are"):
+        with pytest.raises(
+            ConfigError, match=r"has 2 carts, but the bench 'throne-1dof' has 1: are"
+        ):
             acquire(work, port=bench.address, observers=[Notes()])
     assert not (work / "raw").exists()
 
