@@ -253,11 +253,11 @@ def _check(
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)
-        outcome, said = "fail", f"contradict each other, {apart}. {runs} is left out"
+        outcome, said = "fail", f"contradict each other ({apart}). {runs} is left out"
     elif np.any(_contradictions(readings)):
-        outcome, said = "fail", f"range {apart}, depending on the step's size, as if a cart sticks"
+        outcome, said = "fail", f"give values {apart} that depend on the step, as if a cart sticks"
     elif spread > readings[0].tolerance:
-        outcome, said = "skip", f"range {apart}, no further apart than their standard errors"
+        outcome, said = "skip", f"give values {apart}; their standard errors allow this difference"
     else:
         outcome, said = "pass", f"agree within {spread:.2g} %"
     return Check(

@@ -132,7 +132,7 @@ def judge_claims(criterion: asked.Claims, work: Work) -> Verdict:
     return Verdict(
         share=share,
         models=best.models,
-        message="They match the gains."
+        message="The reported numbers match the gains."
         if share == 1
         else f"Simulated on your carts with these gains: {does(best.numbers)}.",
         expected=expected,
@@ -167,7 +167,7 @@ def judge_prefilter(criterion: asked.Prefilter, work: Work) -> Verdict:
     return Verdict(
         share=share,
         models=best.models,
-        message="It is the reciprocal of the loop's static gain, as it should be."
+        message="The prefilter is the reciprocal of the loop's static gain, as it should be."
         if share == 1
         else f"These gains need {right:.4g}, you report {as_typed(typed)}.",
         expected={"prefilter": right},

@@ -200,7 +200,7 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
     same = f"{rows} consecutive rows are equal" if rows else "the noise is the same"
     return (
         f"{first_few(experiments, 4)} {are} also in {', '.join(others)}: "
-        f"in {best['experiment']}{when}, {same}. "
+        f"{same},{when} in {best['experiment']}. "
         "This does not show whose recording it is; if it was shared for a reason, say so."
     )
 

@@ -320,4 +320,4 @@ def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message
         assert ("a person should look at these numbers" in message) is loosely
-        assert ("It agrees with your own recordings." in message) is not loosely
+        assert ("Your values agree with your own recordings." in message) is not loosely
