@@ -254,7 +254,7 @@ def solution(
     failed = [f"cartlab: {with_symbols(check.message)}" for check in analysis.failed_checks]
     for line in failed:  # unreadable files are among these lines
         say(line)
-    doubtful = ", doubtful because the checks above failed" if analysis.failed_checks else ""
+    doubtful = "; it is doubtful, because the checks above failed" if analysis.failed_checks else ""
     say(_wrote(out, "solution", pdf=pdf) + doubtful)
     if as_json:
         typer.echo(text, nl=False)

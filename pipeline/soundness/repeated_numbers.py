@@ -249,7 +249,7 @@ def _check(
     if undecided:
         outcome, said = (
             "fail",
-            (f"contradict each other, {apart}, and nothing shows which is right: no run is used"),
+            (f"contradict each other ({apart}), and nothing shows which is right: no run is used"),
         )
     elif off:
         runs = ", ".join(f"{reading.run} ({reading.value:.4g})" for reading in off)

@@ -64,7 +64,7 @@ def choose_laws(
             break
         leaner = let_go(more, records)
         added = CATALOGUE[more.laws.keys[-1][0]].title.lower()
-        progress(f"with {added}: {len(leaner.laws.groups())} laws are left")
+        progress(f"with {added}: {len(leaner.laws.groups())} laws remain")
         full = more
         if leaner.gain < lean.gain or is_better(leaner, lean):
             lean = leaner

@@ -42,7 +42,7 @@ def find_hypotheses(baseline: Hypothesis, study: Study) -> tuple[Hypothesis, lis
         if not lean.laws.groups():
             return baseline, found
         found.append(judge(fit_whole(_as_model(lean, study, records), study), study))
-        study.progress(f"{found[-1].size} laws are left: error {found[-1].error:.1%}")
+        study.progress(f"{found[-1].size} laws remain: error {found[-1].error:.1%}")
         for rival in rivals_of(lean, records):
             found.append(judge(fit_whole(_as_model(rival, study, records), study), study))
         found[1:] = [h for h in found[1:] if np.isfinite(h.error)]

@@ -182,7 +182,7 @@ def _laws(criterion: asked.Laws, work: Work) -> Verdict:
     worst = max((law.widening for law in laws), default=Fraction(0))
     return Verdict(
         share=ALL - worst / MOST_WIDENING,
-        message=f"This does not hold: {'; '.join(list(meanings)[:_NAMED])}."
+        message=f"The table breaks these laws: {'; '.join(list(meanings)[:_NAMED])}."
         if broken
         else f"All {len(laws)} laws hold within the rounding.",
         expected={"laws": [law.name for law in laws]},

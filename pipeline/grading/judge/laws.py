@@ -115,7 +115,7 @@ def _evaluate(
                 low = float(np.min(real, initial=np.inf))
                 high = float(np.max(real, initial=-np.inf))
                 holds = low <= value[name] + half[name] and high >= value[name] - half[name]
-                text = f"{name} follows from the transfer functions: {low:.4g} to {high:.4g}"
+                text = f"{name} is {low:.4g} to {high:.4g}, by the transfer functions"
                 results[f"recomputed.{name}"] = (text, holds)
     return results
 

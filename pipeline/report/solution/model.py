@@ -18,6 +18,7 @@ from pipeline.report.figures.carts import free_body_figure
 from pipeline.report.sections.page import Page
 from pipeline.report.sections.parameters import chain_table
 from pipeline.words.math import Math, Term, lines, matrix, row, total
+from pipeline.words.numbers import count
 from pipeline.words.phrases import phrases
 from pipeline.words.spans import spans
 from pipeline.words.text import rich
@@ -139,9 +140,9 @@ def _entry(text: str, values: Mapping[str, float]) -> Term:
 
 
 def _redundancies(laws: Sequence[Equation], values: Mapping[str, float]) -> list[Block]:
-    count = "one law is" if len(laws) == 1 else f"{len(laws)} laws are"
+    relations = count(len(laws), "relation")
     return [
-        paragraph(_WORDS.text("laws_left", count=count)),
+        paragraph(_WORDS.text("laws_left", relations=relations)),
         *(_law(law, values) for law in laws),
     ]
 

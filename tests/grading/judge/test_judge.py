@@ -278,7 +278,7 @@ def test_a_broken_law_is_told_in_words():
     swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
     (laws,) = [c for c in swapped.grade().criteria if c.id == "laws"]
     assert laws.message.startswith(
-        "This does not hold: K_2 ≤ K_1 (a cart further from the motor is moved less"
+        "The table breaks these laws: K_2 ≤ K_1 (a cart further from the motor is moved less"
     )
     assert not any(law in laws.message for law in laws.expected["laws"])
     assert "order.K_2.K_1" in laws.found["broken"]
