@@ -2,8 +2,8 @@
 
     python -m benchmarks [NAME…] [--quick] [--out PAGE.md]
 
-Without a name it runs all of them; with names, the other sections stay as they are. `--quick` runs
-small versions that only show that everything works: they are printed, or written to `--out`.
+Without a name all benchmarks run. With names, the other sections stay as they are. `--quick` runs
+small versions, only to show that everything works; they are printed, or written to `--out`.
 
 A benchmark is a module of this folder whose name is in `PAGES`, in the order of its page. The
 module has four names.
@@ -24,7 +24,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-# One thread a tool, set before numpy is loaded: a time of the processor is then one of a core.
+# One thread per tool, so that processor time is time of one core. Set before numpy is loaded.
 os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
 
 from benchmarks.page import section, write_page

@@ -32,7 +32,7 @@ FAULTS = ("drop", "garble", "merge", "delay")
 
 
 class _Once(Notes):
-    """Confirms no second try, keeps no lines."""
+    """An observer that confirms no second try and keeps no lines."""
 
     def confirm(self, instruction: str) -> None:
         """Give up."""
@@ -43,7 +43,7 @@ class _Once(Notes):
 
 
 def stream(folder: Path, *, minutes: float) -> None:
-    """Stream at 1 kHz: lines lost, and what the host and the emulator take of a core."""
+    """Stream at 1 kHz; print lost lines and the processor time of host and emulator."""
     write_work(folder, [sine("long", seconds=60 * minutes)])
     with emulator() as bench:
         process = psutil.Process(bench.pid)
@@ -68,7 +68,7 @@ def stream(folder: Path, *, minutes: float) -> None:
 
 
 def faults(folder: Path, *, seconds: float) -> None:
-    """Spoil 1 % of the lines in each way: valid lines kept, faults counted, record analysed."""
+    """Spoil 1 % of the lines in each way; check that valid lines are kept and faults counted."""
     write_work(folder, [sine("faulty", seconds=seconds)])
     options = [option for kind in FAULTS for option in ("--fault", f"{kind}=0.01")]
     with emulator(*options) as bench:
@@ -90,7 +90,7 @@ def faults(folder: Path, *, seconds: float) -> None:
 
 
 def stops(folder: Path, *, n: int) -> None:
-    """Pass the travel limit: ms from the offending line to the last one the bench sent."""
+    """Pass the travel limit; print the ms from the offending line to the last line of the bench."""
     delays = []
     with emulator() as bench:
         for trial in range(n):
@@ -110,7 +110,7 @@ def stops(folder: Path, *, n: int) -> None:
 
 
 def kills(folder: Path, *, n: int) -> None:
-    """Kill the host at random: what the raw file lacks, and when the motor is off."""
+    """Kill the host at random; print what the raw file lacks and when the motor is off."""
     rng, missing, off = np.random.default_rng(0), [], []
     with emulator() as bench:
         for trial in range(n):

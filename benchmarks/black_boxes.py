@@ -1,7 +1,7 @@
-"""Other tools for a nonlinear model of one cart: records in, a model that runs freely out.
+"""Other tools that learn a nonlinear model of one cart from records.
 
-Each tries the settings that its documentation offers. The smallest model among those with nearly
-the least free-run error on the held-out records is kept.
+Each tool tries the settings in its documentation. Of the models with nearly the smallest free-run
+error on the held-out records, the smallest is kept.
 """
 
 import contextlib
@@ -25,9 +25,9 @@ _FAR = 1e3  # times the largest motion: a run that gets there has diverged
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """One record of one cart at even times: input and position (n,), as read.
+    """One record of one cart at even times: input and position, both (n,).
 
-    `source` is what cartlab made of the record: its own model runs from that.
+    `source` is cartlab's run of the same record, for its own model.
     """
 
     dt: float
@@ -40,7 +40,7 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Model:
-    """A learnt model: its free run of a part, one value every `every` samples, and its words."""
+    """A learnt model: its free run, with a value every `every` samples, and its text."""
 
     run: Callable[[Part], Array]
     every: int
@@ -49,7 +49,7 @@ class Model:
 
 
 def error(model: Model, parts: Sequence[Part]) -> float:
-    """Return the free-run error over the motion, pooled; infinite where a run diverges."""
+    """Return the free-run error as a share of the motion; infinite if a run diverges."""
     off = size = 0.0
     for part in parts:
         with np.errstate(all="ignore"), warnings.catch_warnings():
@@ -65,7 +65,7 @@ def error(model: Model, parts: Sequence[Part]) -> float:
 
 
 def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
-    """Return the one with the fewest terms among those that run nearest to these records."""
+    """Return the model with the fewest terms among those with nearly the smallest error."""
     tried = [(error(model, parts), model) for model in models]
     least = min((off for off, _ in tried), default=np.inf)
     near = [
@@ -75,7 +75,7 @@ def best(models: Iterator[Model], parts: Sequence[Part]) -> Model | None:
 
 
 def _thinned(part: Part, every: int) -> tuple[Array, Array]:
-    """Return input and position of every so many samples; the input as its mean until the next."""
+    """Return input and position at every few samples, the input as its mean until the next one."""
     n = part.y.size // every * every
     u = part.u[:n].reshape(-1, every).mean(axis=1) if every > 1 else part.u
     return u, part.y[::every][: u.size]
@@ -265,7 +265,7 @@ _MOST_TERMS = 15  # the default
 def network(
     parts: Sequence[Part], *, lags: Sequence[int] = (2, 4, 6), thinnings: Sequence[int] = (1, 2, 4)
 ) -> Iterator[Model]:
-    """Learn the next position's change from the last ones and inputs: scikit-learn's MLP."""
+    """Learn the next change of position from past positions and inputs, by scikit-learn's MLP."""
     neural = import_module("sklearn.neural_network")
     for every, lag in itertools.product(thinnings, lags):
         thinned = [_thinned(part, every) for part in parts]
@@ -378,7 +378,10 @@ def recurrent(
         ) -> Array:
             u, y = _thinned(part, every)
             u, y, known = u / scales[0], y / scales[1], max(STATES, -(-part.first // every))
-            near = [*weights[2].ravel(), 1e-2]  # the state of least size that reads the start
+            near = [
+                *weights[2].ravel(),
+                1e-2,
+            ]  # the smallest state that explains the first readings
 
             def off(x0: Array) -> Array:
                 return _recurrent(weights, x0, u[:known]) - y[:known]
@@ -408,7 +411,7 @@ def _recurrent(weights: Sequence[Array], x0: Array, u: Array) -> Array:
 STATES, CELLS = 4, 6
 ADAM, LBFGS = 1000, 1000  # as its documentation has them
 _GONE = 1e-3  # a weight below it counts as removed by the lasso
-_SATURATED = 1000.0  # jax-sysid limits states there, while it learns too
+_SATURATED = 1000.0  # jax-sysid limits states to this size, also while it learns
 TOOLS: tuple[tuple[str, str, Callable[..., Iterator[Model]]], ...] = (
     ("PySINDy", "pysindy", sindy),
     ("SysIdentPy, FROLS", "sysidentpy", frols),

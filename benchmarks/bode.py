@@ -1,6 +1,6 @@
-"""The fit of all carts at once against other tools for resonances, from dwells and from records.
+"""Compare the joint fit of all carts with other tools that find resonances.
 
-How the others are used is in `benchmarks/bode_tools.py`.
+`benchmarks/bode_tools.py` calls the other tools.
 """
 
 import time
@@ -68,7 +68,7 @@ def judged(find: Callable[[], Modes], *, truth: Modes, least: Modes) -> Try:
     try:
         found = find()
     except (DataError, RuntimeError, ValueError, ArithmeticError, LookupError):
-        found = None  # what methods raise that find no answer
+        found = None  # raised by methods that find no answer
     milliseconds = 1e3 * (time.process_time() - start)
     if found is None:
         return Try(modes=np.inf, gains=np.inf, right=False, milliseconds=milliseconds)
@@ -92,7 +92,7 @@ def _rms(values: Array) -> float:
 
 
 def modes_named(chain: Chain, values: Sequence[float]) -> Modes:
-    """Return what is compared, of all named parameters."""
+    """Return the resonances and gains, which are compared, of all named parameters."""
     named = dict(zip(chain.parameters(), values, strict=True))
     keys = "n" if chain.n == 1 else "abc"[: chain.n]
     zetas = ["zeta"] if chain.n == 1 else [f"zeta_{key}" for key in keys]
@@ -224,7 +224,7 @@ _HEAD += ("right", "ms of a core: 1, 2, 3 carts")
 
 
 def _speed(trials: Trials) -> list[float]:
-    """Return how many times as long as `curve_fit` cartlab took, by the medians for each chain."""
+    """Return, for each chain, the median time of cartlab over that of `curve_fit`."""
     times = {
         (name, n): np.median(
             [one.milliseconds for noise in NOISES for one in trials[name, n, noise]]
@@ -270,11 +270,11 @@ def picture(
     return figure
 
 
-_CEILING = 300.0  # at which what is worse, or gave no answer, is drawn
+_CEILING = 300.0  # larger errors, and missing answers, are drawn here
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Compare from magnitudes, from magnitudes and phases, from time records."""
+    """Compare the tools on magnitudes, on magnitudes with phases, and on time records."""
     seeds = 1 if quick else SEEDS
     magnitudes = from_dwells(seeds=seeds, phases=False)
     complex_ = from_dwells(seeds=seeds, phases=True)

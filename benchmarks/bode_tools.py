@@ -1,4 +1,4 @@
-"""How others find the modes of a chain, each as its documentation has it: data in, `Modes` out.
+"""Find the modes of a chain with other tools, each as its documentation shows.
 
 From dwells: `DWELL_TOOLS`; what fits a rational function takes the paper's: common denominator,
 K_i, and the zeros of cart i, as factors 1 + 2 ζ s/ω + (s/ω)². From records: `RECORD_TOOLS`.
@@ -54,7 +54,7 @@ def factors(n: int) -> list[tuple[str, ...]]:
 
 
 def start_of(n: int) -> Array:
-    """Return the paper's start as a vector: gains, then ω and ζ of each factor."""
+    """Return the paper's initial values as a vector: gains, then ω and ζ of each factor."""
     named = {**PAPER_STARTS[n], **({"zeta_n": PAPER_STARTS[n]["zeta"]} if n == 1 else {})}
     gains = [named["K"]] if n == 1 else [named[f"K_{i + 1}"] for i in range(n)]
     pairs = [
@@ -94,7 +94,7 @@ class Dwells:
 
     @classmethod
     def of(cls, responses: Sequence[FrequencyResponse]) -> "Dwells":
-        """Take them from what cartlab fits."""
+        """Take them from the responses that cartlab fits."""
         turns = [np.exp(1j * (0.0 if r.phase is None else r.phase)) for r in responses]
         return cls(
             omega=responses[0].omega,
@@ -107,7 +107,7 @@ class Dwells:
         )
 
     def parts(self, G: ComplexArray, *, log: bool = False) -> Array:
-        """Return what is compared: magnitudes, or real and imaginary parts; or their logarithms."""
+        """Return the numbers to fit: magnitudes, real and imaginary parts, or logarithms."""
         if log:
             G = np.array(np.log(np.abs(G) + _TINY) + 1j * np.angle(G), dtype=complex)
         elif not self.phases:
@@ -164,7 +164,7 @@ def vector_fitted(dwells: Dwells) -> Modes:
         S[:, row, column] = G / scale
     hertz = dwells.omega / (2 * np.pi)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # passivity, which is no matter here
+        warnings.simplefilter("ignore")  # about passivity, which does not matter here
         fit = fitting.VectorFitting(skrf.Network(f=hertz, f_unit="hz", s=S, z0=50))
         fit.vector_fit(
             n_poles_real=0,

@@ -1,4 +1,4 @@
-"""Random benches with hidden effects, and the rows that a study keeps as they come."""
+"""Draw random benches with hidden effects, and keep the rows of a study in a file."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ from pipeline.simulated.emulator.carts import TRUE_PERIOD
 from pipeline.simulated.hidden import default_values, prepare_bench
 from pipeline.submission import Submission
 
-_SPREAD = 0.3  # of the logarithms of masses, dampings and springs about a preset's
+_SPREAD = 0.3  # of the logarithms of masses, dampings and springs, about those of a preset
 USUAL = (0.6, 1.6)  # times the usual size of an effect
 # In every driven run it is damping of the first cart itself. A constant force, too, is never drawn:
 # it is looked for by the rest points.
@@ -31,7 +31,7 @@ Named = tuple[str, int]  # an effect and where it sits
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drawn:
-    """A bench, which springs it has, and what is hidden in it."""
+    """A bench, its springs, and the effects hidden in it."""
 
     bench: SimulatedBench
     springs: tuple[bool, ...]
@@ -39,7 +39,7 @@ class Drawn:
 
 
 def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Drawn:
-    """Draw one to three carts about a preset, and as many effects, `sizes` times the usual."""
+    """Draw a bench near a preset with hidden effects, `sizes` times their usual size."""
     rng = np.random.default_rng(seed)
     preset = list(PRESETS)[int(rng.integers(3))]
     bench = prepare_bench(preset=preset, model=None, hide=[])
@@ -57,7 +57,7 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
         if effect.only_rest or effect.key in _UNSEEN or not places:
             continue
         place = places[int(rng.integers(len(places)))]
-        # The size of a limit or a stop is its place: a nearer one does more.
+        # The size of a limit or a stop is its distance: a nearer one has more effect.
         mine = sizes if effect.parameters[0].neutral is not None else USUAL
         term = _sized(effect, place, chain, float(np.exp(rng.uniform(*np.log(mine)))))
         if not any(_alike(term.effect, other.effect) for other in terms):
@@ -67,10 +67,10 @@ def draw(seed: int, *, effects: int, sizes: tuple[float, float] = USUAL) -> Draw
 
 
 def counted(effect: Effect, place: int, value: float) -> Named:
-    """Return an effect as it counts: two that are provably indistinguishable count as one.
+    """Return an effect under the name that counts: indistinguishable effects have the same name.
 
-    Of sensors only ratios show, whichever has a scale of its own; a lag much shorter than a tick of
-    the bench is a delay.
+    The data show only ratios of the sensors' gains, so all sensors count as one. A lag much shorter
+    than a tick of the bench counts as a delay.
     """
     if effect.same_as == effect.key:
         return effect.key, 0
@@ -80,7 +80,7 @@ def counted(effect: Effect, place: int, value: float) -> Named:
 
 
 def acted(drawn: Drawn, submission: Submission) -> list[list]:
-    """Return what is hidden, sorted, without stops that no cart has come to."""
+    """Return the hidden effects, sorted, without stops that no cart has reached."""
     records = read_data(submission).records
     missed = set()
     for term in drawn.bench.effects:
@@ -114,7 +114,7 @@ def _sized(effect: Effect, place: int, chain: Chain, share: float) -> EffectTerm
 
 
 def _alike(one: Effect, other: Effect) -> bool:
-    """One law, or one family of laws, twice: or contacts, behind which nothing is looked for."""
+    """Return whether two effects must not be combined: the same family of laws, or two contacts."""
     same_family = bool(one.family) and one.family == other.family
     return one.key == other.key or same_family or (one.contact and other.contact)
 
@@ -149,7 +149,7 @@ def run_study(
     first: int,
     count: int,
 ) -> None:
-    """Make what rows of a study are missing, as the command line asks, and write its table."""
+    """Make the missing rows of a study, with options of the command line, and write its table."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--count", type=int, default=count)
     parser.add_argument("--minutes", type=float, default=np.inf, help="begin no bench after")

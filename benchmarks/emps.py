@@ -1,4 +1,4 @@
-"""The electro-mechanical positioning system, an axis on no spring under feedback, by its rule."""
+"""The electro-mechanical positioning system (EMPS): an axis without a spring, under feedback."""
 
 import time
 
@@ -59,14 +59,14 @@ def emps_record(name: str) -> Record:
 
 
 def free_run(model: AugmentedChain, record: Record) -> float:
-    """Return the error (m) of one simulation of a whole record, none of it fitted."""
+    """Return the error (m) of one simulation of a whole record, without any fit to it."""
     (run,) = prepare([record], springs=SPRINGS, notes=[])
     read = simulate_run(start_at(model, springs=SPRINGS), run, fresh_nuisance(run))
     return float(np.sqrt(np.mean((run.y - read) ** 2)))
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the errors on the test record, beside what is published."""
+    """Return the errors on the test record, with the published ones."""
     head = ["tool", "test record, mm", "training record, mm", "s of a core", "answer"]
     title = "One free run of each whole record: root mean square of the error"
     if quick or not (REAL_DATA / "emps" / FILES["test"]).exists():

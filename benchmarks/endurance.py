@@ -67,18 +67,18 @@ from tests.helpers.waiting import PATIENCE, kill, until
 KEPT = Path(__file__).with_name("endurance.json")
 PAGE = Path(__file__).with_name("endurance.md")
 PRESET, ASSIGNMENT = "throne-2dof", "lab"
-SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # factors of a wrong number
+SLIPS = (1.1, 0.9, 2.0, 0.5, 1 / (2 * np.pi), 100.0)  # by which a number is made wrong
 # After a start memory rises for some s: imports, caches, and cycles of dead objects, for which
 # these programs look only after 300,000 new objects.
 SETTLING = 480.0
-BLOCK = 60.0  # s of which memory is averaged: samples in a row are not independent
+BLOCK = 60.0  # s over which memory is averaged, because neighbouring samples are not independent
 KILLED = {"desk": 5, "worker": 3, "connection": 2}  # how often each, while the desk is killed
 FOLDERS = 4  # of each student
 
 
 @dataclass(frozen=True, kw_only=True)
 class Size:
-    """How large a run of the class is; `rest` s between two kills on average."""
+    """The size of a run of the class; `rest` is the mean time between two kills, s."""
 
     minutes: float
     teams: int
@@ -123,7 +123,7 @@ def graded_class(place: str, size: Size, *, folder: Path, seed: int) -> list[Fil
 
 
 def team_names(many: int) -> list[str]:
-    """Return the names of the class."""
+    """Return the names of the teams."""
     return [f"team-{number:03d}" for number in range(1, many + 1)]
 
 
@@ -160,7 +160,7 @@ class Memory:
     mb: list[float] = field(default_factory=list)
 
     def add(self, at: float, processes: Sequence[psutil.Process]) -> None:
-        """Note what they have now; one that just ended counts as 0."""
+        """Note the memory of the processes now; an ended process counts as 0."""
         total = 0.0
         for process in processes:
             with suppress(psutil.NoSuchProcess):
@@ -229,7 +229,7 @@ class Server:
         return [own], workers
 
     def kill(self) -> None:
-        """Kill it alone; its own processes end with it."""
+        """Kill only the desk; its own processes end with it."""
         assert self.process is not None
         children = psutil.Process(self.process.pid).children(recursive=True)
         self.process.kill()
@@ -238,7 +238,7 @@ class Server:
         self.outlived += len(left)
 
     def stop(self) -> float:
-        """End it as an administrator does; return how long that took, s."""
+        """End the desk as an administrator does; return the time that it took, s."""
         assert self.process is not None
         began = time.monotonic()
         self.process.terminate()
@@ -520,7 +520,7 @@ QUICK = Size(minutes=0.75, teams=12, students=3, bases=1, rest=12.0, sample=0.5,
 
 
 def main() -> None:
-    """Make one part, or the page of those made."""
+    """Run one part, or write the page of the parts that were run."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("part", choices=("class", "exploration", "page"))
     parser.add_argument("--minutes", type=float, default=30.0, help="of the class")
@@ -572,7 +572,7 @@ def write_page() -> None:
 
 
 def class_words(made: Mapping[str, Any]) -> str:
-    """Return what became of the class, as a list."""
+    """Return the result of the class as a list."""
     confirmed = ", ".join(f"{KINDS[kind]} {many:,}" for kind, many in made["confirmed"].items())
     killed = ", ".join(f"{KILLS[what]} {many}×" for what, many in made["kills"].items())
     total = sum(made["confirmed"].values())
@@ -604,7 +604,7 @@ def exploration_words(made: Mapping[str, Any]) -> str:
 
 
 def memory_words(seen: Mapping[str, float]) -> str:
-    """Return median, most and slope of some memory."""
+    """Return the median, the largest value and the slope of a memory over time."""
     return (
         f"median {seen['median']:.0f} MB, most {seen['most']:.0f} MB, slope {seen['slope']:+.0f} ± "
         f"{seen['std']:.0f} MB an hour, over {60 * seen['hours']:.0f} minutes"
@@ -612,7 +612,7 @@ def memory_words(seen: Mapping[str, float]) -> str:
 
 
 def load_words(made: Mapping[str, Any]) -> str:
-    """Return on which machine, and how busy it was."""
+    """Return the machine, and how busy it was."""
     middle, most = made["load"]
     return f"Load average {middle:.1f} (most {most:.1f}) on {made['machine']}."
 

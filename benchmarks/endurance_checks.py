@@ -1,4 +1,4 @@
-"""Compare all that was sent to a desk with the gradebook and the folders of students."""
+"""Compare everything sent to a desk with the gradebook and the folders of students."""
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
@@ -14,14 +14,14 @@ from pipeline.submission import load_submission
 
 @dataclass(kw_only=True)
 class Found:
-    """What became of the changes: each sentence names one."""
+    """The changes that went wrong: a sentence for each."""
 
     lost: list[str] = field(default_factory=list)
     doubled: list[str] = field(default_factory=list)
     spoilt: list[str] = field(default_factory=list)
 
     def count(self, change: Change, times: int) -> None:
-        """Note a change that is there so many times, where it should be once."""
+        """Note a change that was stored this number of times, but should be stored once."""
         if change.confirmed and times == 0:
             self.lost.append(_say(change))
         if times > 1:
@@ -73,7 +73,7 @@ def check_book(place: str, journal: Journal, *, teams: Sequence[str], found: Fou
         elif change.kind == "answer":
             told = steps[team, criterion, "answered", change.token]
             found.count(change, told)
-            # The points that an answer gives are there with it, or neither is.
+            # An answer and the points that it gives are stored together, or not at all.
             if len(given[team, criterion, change.token]) > told:
                 found.spoilt.append(f"{_say(change)}: its points without it")
         if change.kind in ("points", "together"):

@@ -1,4 +1,4 @@
-"""Scripted TAs and students of a lab server, and a journal of all that they sent.
+"""Scripted TAs and students of a lab server, and a journal of everything that they sent.
 
 Each is a browser without scripts, in a thread of its own, and draws what to do next by chance.
 Whenever the desk is killed they wait until it is back, and look at the page again.
@@ -50,7 +50,7 @@ class Change:
 
 @dataclass(kw_only=True)
 class Journal:
-    """All that was sent, how long each answer took, and answers that should not be.
+    """Everything that was sent, the time of each answer, and wrong answers.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Lab:
 
 
 class Person(threading.Thread):
-    """Somebody who does one thing after the other; a fault of the script itself is kept."""
+    """A person who does one thing after the other; errors of the script itself are kept."""
 
     rests = RESTS_OF_TA
 
@@ -113,11 +113,11 @@ class Person(threading.Thread):
             raise
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Return what they do, each with how often."""
+        """Return the actions of this person, each with its frequency."""
         raise NotImplementedError
 
     def finish(self) -> None:
-        """Do what is left when the lab is over."""
+        """Do the remaining work when the lab is over."""
 
     def _rest(self, least: float) -> None:
         self.lab.over.wait(self.draw.uniform(least, self.rests[1]) / self.lab.pace)
@@ -178,7 +178,7 @@ class Assistant(Person):
     """A TA: reviews teams, gives points, decides for several at once, answers requests."""
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Review most of the time."""
+        """Return the actions: mostly reviews."""
         return {self.look: 2, self.review: 6, self.decide: 1, self.answer: 3, self.read: 1}
 
     def look(self) -> None:
@@ -293,7 +293,7 @@ class Student(Person):
         self._uploaded = self._folder = 0
 
     def habits(self) -> Mapping[Callable[[], None], float]:
-        """Upload most of the time."""
+        """Return the actions: mostly uploads."""
         return {self.send: 6, self.save: 3, self.ask: 2, self.read: 1}
 
     @property
@@ -302,7 +302,7 @@ class Student(Person):
         return f"/student/{self._folder}/"
 
     def finish(self) -> None:
-        """Have the tables written that are missing, as the desk was killed before."""
+        """Let the desk write missing tables, because it was killed before it wrote them."""
         for number in range(self._folder + 1):
             self._folder = number
             self._complete(self.get("submission", self.room))
@@ -358,13 +358,13 @@ class Student(Person):
         return f"{rounds}-{name}", b"".join(lines[: len(lines) - rounds])
 
     def _complete(self, text: str) -> None:
-        """Have the tables written that are missing."""
+        """Let the desk write the missing tables."""
         if 'name="file" value="data/' in text:
             self._timed("upload", lambda: self._visitor.post(f"{self.room}fill"))
 
 
 def digest(raw: bytes) -> str:
-    """Return what tells the content of a file."""
+    """Return a digest of the content of a file."""
     return hashlib.sha256(raw).hexdigest()
 
 

@@ -62,7 +62,7 @@ def run(seed: int) -> dict:
         try:
             fixed = session_time(extend_plan(plan, submission).recordings)
         except DataError:
-            fixed = None  # dwells are proposed of a linear chain, and none follows these records
+            fixed = None  # dwells need a linear chain, and none fits these records
         gap_file = folder / "gap" / "gap.json"
         gap = json.loads(gap_file.read_text(encoding="utf-8")) if gap_file.exists() else {}
     found = [counted_of(effect) for effect in gap.get("effects", ())]
@@ -87,7 +87,7 @@ def named_of(effect: dict) -> tuple[str, int]:
 
 
 def counted_of(effect: dict) -> tuple[str, int]:
-    """Return an effect of gap.json as it counts."""
+    """Return an effect of gap.json under the name that counts."""
     key, place = named_of(effect)
     first = next(iter(effect["parameters"].values()))["value"]
     return counted(find_effect(key), place, first)
@@ -121,7 +121,7 @@ def off(gap: dict, drawn: Drawn) -> dict[str, float]:
 
 
 def right(row: dict) -> bool:
-    """Is what acts named, all of it and nothing else: or nothing, where nothing does?"""
+    """Return whether exactly the hidden effects are named."""
     verdict = "named" if row["hidden"] else "none"
     return row.get("verdicts", [""])[-1] == verdict and row["found"] == row["hidden"]
 

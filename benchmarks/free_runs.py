@@ -30,7 +30,7 @@ class Answer:
 
 
 def part_of(record: Record, *, first: int = 48) -> Part:
-    """Return a record as all see it: as read, but from where the hand lets go."""
+    """Return a record as all tools get it: as read, but from the release on."""
     run = make_run(record, n=1)
     u = np.zeros(record.t.size) if record.u is None else record.u
     return Part(
@@ -44,7 +44,7 @@ def part_of(record: Record, *, first: int = 48) -> Part:
 
 
 def start_at(model: AugmentedChain, *, springs: tuple[bool, ...]) -> FitModel:
-    """Return a model as the fits have it: its structure and its vector."""
+    """Return a model in the form used by the fits: its structure and its vector."""
     structure = Structure(springs=springs)
     for term in model.terms:
         signs = tuple(float(np.sign(v) or 1.0) for v in term.values)
@@ -110,6 +110,6 @@ def percent(value: float) -> str:
 
 
 def left_out(what: str, *, quick: bool, columns: int) -> list[str]:
-    """Return the row of what was not measured."""
+    """Return the row for a part that was not measured."""
     why = "in a quick run" if quick else "its recordings are not on this machine"
     return [what, f"left out: {why}", *[""] * (columns - 2)]

@@ -1,6 +1,6 @@
-"""Which laws of friction a servo and a cart need: one step of a ladder of laws after the other.
+"""Which laws of friction a servo and a cart need: models with more and more laws.
 
-The search of `cartlab gap` runs once for each step, with the laws of that step alone.
+The search of `cartlab gap` runs once for each model, with the laws of that model only.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,14 +37,14 @@ LADDER = (
     ("M2 + presliding (Dahl)", (*STRIBECK, "presliding_friction")),
 )
 VISCOUS, WHOLE = "viscous alone", "cartlab, whole catalogue"
-# A constant force is no friction, but on an axis without a spring every step needs one.
+# A constant force is not friction, but on an axis without a spring every model needs one.
 ALWAYS = ("force_offset",)
 CART = "DOF1_en1_input1"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Axis:
-    """A real axis: its records and which springs it has."""
+    """A real axis: its records and its springs."""
 
     words: str
     records: Sequence[Record]
@@ -70,7 +70,7 @@ def axes() -> Iterator[Axis]:
 
 
 def climb(axis: Axis) -> Iterator[Gap]:
-    """Yield the result of each step of the ladder, then that with the whole catalogue."""
+    """Yield the result of each model, then that with the whole catalogue."""
     for _, laws in LADDER:
         allowed = [find_effect(key) for key in (*laws, *ALWAYS)]
         yield explain_gap(axis.records, axis.bench, catalogue=allowed)
@@ -83,7 +83,7 @@ def laws_of(gap: Gap) -> str:
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the held-out error of each step, on each axis."""
+    """Return the held-out error of each model, on each axis."""
     found = [] if quick else list(axes())
     head = ["laws on offer"]
     rows = [[name] for name in (VISCOUS, *(name for name, _ in LADDER), WHOLE)]

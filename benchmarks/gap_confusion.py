@@ -28,7 +28,7 @@ SUITES = [
     "singles", "small", "tiny", "weak", "dirt", "pairs", "clean", "clean-dirt", "wide", "wide-pairs"
 ]  # fmt: skip
 SEVERITY = {"small": 0.3, "weak": 0.2, "tiny": 0.05}
-# Two of these on one cart would be one friction law: never a pair.
+# Two of these on one cart would act as one friction law, so they are never a pair.
 DRY = ("coulomb_friction", "stiction", "presliding_friction")
 
 

@@ -61,7 +61,7 @@ PLUCKED = (
 )
 RIGHT = ("exact", "equivalent", "ambiguous, right first")
 _MUCH = 2.0  # noises left
-_THINNED = 2  # samples a point of a picture
+_THINNED = 2  # samples per point of a picture
 
 
 # ----------------------------------------------------------------------------- tables
@@ -74,7 +74,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary_of(rows: Sequence[dict]) -> str:
-    """Return the suites: how many are right, how much is left, how long they took."""
+    """Return the suites: number of right answers, remaining error, and time."""
     out = []
     for suite, words in SUITES.items():
         cases = [row for row in rows if row["suite"] == suite]
@@ -167,7 +167,7 @@ def sureness_of(rows: Sequence[dict]) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Rig:
-    """Recordings of a real rig, and what is free to move in them."""
+    """Recordings of a real rig, and the carts that are free in them."""
 
     name: str
     words: str
@@ -328,7 +328,7 @@ def main() -> None:
     parts: dict[str, str] = {}
     if options.results:
         lines = [json.loads(line) for path in options.results for line in path.open()]
-        # A case that was run again is in a later file.
+        # If a case was run again, the later file has it.
         rows = list({(row["suite"], row["base"], row["index"]): row for row in lines}.values())
         parts["rates"] = summary_of(rows) + "\n" + sureness_of(rows)
         parts["confusion"] = confusion_of(rows)

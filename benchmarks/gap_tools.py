@@ -1,4 +1,4 @@
-"""The gap workflow and other tools that learn nonlinear models, judged on records new to all.
+"""Compare the gap workflow with other tools that learn nonlinear models.
 
 The other tools are in `benchmarks/black_boxes.py`.
 """
@@ -42,8 +42,8 @@ other releases. "Linear" is the best linear cart.
 TOOLS = ("pysindy", "sysidentpy", "scikit-learn", "jax-sysid")
 RATE = 113.1  # Hz, the ECP's usual
 FIRST_SEED = 950_000
-FURTHER = 1_000_000  # added to a seed: of the further records
-REPEATS = 3  # of each run of a class's bench; as many again to judge by
+FURTHER = 1_000_000  # added to a seed for the further records
+REPEATS = 3  # of each run of a class's bench; the same number again is for judging
 OF_ONE_CART = tuple(e for e in EFFECTS if e not in ("coupling_damper", "sensor_gain"))
 # The term of the library that is the effect, or that a person would take for it.
 TERM = {
@@ -60,7 +60,7 @@ SHOWN = "coulomb_friction"  # the bench whose answers are shown
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """What was hidden and what each tool made of it; `gap` is cartlab's account."""
+    """The hidden effects and each tool's answer; `gap` is cartlab's result."""
 
     hidden: tuple[str, ...]
     noise: float
@@ -76,7 +76,7 @@ def compare(
     hidden: tuple[str, ...],
     unit: str,
 ) -> Bench:
-    """Let every tool learn and choose as cartlab does, by its sides; judge by further records."""
+    """Let every tool learn from cartlab's training runs; judge it by further records."""
     began = time.process_time()
     gap = explain_gap(records, SetUp(springs=springs, units=Units(position=unit, input="V")))
     seconds = time.process_time() - began
@@ -101,7 +101,7 @@ def compare(
 
 
 def benches(*, quick: bool) -> list[Bench]:
-    """Return twenty benches of one cart: nothing hidden, each effect, two of them, a class's."""
+    """Return twenty benches of one cart: with no effect, one or two; and a class's bench."""
     plans: list[tuple[str, ...]] = [(), *((e,) for e in OF_ONE_CART)]
     plans.append(("coulomb_friction", "cubic_spring"))
     found = []
@@ -119,12 +119,12 @@ def benches(*, quick: bool) -> list[Bench]:
 
 
 def is_found(gap: Gap, hidden: Sequence[str]) -> bool:
-    """Tell whether cartlab's account has the hidden effects and no others, whatever its verdict."""
+    """Return whether cartlab found exactly the hidden effects, whatever its verdict."""
     return sorted(f.effect.key for f in gap.effects) == sorted(hidden)
 
 
 def is_named(bench: Bench) -> bool:
-    """Tell whether cartlab says what was hidden and nothing else, and that this is all."""
+    """Return whether cartlab found exactly the hidden effects, with the right verdict."""
     verdict = "named" if bench.hidden else "none"
     return bench.gap.verdict == verdict and is_found(bench.gap, bench.hidden)
 
@@ -161,7 +161,7 @@ def each(found: Sequence[Bench]) -> Table:
 
 
 def picture(found: Sequence[Bench]) -> Figure:
-    """Draw every bench's error over its noise, a mark a tool."""
+    """Draw the error of every bench over its noise, with a marker for each tool."""
     figure = Figure(figsize=(6.5, 3.2), layout="constrained")
     axes = figure.subplots()
     names = (OURS, *(name for name, _, _ in OTHERS), LINEAR_CART)

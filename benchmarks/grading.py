@@ -41,7 +41,7 @@ simulated, so every mistake is known.
 TOOLS = ("nbgrader", "otter-grader")
 
 HONEST = "honest"
-WRONG_RUBRIC = "honest, rubric lacks a spring"  # one in ANEW_EVERY: each is analysed again
+WRONG_RUBRIC = "honest, rubric lacks a spring"  # one in ANEW_EVERY, each analysed again
 DATA = "data_problem"
 ANEW_EVERY = 5
 ONE = "one number: "
@@ -80,7 +80,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def mistakes(*, start: int, count: int) -> Table:
-    """Return how many teams of each kind got all their codes, and others beside."""
+    """Return how many teams of each kind got exactly their codes."""
     rows = [row for seed in range(start, start + count) for row in graded(seed, slips=4)]
     return named_mistakes(rows)
 
@@ -141,7 +141,7 @@ two mistakes explain the number, and the flag names the planted one second. Not 
 
 
 def graded(seed: int, *, slips: int) -> Iterator[dict[str, Any]]:
-    """Yield what became of each grading of one bench."""
+    """Yield the result of each grading of one bench."""
     for kind, team, codes in gradings(seed, slips=slips):
         start = time.process_time()
         grade = team.grade()
@@ -170,7 +170,7 @@ def gradings(seed: int, *, slips: int) -> Iterator[tuple[str, Team, set[str]]]:
         if team.bench.chain.n == 1 and not OF_SEVERAL_CARTS.isdisjoint(codes):
             continue
         slipped = replace(team, rng=np.random.default_rng([9, seed, turn]))
-        unchanged = False  # this team has no way to make one of them
+        unchanged = False  # this team cannot make one of the mistakes
         for slip in made:
             before, slipped = slipped, slip(slipped)
             unchanged |= slipped.submission is before.submission
@@ -245,7 +245,7 @@ clusters.
 
 
 def other_graders(base: Path, *, honest: int, each: int) -> Table:
-    """Return what nbgrader and otter-grader make of the same one-cart class."""
+    """Return the results of nbgrader and otter-grader for the same one-cart class."""
     base.mkdir(parents=True)
     slips = write_teams(base / "class", honest=honest, each=each)
     rows = []

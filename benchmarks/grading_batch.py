@@ -38,7 +38,7 @@ from pipeline.submission import load_submission
 
 ROOT = Path(__file__).parents[1]
 PRESET = "throne-2dof"
-# Noise added to a copy, in encoder steps, and what else is done to it.
+# Noise added to a copy, in encoder steps, and other changes to it.
 DISGUISES = {
     "as it is": {},
     "cut to 60 %": {"keep": 0.6},
@@ -75,13 +75,13 @@ class Cost:
 
     @property
     def cpu(self) -> float:
-        """Seconds of the processor, all processes together."""
+        """Processor seconds of all processes together."""
         return self.parent + self.workers
 
 
 @contextmanager
 def measured(costs: list[Cost]) -> Iterator[None]:
-    """Add what a stretch of work costs."""
+    """Add the cost of the work in this block."""
     process = psutil.Process()
     start, before = time.perf_counter(), process.cpu_times()
     yield
@@ -178,7 +178,7 @@ def disguised(
 
 
 def copies(base: Path, *, teams: int) -> Table:
-    """Return which disguised copies are found, among honest teams that are not taken for any."""
+    """Return which disguised copies are found, and how many honest pairs are flagged."""
     records: list[tuple[Record, ...]] = []
     for seed in range(teams):
         folder = base / str(seed)

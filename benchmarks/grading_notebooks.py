@@ -1,9 +1,9 @@
 """The one-cart lab as a notebook assignment, graded by nbgrader and by otter-grader.
 
-The smallest assignment that asks for the same six numbers: a team types them into one cell, beside
-its recordings, and each is held against what `lab_reference.py` makes of those. Both tools are
-used by their command line: nbgrader as `generate_assignment`, `autograde` and `generate_feedback`,
-otter as `generate` and, without containers, `run`, the hand-in a zip as `otter.export` makes it.
+The smallest assignment that asks for the same six numbers. A team types them into one cell, and
+each number is compared with that of `lab_reference.py` from the team's recordings. Both tools are
+used on their command lines: nbgrader's `generate_assignment`, `autograde` and `generate_feedback`; otter's
+`generate` and, without containers, `run`, with a submission zipped as by `otter.export`.
 """
 
 import json
@@ -78,7 +78,7 @@ class Graded:
 
 
 def write_teams(folder: Path, *, honest: int, each: int) -> dict[str, str]:
-    """Write a class with so many teams of each slip; return the slip of each team, "" for none."""
+    """Write a class with `each` teams per slip; return the slip of each team, or ""."""
     slips = [""] * honest + [slip for slip in (*SLIPS, COPIED) for _ in range(each)]
     write_class(folder, len(slips), preset=PRESET)
     teams = sorted(folder.iterdir())
@@ -120,7 +120,7 @@ def cartlab(folder: Path, base: Path) -> Graded:
 
 
 def nbgrader(folder: Path, base: Path) -> Graded | None:
-    """Grade with nbgrader, feedback pages and all; None where it is not installed."""
+    """Grade with nbgrader, feedback pages included; None if it is not installed."""
     if not installed("nbgrader"):
         return None
     from nbgrader.api import Gradebook as Book  # pyright: ignore[reportMissingImports]
@@ -145,7 +145,7 @@ def nbgrader(folder: Path, base: Path) -> Graded | None:
 
 
 def otter(folder: Path, base: Path) -> Graded | None:
-    """Grade with otter-grader, one hand-in after the other; None where it is not installed."""
+    """Grade with otter-grader, one submission after the other; None if it is not installed."""
     if not installed("otter-grader"):
         return None
     tests = base / "otter" / "tests"

@@ -1,4 +1,4 @@
-"""Noisy dwells of the throne presets, the least error possible with them, and what the fit makes.
+"""Noisy dwells of the throne presets, the smallest possible error, and the error of the fit.
 
 Dwells: 20, 25 and 30 frequencies, logarithmic from 0.3 to 7 Hz. The input amplitude gives the
 cart that moves most 1 cm, but is 1 V at most. Errors: 1 % of the amplitude and 0.00115 cm (half
@@ -29,7 +29,7 @@ BAND_HZ = (0.3, 7.0)
 POINTS = {1: 20, 2: 25, 3: 30}
 LARGEST_MOTION = 1.0  # cm
 LARGEST_INPUT = 1.0  # V
-RIGHT = 0.02  # a fit is right where every resonance is within 2 % of its true frequency
+RIGHT = 0.02  # a fit is right if every resonance is within 2 % of its true frequency
 
 PAPER_STARTS = {
     1: {"K": 30.6, "omega_n": 13.2, "zeta": 0.10},
@@ -91,7 +91,7 @@ def least_possible_std(chain: Chain, *, phases: bool = False, noise: float = 1.0
 
 
 def bound(chain: Chain, measured: Callable[[Chain], Array]) -> Array:
-    """Return the Cramér-Rao bound where values of standard error 1 are measured, by name."""
+    """Return the Cramér-Rao bound by name, for measured values with a standard error of 1."""
     P = Parametrisation(bench=Bench(springs=(True,) * (chain.n + 1)))
     p = P.physical(chain)
     steps = 1e-6 * np.where(p > 0, p, np.max(chain.k))
@@ -143,7 +143,7 @@ def quality(chain: Chain, *, seeds: int, phases: bool = False, first_seed: int =
 def fit_from(
     responses: Sequence[FrequencyResponse], *, start: dict[str, float], n: int
 ) -> ChainFit:
-    """Fit with all springs free, as for a bench nobody has told us about."""
+    """Fit with all springs free, as for an unknown bench."""
     return fit_bode(responses, bench=Bench(springs=(True,) * (n + 1)), initial=start)
 
 
@@ -179,7 +179,7 @@ def converged_share(chain: Chain, *, kind: str, seeds: int) -> float:
 
 
 def is_right(fit: ChainFit, chain: Chain) -> bool:
-    """Tell whether every frequency of the fit is within 2 % of the truth."""
+    """Return whether every frequency of the fit is within 2 % of the truth."""
     return all(
         abs(fit.parameters[name].value / value - 1) < RIGHT
         for name, value in chain.parameters().items()

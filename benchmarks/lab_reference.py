@@ -1,4 +1,4 @@
-"""What a TA would write to grade the one-cart lab in a notebook: numbers from the team's own files.
+"""Compute the numbers of the one-cart lab from a team's own files, as a TA would write it.
 
 Handed to nbgrader and to otter-grader beside the assignment (`grading_notebooks.py`). Numpy and
 scipy, the textbook's methods: the level of a step, the logarithms of a decay's peaks, a sine
@@ -21,7 +21,7 @@ _SEEN = 0.05  # of the largest swing; smaller peaks are the encoder's
 
 
 def check(table: str, name: str, reported: Mapping[str, Table], dwells: Table) -> None:
-    """Ask whether a reported number is near what the team's recordings give."""
+    """Check that a reported number is near the number from the team's recordings."""
     numbers = initial() if table == "initial" else final(tuple(sorted(dwells.items())))
     found, expected = reported[table][name], numbers[name]
     assert abs(found / expected - 1) < TOLERANCE[name], (
@@ -69,7 +69,7 @@ def _gain(data: NDArray) -> float:
 def _decrement(data: NDArray) -> tuple[float, float]:
     y = data["x1"] - data["x1"][-len(data) // 10 :].mean()
     crossings = np.flatnonzero(np.diff(np.sign(y)) != 0)
-    halves = pairwise(crossings)  # what lies before is the hand's
+    halves = pairwise(crossings)  # before this, the hand moves the cart
     peaks = [int(a + np.argmax(np.abs(y[a : b + 1]))) for a, b in halves]
     large = [peak for peak in peaks if abs(y[peak]) > _SEEN * np.abs(y).max()]
     first, last, cycles = large[0], large[-1], (len(large) - 1) / 2

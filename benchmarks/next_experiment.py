@@ -45,7 +45,7 @@ FIGURE = Path(__file__).with_name("figures") / "next.svg"
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Stage:
-    """What is known after so many seconds at the bench: relative, of every named parameter."""
+    """The relative errors of all named parameters after a time at the bench, s."""
 
     seconds: float
     stated: Array
@@ -84,7 +84,7 @@ def log_spaced(known: Knowledge, plan: Plan, *, n: int) -> list[Recording]:
 
 
 def run(preset: str, *, seed: int, n: int, dwells: int, scratch: Path) -> tuple[list[Stage], Array]:
-    """Return the stages (first set, chosen, and with dwells the paper's) and what was promised."""
+    """Return the stages (first set, chosen, paper's dwells) and the predicted errors."""
     chain = PRESETS[preset]
     bench = VirtualBench(prepare_bench(preset=preset, model=None, hide=[]), seed=seed)
     springs = [True] * (chain.n + 1)
@@ -153,7 +153,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         for preset in PRESETS:
             for seed in range(asked.seeds):
-                dwells = 0 if seed else asked.dwells  # they take long, and are the same each time
+                dwells = 0 if seed else asked.dwells  # slow, and the same each time
                 one = run(preset, seed=seed, n=asked.next, dwells=dwells, scratch=Path(scratch))
                 results.setdefault(preset, []).append(one)
                 print(preset, seed, [round(stage.seconds) for stage in one[0]], flush=True)

@@ -1,7 +1,7 @@
 """The page of the benchmarks: its tables, the notes below them, and how one section is replaced.
 
-The page is its own store. Each section is between two comments; a run replaces only the sections
-that it made, and notes the machine and the versions.
+Results are stored in the page itself. Each section is between two comments. A run replaces only the
+sections that it made, and notes the machine and the versions.
 """
 
 import csv
@@ -99,7 +99,7 @@ def share(hits: int, of: int) -> str:
 
 
 def write_page(page: Path, made: dict[str, str], *, order: Sequence[str]) -> None:
-    """Replace the sections that were made; leave the others and the head."""
+    """Replace the sections that were made; keep the others and the head."""
     text = page.read_text(encoding="utf-8") if page.exists() else _HEAD
     sections = {found[1]: found[0] for found in _SECTION.finditer(text)} | made
     head = _SECTION.split(text, maxsplit=1)[0].rstrip() + "\n"

@@ -1,4 +1,4 @@
-"""What a report costs: the first and the next, by carts, by records, and beside a notebook."""
+"""The time and memory of a report, by carts and by records, and of a notebook."""
 
 import json
 import os
@@ -58,7 +58,7 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 def run(command: Sequence[str | Path], *, cwd: Path = _ROOT, **environment: str) -> Cost:
-    """Run a command and return what it took, with whatever it started and waited for."""
+    """Run a command and return its cost, including the processes that it waited for."""
     began = time.perf_counter()
     process = subprocess.Popen(
         [*map(str, command)],
@@ -111,7 +111,7 @@ def by_carts(base: Path, *, runs: int, examples: Sequence[str]) -> Table:
 
 
 def by_records(base: Path, *, records: Sequence[int]) -> Table:
-    """Return the costs for submissions of so many records, all of them different."""
+    """Return the costs of submissions with these numbers of records, all different."""
     costs = []
     for count in records:
         folder = base / f"records-{count}"
@@ -179,7 +179,7 @@ def write_records(folder: Path, count: int) -> None:
 
 
 def documents(base: Path, *, runs: int) -> Table:
-    """Return what a document of the same figures costs, written by hand for one cart."""
+    """Return the cost of a document with the same figures, written by hand for one cart."""
     folder = base / "document"
     shutil.copytree(EXAMPLES / "one-cart", folder)
     shutil.copy(Path(__file__).with_name("lab_reference.py"), folder)
@@ -201,7 +201,7 @@ def documents(base: Path, *, runs: int) -> Table:
             rows.append(missing(name, columns=4))
             continue
         cwd = folder if tool else _ROOT
-        warmed = runs > 1  # the first then counts for nothing
+        warmed = runs > 1  # the first run then does not count
         costs = [run(command, cwd=cwd) for _ in range(runs + warmed)][warmed:]
         rows.append(
             [

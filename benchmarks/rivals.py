@@ -1,4 +1,4 @@
-"""How often one proposed experiment settles which hidden effect acts.
+"""How often a proposed experiment shows which hidden effect acts.
 
     python -m benchmarks.rivals [--count 480] [--minutes 60]
 
@@ -31,14 +31,14 @@ from tests.helpers.virtual import VirtualBench, VirtualSession
 
 ROWS = Path(__file__).with_name("rivals.jsonl")
 FIRST_SEED = 80_000
-SMALL = (0.02, 0.3)  # times the usual size: larger effects have their name from one sweep
+SMALL = (0.02, 0.3)  # times the usual size: larger effects are named after one sweep
 MORE = 2  # proposed experiments, one after the other
 OPEN = ("ambiguous", "partial")
-BUDGET = 300.0  # s that a look for the gap may take, as in an exploration
+BUDGET = 300.0  # s for a search for the gap, as in an exploration
 
 
 def run(seed: int) -> dict:
-    """Record a sweep; while the gap is in dispute, record what it proposes."""
+    """Record a sweep; while the explanation is open, record the proposed experiment."""
     drawn = draw(seed, effects=1 + seed % 2, sizes=SMALL)
     bench = VirtualBench(drawn.bench, seed=seed)
     began, looks = time.process_time(), []
@@ -64,14 +64,14 @@ def run(seed: int) -> dict:
 
 
 def look(folder: Path) -> Gap:
-    """Return the gap as the records stand, with what it proposes."""
+    """Return the gap of these records, with the proposed experiment."""
     submission = load_submission(folder)
     gap = investigate(analyse(submission), progress=lambda text: None, budget=BUDGET)
     return propose_for(gap, submission)
 
 
 def told(gap: Gap) -> dict:
-    """Return what a look says, and what it proposes."""
+    """Return the verdict of a gap, and its proposal."""
     return {
         "verdict": gap.verdict,
         "found": sorted(
@@ -89,7 +89,7 @@ def first_of(found: FoundEffect) -> float:
 
 
 def right(row: dict, *, after: int) -> bool:
-    """Is what is hidden named, after so many proposed experiments at most?"""
+    """Return whether the hidden effect is named after at most this number of experiments."""
     last = row["looks"][: after + 1][-1]
     return last["verdict"] == "named" and last["found"] == row["hidden"]
 

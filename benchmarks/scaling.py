@@ -45,7 +45,7 @@ PRICES = (0.02, 0.05)  # of a core-hour in a rented cluster, dollars or euros
 
 
 def measure(*, teams: int) -> dict[str, Any]:
-    """Return what one hand-in costs: worker, client, comparison, bytes."""
+    """Return the cost of one submission: worker, client, comparison, bytes."""
     costs: dict[str, Any] = {"seconds": {}}
     records, sizes, packing = [], [], 0.0
     with tempfile.TemporaryDirectory() as folder:
@@ -57,7 +57,7 @@ def measure(*, teams: int) -> dict[str, Any]:
                 task = Task(id=team.name, key=team.name, sources=(str(team),))
                 start = time.process_time()
                 grading = grade_task(task, rubric=rubric, scratch=base)
-                if number:  # the first one also loads what all of them need
+                if number:  # the first one also loads everything that all of them need
                     seconds.append(round(time.process_time() - start, 3))
                 book = len(grading.grade) + len(grading.fingerprints)
                 start = time.process_time()
@@ -68,7 +68,7 @@ def measure(*, teams: int) -> dict[str, Any]:
         handed_in, kept = np.mean(sizes, axis=0)
         costs |= {"handed_in": round(handed_in), "kept": round(kept)}
         costs["pack"] = round(packing / len(sizes), 4)  # on a cluster only
-        # What the one client process does for each: hash, hand on, store, compare, write.
+        # The client process handles each submission: hash, send, store, compare, write.
         write_class(base / "few", teams, preset=PRESETS[0])
         write_class(base / "many", 4 * teams, preset=PRESETS[0])
         grade(base / "few", base / "first", preset=PRESETS[0])  # loads what is needed
@@ -123,12 +123,12 @@ class Cluster:
     repair: float = 300.0
     hang: float = 0.0
     time_limit: float = 120.0
-    ahead: int = 2  # tasks under way for every core
+    ahead: int = 2  # tasks in progress per core
 
 
 @dataclass(frozen=True, kw_only=True)
 class Night:
-    """What became of a run: seconds to the last stored result, core-seconds done and done twice."""
+    """The result of a run: seconds to the last stored result, core-seconds done and repeated."""
 
     seconds: float
     busy: float
@@ -137,7 +137,7 @@ class Night:
 
 
 def simulate(n: int, service: np.ndarray, *, cluster: Cluster, seed: int) -> Night:
-    """Run n hand-ins through a cluster, event by event."""
+    """Simulate a cluster that grades n submissions, event by event."""
     rng = np.random.default_rng(seed)
     length = rng.choice(service, n)
     length[rng.random(n) < cluster.hang] = cluster.time_limit

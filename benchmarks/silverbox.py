@@ -35,10 +35,10 @@ TOOLS = ("pysindy", "sysidentpy", "scikit-learn")
 INTERVAL = 2**14 / 1e7  # s
 TRAIN = (40650, 105712)
 TESTS = {"multisine": (105712, 127400), "arrow": (100, 40575), "no extrapolation": (100, 32100)}
-START = 50  # samples of a test part to start from, which are not judged
+START = 50  # first samples of a test part, which are not judged
 
 
-# As their sources have them, mV on the parts of `TESTS`; `_NOTE` says how far they were checked.
+# Published errors, mV on the parts of `TESTS`; `_NOTE` says how far they were checked.
 _BASELINES = "baselines"
 _SYSIDENTPY = "[SysIdentPy's book](https://sysidentpy.org/book/0-Preface/)"
 PUBLISHED = (
@@ -134,7 +134,7 @@ cartlab's names are those of carts. An electronic circuit has no {effects}: that
 small remainder besides the cube and an offset.
 """
 _PIECE = 10_000  # samples
-# Nine samples a period: what smooths over more takes the motion away.
+# A period has nine samples; smoothing over more would remove the motion.
 _SETTINGS = {
     "PySINDy": {"windows": (1, 5)},
     "SysIdentPy, FROLS": {"thinnings": (1,), "lags": (2, 3), "degrees": (3,)},

@@ -1,4 +1,4 @@
-"""The joint fit on time records: how fast, how often it finds the chain, how honest its errors."""
+"""The joint fit on time records: its speed, success rate and standard errors."""
 
 import time
 
@@ -16,8 +16,8 @@ WORDS = """
 Other tools are compared in the [benchmarks](README.md).
 """
 TOOLS = ()
-NOISES = (0.0, 0.0005, 0.00227)  # cm: rounding alone, a fifth of a count, a count
-INSIDE = 1.96  # standard errors: 95 % of an honest estimate
+NOISES = (0.0, 0.0005, 0.00227)  # cm: rounding only, a fifth of a count, a count
+INSIDE = 1.96  # standard errors: 95 % of the estimates, if the standard errors are right
 
 
 def tables(*, quick: bool) -> list[Table]:

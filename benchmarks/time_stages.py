@@ -20,7 +20,7 @@ COUNT = 0.00227  # cm
 RATES = (113.1, 333.0, 1000.0)  # Hz
 DWELL_RATES = (113.1, 500.0)  # Hz
 ZETAS = (0.01, 0.03, 0.07, 0.15)
-INSIDE = 1.96  # standard errors: 95 % of an honest estimate
+INSIDE = 1.96  # standard errors: 95 % of the estimates, if the standard errors are right
 
 
 def record(t: Array, y: Array, *, kind: Kind, u: Array | None = None, omega: float | None = None):
@@ -63,7 +63,7 @@ def random_release(rng: np.random.Generator, *, zeta: float, fs: float, d: float
 
 
 def tables(*, quick: bool) -> list[Table]:
-    """Return the errors of the stages, and how often a decay is said to have dry friction."""
+    """Return the errors of the stages, and how often dry friction is reported in a decay."""
     seeds = 3 if quick else 300
     return [errors(decays=-(-seeds // 12), dwells=-(-seeds // 3)), friction(seeds)]
 
@@ -107,7 +107,7 @@ def _decay_errors(seeds: int, zeta: float, fs: float) -> Array:
 
 
 def friction(seeds: int) -> Table:
-    """Return how often a decay is said to have dry friction, by how much it has."""
+    """Return how often dry friction is reported in a decay, by its size."""
     rows = []
     for d in (0.0, 0.002, 0.01):
         present = []
