@@ -2,8 +2,9 @@
 
 The smallest assignment that asks for the same six numbers. A team types them into one cell, and
 each number is compared with that of `lab_reference.py` from the team's recordings. Both tools are
-used on their command lines: nbgrader's `generate_assignment`, `autograde` and `generate_feedback`; otter's
-`generate` and, without containers, `run`, with a submission zipped as by `otter.export`.
+used on their command lines: nbgrader's `generate_assignment`, `autograde` and
+`generate_feedback`; otter's `generate` and, without containers, `run`, with a submission zipped
+as by `otter.export`.
 """
 
 import json
