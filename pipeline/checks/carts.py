@@ -180,7 +180,7 @@ def _ask_if_there(name: str, *, bench: Bench) -> str:
 
 
 def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
-    meaning = "two routes through the transfer functions to one physical number agree"
+    meaning = "two ways from the transfer functions to the same physical number"
     return [
         Check(
             kind="redundancy",
@@ -188,7 +188,7 @@ def _redundancy_checks(values: Mapping[str, float]) -> list[Check]:
             outcome=passed(residual <= _REDUNDANCY),
             value=float(residual),
             limit=_REDUNDANCY,
-            message=f"Redundancy {name} ({meaning}): relative difference {residual:.1e}.",
+            message=f"Redundancy {name}: {meaning} differ by {residual:.1e} (relative).",
         )
         for name, residual in recover_from_parameters(values).residuals.items()
     ]

@@ -84,7 +84,7 @@ def _state_springs(submission: Submission) -> None:
     names = spring_names(submission.system.carts)
     if found.open:
         which = " or ".join(names[i - 1] for i in found.open)
-        comment = unsure(f"is there {which}? {found.why} ({', '.join(names)})")
+        comment = unsure(f"is there a spring {which}? {found.why} ({', '.join(names)})")
     else:
         comment = f"{', '.join(names)}: {found.why}"
     mark_system(submission.folder, "springs", doubt=comment, value=list(found.present))

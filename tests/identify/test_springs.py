@@ -78,9 +78,9 @@ def test_fill_marks_what_the_files_do_not_tell(tmp_path):
         next(line for line in text.splitlines() if line.startswith(key))
         for key in ("springs = ", "position = ")
     )
-    assert "# unsure: is there wall-1?" in springs
+    assert "# unsure: is there a spring wall-1?" in springs
     assert "# unsure: counts are whole numbers" in position
-    assert "springs: unsure: is there wall-1?" in done.stderr
+    assert "springs: unsure: is there a spring wall-1?" in done.stderr
     assert "position: unsure: counts are whole numbers" in done.stderr
     assert "or an encoder that is stuck" not in done.stdout  # its table says that it is held
     assert fill(folder).doubts == tuple(
