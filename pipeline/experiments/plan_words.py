@@ -100,7 +100,7 @@ def what_words(recording: Recording, submission: Submission) -> str:
         if recording.controller is not None:
             what += f", {recording.controller.type.replace('_', ' ')}"
             what += f" of cart {recording.controller.cart}"
-    return f"{what}; {recording.duration:.0f} s after {recording.settle:g} s of rest"
+    return f"{what}; {recording.duration:.0f} s, after {recording.settle:g} s of rest"
 
 
 def time_words(seconds: float) -> str:
