@@ -73,7 +73,7 @@ class Gone(Exception):
 
 @dataclass(kw_only=True)
 class Lab:
-    """What all people share: the desk's port, whether it runs, and whether the lab is over.
+    """The state that all people share: the desk's port, whether it runs, and whether the lab is over.
 
     Attributes
     ----------

@@ -15,7 +15,8 @@ EFFECT = Effect(
     parameters=(FORCE,),
     fingerprint="The peaks of a decay fall along a straight line, not an exponential. The cart "
     "stops abruptly, not always at the same position.",
-    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger swings.",
+    deciding_run="Free decays from two release distances: the fitted ζ is smaller for the larger "
+    "swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
     family="dry friction",

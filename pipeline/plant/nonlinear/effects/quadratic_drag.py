@@ -20,7 +20,8 @@ EFFECT = Effect(
         ),
     ),
     fingerprint="Large swings decay faster than small ones.",
-    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger swings.",
+    deciding_run="Free decays from two release distances: the fitted ζ is larger for the larger "
+    "swings.",
     reference="D. J. Inman, Engineering Vibration, 4th ed., section 1.10",
     axis="velocity",
 )
