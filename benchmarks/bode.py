@@ -305,8 +305,8 @@ def tables(*, quick: bool) -> list[Table]:
 
 
 _BETTER = """
-**Others are better** in speed and generality. `curve_fit` needs {least:.0f} to {most:.0f} times
-less time than cartlab. N4SID needs only the order and suits any linear system. Vector fitting
+**Others are better** in speed and generality. `curve_fit` is {least:.0f} to {most:.0f} times
+as fast as cartlab. N4SID needs only the order and suits any linear system. Vector fitting
 needs no initial values.
 """
 _NOTE = """
@@ -321,9 +321,9 @@ _NOTE = """
 - Nelder–Mead is `fminsearch` with its defaults, without weights, on magnitudes or their
   logarithms; with phases also on real and imaginary parts. `curve_fit` knows the standard error
   of each point. Vector fitting has one pair of poles for each cart and needs phases.
-- A record is a multisine from rest: three periods of 10 s at 50 Hz, up to 1 cm, with white noise
-  of 0.0007, 0.0023 and 0.007 cm. N4SID and ERA have the true order; N4SID has horizons of 40
-  samples (better here than the default 20), ERA 400 Markov parameters.
+- A record is a multisine from rest: three periods of 10 s at 50 Hz, up to 1 cm. White noise of
+  0.0007, 0.0023 or 0.007 cm is added. N4SID and ERA have the true order. N4SID has horizons of 40
+  samples (better here than the default 20). ERA has 400 Markov parameters.
 - Modal analysis (sdypy-EMA) has the responses of periods two and three from 0.3 to 8 Hz, and
   orders up to 40 (LSCF) or 20 (rational fractions). Of its stable poles, those nearest to the
   paper's initial values count. It returns no static gains.

@@ -73,7 +73,7 @@ class Gone(Exception):
 
 @dataclass(kw_only=True)
 class Lab:
-    """The state that all people share: the desk's port, whether it runs, and whether the lab is over.
+    """State shared by all people: the desk's port, whether it runs, whether the lab is over.
 
     Attributes
     ----------
