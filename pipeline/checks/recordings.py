@@ -25,7 +25,7 @@ from pipeline.words.numbers import abridge
 from pipeline.words.phrases import phrases
 
 _WORDS = phrases("checks")
-_SPELT_OUT = 3  # most names to list if they are a whole kind; else only their number
+_SPELT_OUT = 3  # a whole kind of up to so many records is listed by name
 _PLURAL = {"sine": "dwells", "step": "steps", "decay": "decays", "sweep": "sweeps"}
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from pipeline.arrays import Array
 
-_LAGS_SHARE = 1 / 3  # of the samples. At a rest after a step, residuals are correlated all the time
+# Lags to use, as a share of the samples. At a rest after a step, residuals stay correlated.
+_LAGS_SHARE = 1 / 3
 
 
 def _parzen(x: Array) -> Array:

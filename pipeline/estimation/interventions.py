@@ -20,16 +20,23 @@ from pipeline.estimation.sliding import most_around
 from pipeline.results import Intervention, Record
 
 _BULK = 2.0  # standard deviations of the law's residual, as in its fit
-_FAR, _BEGINS = 4.0, 1.5  # multiples of `_BULK`. The second one bounds a burst
-_SHARE, _TYPICAL = 0.3, 3.0  # of the force acting on the cart. Times the law's residual elsewhere
-_AROUND = 0.15  # s before and after. The force acting at that time is the largest within
-_REACH = 0.02  # s to each side of its middle. A window mostly sees this part
+# A burst exceeds the first multiple of `_BULK`. It begins and ends at the second.
+_FAR, _BEGINS = 4.0, 1.5
+# Least share of the force on the cart that a burst has. Least multiple of the share that the law
+# usually leaves.
+_SHARE, _TYPICAL = 0.3, 3.0
+# s before and after a window. The force acting there is the largest within.
+_AROUND = 0.15
+# s to each side of a window's middle; this part has most of the weight.
+_REACH = 0.02
 _GAP = 0.1  # s. Closer bursts are merged
 _LASTS = 0.06  # s above half its peak. An impact has 0.04, the width of a window
-_KNOWN = 0.03  # s of a burst that may be in a known state
+# s of a burst that must be in a known state, in which the law holds at other times.
+_KNOWN = 0.03
 _SWINGS = 3  # sign changes of a hand's force. An effect's force has many more
 _INSTANT = 0.03  # s. Nobody pushes twice at the same instant
-_BINS, _MOST, _VISITS = 20, 0.5, 5  # of a state's range. Share, and number, of its quiet windows
+# Bins of a state's range. Of the windows in a bin, this share and this number must be quiet.
+_BINS, _MOST, _VISITS = 20, 0.5, 5
 
 
 def find_interventions(records: Sequence[Record]) -> tuple[Intervention, ...]:

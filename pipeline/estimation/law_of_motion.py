@@ -24,7 +24,7 @@ _LAGS = (0.0, 0.02, 0.05)  # s. Trial delays of the input
 # drag and braking; dry friction, constant and proportional to the input.
 _OWN, _POSITION = 2, 3
 _SPRINGS, _DAMPERS, _DRY = slice(0, 8), slice(8, 13), slice(13, 15)
-_ROUNDS, _SETTLED = 30, 1e-3  # of reweighting. Relative change of the bulk at which it ends
+_ROUNDS, _SETTLED = 30, 1e-3  # most rounds of reweighting; relative change of the bulk at the end
 _BULK = 2.0  # standard deviations of the bulk. Data beyond are ignored
 
 

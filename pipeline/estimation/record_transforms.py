@@ -18,7 +18,8 @@ from pipeline.arrays import Array, ComplexArray
 from pipeline.estimation.noise import difference_gain
 from pipeline.results import Record
 
-_LEAST_INPUT_SHARE = 0.01  # of its strongest line. A weaker input does not excite the plant
+# Share of the input's strongest line. Where the input is weaker, it does not excite the plant.
+_LEAST_INPUT_SHARE = 0.01
 # The same relative to its strongest neighbour. At a null of the input's spectrum (every second
 # harmonic of a step on and off), any nonlinearity would be divided by almost zero.
 _LEAST_NEIGHBOUR_SHARE = 0.25

@@ -45,12 +45,15 @@ Shape = Literal["square", "triangle", "chirp"]
 _PERIOD = 5e-3  # s between samples. Several samples fall in a period
 _PER_CYCLE, _BEYOND = 10, 2.0  # samples per period at this multiple of the highest resonance
 _TIME = 12.0  # s. Approximate duration of a record
-_LONGEST = 4  # times as long at most. Used if the record would not settle its best pair
-_STEP = 1e-3  # relative. Change of an effect's parameter for a difference
-_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # A model with a smaller share of the best weight is out
-_DECIDED = CLOSE_BIC * THINNING  # Sum of squares that settles a pair
-_LEAST_WEIGHT = 0.1  # Smallest share. Correlated residuals make the criterion look too certain
-_SAME = 1e-9  # Of the largest effect on the motion. Smaller ones are not visible
+# A record may be so many times longer, if otherwise it would not settle its best pair.
+_LONGEST = 4
+_STEP = 1e-3  # relative change of an effect's parameter for a difference
+_HOPELESS = np.exp(-0.5 * CLOSE_BIC)  # a model with a smaller share of the best weight is out
+_DECIDED = CLOSE_BIC * THINNING  # sum of squares that settles a pair
+# Least weight of a model. Correlated residuals make the criterion look too certain.
+_LEAST_WEIGHT = 0.1
+# Parameters with a smaller share of the largest effect on the motion are not visible.
+_SAME = 1e-9
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -18,7 +18,8 @@ Tones = tuple[tuple[int, float, float], ...]
 Lines = NDArray[np.int64]  # numbers of harmonics
 
 _QUANTA = 16  # equal parts of the motion's power. Each goes to the most informative line
-_LOW, _HIGH = 0.3, 1.6  # times the first and the last resonance. The lines lie between
+# The lines lie between these multiples of the first and the last resonance.
+_LOW, _HIGH = 0.3, 1.6
 _CLIP_AT = 0.8  # share of the peak
 _DIGITS = 4  # of shares and phases in the file
 

@@ -33,8 +33,9 @@ from pipeline.words.numbers import count
 from pipeline.words.progress import Progress
 from pipeline.workflow import analyse
 
-AIM = 0.4  # of the travel limit. The intended motion of the carts
-FURTHEST = 0.8  # of the travel limit. Allowed for a transient, as the first model may be wrong
+AIM = 0.4  # the intended motion of the carts, as a share of the travel limit
+# The motion allowed for a transient, as a share of the travel limit; the first model may be wrong.
+FURTHEST = 0.8
 
 # About 1 cm in common units; an ECP 210 has 440 counts per centimetre.
 _ABOUT_1_CM = {"m": 0.01, "cm": 1.0, "mm": 10.0, "in": 0.4, "count": 440.0, "counts": 440.0}
@@ -49,7 +50,7 @@ _FIRST_SETTLE = 5.0  # s
 FIRST_SWEEP_TIME = _SWEEP_TIME + _FIRST_SETTLE  # s, on every bench
 
 _DWELLS = 24
-_STEP = 0.9  # of the aim. The final level of a step; it overshoots up to twice as far
+_STEP = 0.9  # the final level of a step, as a share of the aim; it overshoots up to twice as far
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,7 +29,8 @@ BIC_DROP, SAME_LAW = 20.0, 6.0
 # the truth is missing, and a note says so.
 ENOUGH_NOISE, ENOUGH_REPEATS, FURTHER = 2.0, 1.5, 1.3
 SURE = 3.0  # standard errors. An effect nearer to zero is not named
-PARTIAL_GAIN = 0.9  # of the error. Worth reporting if too much is left for a name
+# Share of the error that may remain after an effect, if the gap cannot be named.
+PARTIAL_GAIN = 0.9
 # For a law beside a play: it must remove this share of the excess. The contact of a model that
 # follows the record is rigid, and another law would absorb the error of the bounce.
 CONTACT_GAIN = 0.5
@@ -37,7 +38,7 @@ CONTACT_GAIN = 0.5
 # A rival has an error within 15 %. Its criterion is closer than a tenth of the gain, and closer
 # than twice the gain that an effect needs.
 CLOSE_ERROR, CLOSE_GAIN, CLOSE_BIC = 1.15, 0.10, 2.0 * BIC_DROP
-MOSTLY = 0.5  # of the error. Above this, most of it is unexplained
+MOSTLY = 0.5  # above this share of the baseline's error, most is unexplained
 NEAR_FLOOR = 1.5  # times the noise. Above this, most of the squared error is not noise
 
 # A constant force must reach all three limits: in standard errors, as every cart is tested; as a

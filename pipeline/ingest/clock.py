@@ -18,12 +18,14 @@ from pipeline.ingest.formats.table import FileTable
 SLOW = 0.5  # s between samples. No bench records more slowly
 FEWEST_SAMPLES = 8  # fewest samples for any estimate
 _GAP = 4.0  # usual intervals. After so long without a sample, time is missing
-_ROUNDING_BAND = 0.65  # of the rounding step. Half of it, plus the error of a short piece's fit
+# Distance of a stamp from its line, in rounding steps: half a step, plus the fit's error.
+_ROUNDING_BAND = 0.65
 # Widths of a strip around a line, in rounding steps: 1 if stamps are only rounded, more if some
 # ticks of the clock are late.
 _BANDS = (1.0, 1.02, 1.05, 1.1, 1.2, 2 * _ROUNDING_BAND)
-_HAIR = 1e-6  # of a rounding step. The error of doubles
-_NO_ROOM = 10 * _HAIR  # a smaller range of slopes comes from stamps that flicker, not from time
+_HAIR = 1e-6  # error of doubles, in rounding steps
+# A smaller range of slopes is due to flickering stamps, not to time.
+_NO_ROOM = 10 * _HAIR
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -17,16 +17,19 @@ from pipeline.ingest.clock import SLOW, read_clock
 from pipeline.ingest.formats.table import FileTable
 from pipeline.submission.models import MOST_CARTS
 
-_JUMP = 0.2  # of its range between two samples. No cart moves so fast
+# Share of its range that a column changes between two samples; no cart moves so fast.
+_JUMP = 0.2
 _ADVANCES = 0.2  # share of samples that advance. A clock may have rounded stamps
 _EQUAL = 0.05  # relative rms difference of a position and its reference
 _ALIKE = 0.999  # correlation of one signal in two scales
 _FASTEST = 1e-5  # s between samples. No bench records faster
 _CLEARER = 0.5  # ratio of the unexplained shares of acceleration, best input to next best
-_FOLLOWS = 0.5  # unexplained share. Columns that an input moves stay below
+# Unexplained share of acceleration. It is smaller for columns that an input moves.
+_FOLLOWS = 0.5
 _PURER = 0.1  # ratio of the curvatures that are not a sine, purest column to next
-_FREE = 0.1  # unexplained share. Carts in free motion stay below
-_WINDOW = 0.4  # of the period of the fastest motion
+# Unexplained share of acceleration. It is smaller for carts in free motion.
+_FREE = 0.1
+_WINDOW = 0.4  # length of a window, as a share of the fastest period
 _FEWEST, _MOST_WINDOWS = 9, 4000
 
 

@@ -20,7 +20,7 @@ COUNT = 0.00227  # cm
 
 # A hand trembles by hundredths of a millimetre at these rates, so it does not hold like a clamp.
 _TREMOR_HZ = np.array([1.3, 4.1, 8.7])
-_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # of the distance from rest, while held
+_TREMOR_AMPLITUDE = np.array([4e-3, 2e-3, 1e-3])  # as a share of the distance from rest
 _SHORTEST_STEP = 1e-5  # s of simulator time. With it, a session takes half an hour to simulate
 
 

@@ -16,8 +16,9 @@ _WORDS = phrases("soundness")
 # Independent records, or kinds of record, that must agree. A single one may be wrong by chance.
 WITNESSES = 2
 SIGMAS = 4.0  # standard errors. By chance one number in 16,000 is as far off
-SAME = 0.02  # relative. For an encoder step, a clock or a length that a program sets for all
-SAME_SIZE = 0.2  # relative. Friction affects two such steps equally
+# Relative difference of an encoder step, a clock or a length that a program sets for all.
+SAME = 0.02
+SAME_SIZE = 0.2  # relative difference of two step sizes that friction affects equally
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,8 +11,10 @@ from pipeline.set_up import Bench
 from pipeline.soundness.fault import RecordingFault, say
 
 OTHER_DWELL = 0.1  # relative. A dwell this far from its stated frequency is another dwell
-LEAST_SHARE = 0.2  # of a held cart's swing. A cart that moves less is not the free one
-_HELD_FIRMLY = 0.05  # of the free carts' swing. A cart that is held firmly moves less
+# Share of a held cart's swing. If a cart that should be free moves less, it is not the free one.
+LEAST_SHARE = 0.2
+# Share of the free carts' swing. A cart that is held firmly moves less.
+_HELD_FIRMLY = 0.05
 _LONGEST = 3.0  # m. No bench has a longer track
 _LONGEST_WHOLE = 0.5  # m. Limit if all readings are whole numbers, as counts are
 _LARGEST = 100.0  # V. No amplifier at a bench gives as much

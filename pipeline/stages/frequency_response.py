@@ -22,7 +22,8 @@ from pipeline.names import (
 )
 from pipeline.results import Estimate, FrequencyResponse, Record, SinePoint
 
-_LARGEST_RELATIVE_STD = 0.2  # of a record's response. Frequencies with more are dropped
+# Largest relative standard error of a record's response; other frequencies are dropped.
+_LARGEST_RELATIVE_STD = 0.2
 # Two dwells are repeats if their frequencies differ by less than this. A fitted frequency is
 # accurate to some 1e-4. Within that, no response changes by more than its standard error.
 _SAME_FREQUENCY = 1e-3
@@ -31,8 +32,10 @@ _SMALLEST_RELATIVE_STD = 1e-6
 
 
 # Peaks and nulls.
-_CLEAR_FALL = 3.0  # times below the low-frequency level, at twice its frequency: a mode was passed
-_LOW_SHARE = 0.7  # of the first resonance. Below it, the magnitude gives the gain
+# A mode was passed if the response at twice its frequency is so many times below the low level.
+_CLEAR_FALL = 3.0
+# Share of the first resonance. Below it, the magnitude gives the static gain.
+_LOW_SHARE = 0.7
 
 
 # ---------------------------------------------------------------------- dwells

@@ -15,7 +15,8 @@ from pipeline.estimation.peaks import extrema, plateaus
 from pipeline.results import Record, StepEdge, StepGain
 
 _MOVED = 6.0  # grains (see `_FLAT`). A smaller motion does not count
-_EXTRAPOLATES = 0.02  # of the motion. Largest residual and error of an extrapolated level
+# Largest residual and standard error of an extrapolated level, as shares of the motion.
+_EXTRAPOLATES = 0.02
 _STICKS_SIGMAS = 4.0  # standard errors. By chance one edge in 16,000 is as far off
 _MIN_SAMPLES = 12
 # Motion is counted in grains. A grain is the encoder step, or the step whose rounding error equals

@@ -18,7 +18,8 @@ SETTLED = ("named", "none")
 # Separation squared times seconds: a recording below this limit cannot decide between explanations.
 # With 200 readings a second, of which every tenth is independent, the criterion would differ by 20.
 _APART = 1.0
-_HARD = 0.8  # of the amplitude that moves the carts as far as allowed; from here on it is as good
+# A recording with this share of the largest allowed amplitude is as good as the largest.
+_HARD = 0.8
 _FAR_OUT = "far"  # the aim of a recording that shows effects at large motion
 
 

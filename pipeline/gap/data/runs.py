@@ -15,8 +15,10 @@ from pipeline.results import Record
 
 _STILL = 2.6  # encoder steps, peak to peak. A smaller range counts as rest
 _SMOOTHING = 0.03  # s, half width of a local cubic. For a bench of carts
-_HELD_SAMPLES = 4  # a hold at the top of the motion has at least so many samples
-_HELD_TIME = 2.0  # and lasts at least this many times a free passage of the top
+# A hold at the top of the motion has at least so many samples. It lasts at least `_HELD_TIME` times
+# as long as a free passage of the top.
+_HELD_SAMPLES = 4
+_HELD_TIME = 2.0
 _RESTING = 1.5  # encoder steps. The range of the readings of a cart at rest
 _ONE_READING = 0.07  # s. At rest, this time counts as one independent reading
 

@@ -21,7 +21,7 @@ from pipeline.words.progress import Progress, silent
 CLOSE, LOOSE, FREE = 0.5, 0.1, 0.0  # gains: the share of the error that corrects the model
 _FIRST = 25  # iterations of the first fit. Its chain may be far off.
 _FEW = 6  # iterations of a fit that only shows whether a rival comes near
-_SHORT_LIST = 4  # number of laws with a shape to refit.
+_SHORT_LIST = 4  # number of laws with a shape to refit
 
 
 def start_all(records: Records, *, springs: Sequence[bool], chains: Sequence[Chain]) -> Follow:

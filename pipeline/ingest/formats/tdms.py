@@ -34,7 +34,7 @@ _MOST_METADATA = 10_000_000  # bytes
 _MOST_OBJECTS = 1_000
 _MOST_VISITS = 2_000_000  # limit; npTDMS visits each object in each segment
 _MOST_VALUES, _MOST_CHUNKS = 5_000_000, 200_000
-_SETTING = 0.1  # of the longest channel. Shorter channels are settings, as in a .mat file
+_SETTING = 0.1  # share of the longest channel; shorter channels are settings, as in a .mat file
 _MOST_NAMED = 8
 _TIME = re.compile(r"\s*(elapsed[ _])?(t|times?|time[ _]?stamps?)\s*([\[(].*)?", re.IGNORECASE)
 

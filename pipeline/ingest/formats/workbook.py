@@ -15,7 +15,8 @@ from pipeline.ingest.formats.text import checked_names, is_bench_log, with_units
 from pipeline.ingest.formats.workbook_cells import Book, Cells
 from pipeline.words.numbers import first_few
 
-# Of the longest. Shorter columns and tables are settings, like shorter vectors of a .mat file.
+# Share of the longest column. Shorter columns and tables are settings, like shorter vectors of a
+# .mat file.
 _SETTING = 0.1
 _MOST_NAMED = 8
 _PARTS = (b"[Content_Types].xml", b"docProps/", b"xl/")  # one of these occurs early in the archive
