@@ -34,8 +34,8 @@ from pipeline.experiments.plan import PlanLimits, Recording
 from pipeline.experiments.plan_words import hold_words
 
 SILENCE = 0.5  # s without a byte during a run, after which the bench counts as gone
-# Ms around the planned end; silence that begins earlier is a fault, and so are lines that come
-# later.
+# Milliseconds around the planned end: silence that begins earlier is a fault, and so are lines
+# that come later.
 _NEARLY = 100.0
 # Counts; a resting cart may flicker by so many, and in a valid run a free cart moves more.
 _STILL = 4

@@ -418,7 +418,7 @@ def is_marked(doubt: str, marks: Sequence[str]) -> bool:
 
 
 def _mark(doubt: str) -> str:
-    """Return the comment that marks a doubt, shortened as in the file."""
+    """Return the comment that marks a doubt, shortened to fit on a line of the file."""
     return comment_text(UNSURE + doubt)
 
 

@@ -60,7 +60,7 @@ def class_so_far(rows: Mapping[str, Member], book: Gradebook) -> SoFar:
 
 
 def _others(before: Member, now: Member) -> bool:
-    """Return whether a submission now has another team; without known authors, it has not."""
+    """Return whether a submission now has another team (False if authors are unknown)."""
     return _strangers(before, now) and not same_number(before.owner, now.owner)
 
 

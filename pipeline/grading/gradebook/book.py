@@ -151,7 +151,7 @@ class Gradebook:
     def listed(self) -> Iterator[Member]:
         """Yield the submissions of the current class list, without fingerprints.
 
-        None before the first.
+        Before the first batch the list is empty.
         """
         with self._database.reading() as connection:
             last = self._newest(connection)
@@ -404,7 +404,7 @@ class Gradebook:
         return last, connection.execute(line).one()
 
     def _find_ever(self, connection: Connection, team: str) -> Row:
-        """Return the row of a team, even if it was graded but is no longer in the class list."""
+        """Return the row of a team, from its gradings if the class list no longer has it."""
         try:
             return self._find(connection, team)[1]
         except ConfigError:

@@ -69,12 +69,12 @@ class Line(GradeTable):
 
     @cached_property
     def judged(self) -> dict[str, Judged]:
-        """Its criteria by id."""
+        """The criteria by id."""
         return {criterion["id"]: criterion for criterion in self.criteria}
 
     @property
     def codes(self) -> tuple[Code, ...]:
-        """The codes of its flags, each once."""
+        """The codes of the flags, each once."""
         return tuple(dict.fromkeys(flag["code"] for flag in self.flags))
 
     @property

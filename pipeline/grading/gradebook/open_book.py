@@ -505,7 +505,7 @@ def _read_override(row: Row) -> HandPoints:
 
 
 def newest_overrides(connection: Connection, submitted: Iterable[int]) -> dict[int, dict[str, Row]]:
-    """Return the last points by hand, by the number of the submission and the criterion."""
+    """Return the last override of each criterion, by number of submission and by criterion."""
     rows = connection.execute(_overrides().where(overrides.c.submission_id.in_(set(submitted))))
     newest: dict[int, dict[str, Row]] = defaultdict(dict)
     for row in rows:
@@ -514,7 +514,7 @@ def newest_overrides(connection: Connection, submitted: Iterable[int]) -> dict[i
 
 
 def name_version(row: Row, newest: Row | None) -> str:
-    """Name the state behind the points of a criterion: the grading, and the last points by hand."""
+    """Return the version of a criterion's points: numbers of its grading and its last override."""
     return f"{row.id}.{newest.id if newest is not None else 0}"
 
 

@@ -291,7 +291,7 @@ def points_lost(grade: Grade, rubric: Rubric) -> frozenset[str]:
 
 
 def _read_queued(connection: Connection, last: Row, events: Sequence[Row]) -> list[Queued]:
-    """Return requests given by their newest events; there are five queries, however many."""
+    """Return requests, given by their newest events, in five queries."""
     positions = {event.position for event in events}
     rows = connection.execute(class_list(last).where(entries.c.position.in_(positions))).all()
     read = [(row, read_flag(row.shared)) for row in rows]
@@ -310,7 +310,7 @@ def _read_queued(connection: Connection, last: Row, events: Sequence[Row]) -> li
 
 
 def _name_version(points: str, request: Request) -> str:
-    """Name the state of a request that an answer must have seen."""
+    """Return the version of a request, which an answer must name."""
     return f"{points}.{request.number}"
 
 

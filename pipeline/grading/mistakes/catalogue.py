@@ -287,7 +287,7 @@ def _peaks(turns: Mapping[str, StepTurns]) -> Iterator[Mistake]:
 
 
 def _swinging(turns: Mapping[str, StepTurns], gains: Numbers) -> Iterator[Mistake]:
-    """Yield later turning points of steps that were read as settled levels."""
+    """Yield the mistake of reading a later turning point of a step as its settled level."""
     edges = {edge for one in turns.values() for edge in one.by_edge}
     for edge, turn in itertools.product(sorted(edges), (1, 2)):
         later = {n: e for n, t in turns.items() if (e := t.turn(edge, turn)) is not None}

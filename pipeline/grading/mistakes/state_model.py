@@ -170,7 +170,7 @@ def _own_names(i: int, n: int) -> tuple[str, str]:
 def _implied(values: Mapping[str, float], n: int) -> Array | None:
     """Return the [A B] of the chain that a table's transfer functions imply.
 
-    None if they imply none.
+    None if there is no such chain.
     """
     chain = own_chain(values, n=n)
     return None if chain is None else _matrices(chain)
@@ -340,7 +340,7 @@ def _backwards(A: Array, B: Array, *, n: int, tied: bool) -> Harm | None:
     """Return `wrong_way` if a positive input drives or holds a cart on the negative side."""
     orders = [np.arange(2 * n), *(np.argsort(order) for _, order in _reordered(n))]
     meant = [A[np.ix_(o, o)] for o in orders]
-    # Only in the right order of the states is each position followed by its velocity.
+    # If the states are in the right order, each position is followed by its velocity.
     kinematic = np.eye(2 * n)[1::2]
     known = [i for i, one in enumerate(meant) if np.allclose(one[0::2], kinematic)] or [0]
     ways = [_drives_back(meant[i], b, tied=tied) for i in known for b in (B[orders[i]], B)]

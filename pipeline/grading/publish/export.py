@@ -4,9 +4,8 @@ Each format is a table with a row for every student. If the platform's own expor
 is given, its rows and columns stay and only the grades are filled in.
 
 - Canvas: the CSV of its gradebook, read by `lib/gradebook_importer.rb`. It finds students by `ID`,
-  `SIS User ID` or `SIS Login ID`, and the assignment by its title, which may be followed by its id
-  in
-  brackets.
+  `SIS User ID` or `SIS Login ID`. It finds the assignment by its title, which may be followed by
+  its id in brackets.
 - Moodle: the offline grading worksheet of one assignment (`mod/assign/feedback/offline`), if the
   participant numbers are known; otherwise the table for *Import CSV* of its gradebook.
 - Gradescope: the table of its *Download Grades*, and a `results.json` for each submission, as an

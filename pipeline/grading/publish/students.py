@@ -70,8 +70,8 @@ class Remark:
 def one_of(several: Sequence[Student]) -> Student:
     """Combine the entries that one student has from several submissions.
 
-    An entry with points wins over one without. If the points differ, the student has none until a
-    person decides.
+    An entry with points wins over one without. If the points differ, the student gets no
+    points until a person decides.
     """
     if undecided := [student for student in several if student.undecided]:
         return undecided[0]

@@ -83,7 +83,7 @@ class Print:
     def noise(self) -> np.ndarray:
         """The residual (n_rows, n) in standard deviations.
 
-        0 near sudden changes of motion or input.
+        It is 0 near sudden changes of motion or input.
         """
         sigmas = self.residual.astype(np.float32) / STEPS_PER_SIGMA
         for row in sigmas:

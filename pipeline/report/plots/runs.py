@@ -54,7 +54,7 @@ class ComparedCart:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ComparedRun:
-    """One run.
+    """One run: each cart as measured and as simulated by each model.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ def _driven(
 ) -> tuple[dict[int, list[Simulated]], str]:
     """Return, by cart, a run simulated with the measured input and with the loop that ran.
 
-    And a note.
+    The text is a note for the reader of the plot.
     """
     checks = [check for check in analysis.hardware if check.experiment == record.id]
     checks = checks or list(check_hardware(record, chain))
