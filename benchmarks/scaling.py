@@ -23,7 +23,8 @@ import numpy as np
 
 from benchmarks.grading_batch import disguised, grade, write_class
 from benchmarks.page import significant
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradings import Member
 from pipeline.grading.intake.files import packed
 from pipeline.grading.rubric_file import load_rubric

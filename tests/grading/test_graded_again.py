@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.batch.runner import code_version, grade_batch
-from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.batch.task import Setup, Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.files import digest, packed, unpacked
 from pipeline.grading.intake.hand_ins import find_hand_ins

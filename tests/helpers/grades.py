@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.batch.task import Setup, Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Criterion, Flag, Grade, grade_text
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.schema import FILE

@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 
 from pipeline.grading.batch.runner import Grader
-from pipeline.grading.batch.worker import Setup, Task
+from pipeline.grading.batch.task import Setup, Task
 from pipeline.grading.grade import read_grade
 from pipeline.grading.publish.gradescope import results_text
 from pipeline.grading.rubric_file import load_rubric

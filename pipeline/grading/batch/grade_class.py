@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pipeline.errors import ConfigError, PipelineError
 from pipeline.grading.batch.runner import Executor, Progress, grade_batch, run_here, silent
-from pipeline.grading.batch.worker import Setup
+from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.class_lines import wrong_springs
 from pipeline.grading.gradings import Batch
@@ -22,7 +22,6 @@ from pipeline.grading.publish.outputs import write_outputs
 from pipeline.grading.rubric import Rubric
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.similarity.prints import fingerprint
-from pipeline.ingest.read import read_data
 from pipeline.lock import alone_in
 from pipeline.output import OWNERS_FOLDER, named_folder, own_folder
 from pipeline.resources import EXAMPLES
@@ -271,6 +270,8 @@ def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
     ------
     ConfigError : an example of the rubric cannot be read.
     """
+    from pipeline.ingest.read import read_data  # loads all readers of files
+
     for example in rubric.examples:
         try:
             data = read_data(load_submission(folder / example))

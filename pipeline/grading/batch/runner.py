@@ -12,7 +12,7 @@ from pathlib import Path
 import pipeline
 from pipeline.errors import ConfigError
 from pipeline.grading.batch.so_far import class_so_far
-from pipeline.grading.batch.worker import OUT_OF_MEMORY, Setup, Task, failed, read_grading
+from pipeline.grading.batch.task import OUT_OF_MEMORY, Setup, Task, failed, read_grading
 from pipeline.grading.grade import Flag
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradings import Batch, Grading, Member

@@ -1,16 +1,16 @@
 """The process that grades one submission after another and can be stopped at a limit."""
 
-import base64
 import re
 import tempfile
 import traceback
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import PipelineError, is_disk_full
-from pipeline.grading.grade import Grade, grade_text
+from pipeline.grading.batch.task import OUT_OF_MEMORY, Task, failed, plain_grading
+from pipeline.grading.grade import grade_text
 from pipeline.grading.gradings import Grading
 from pipeline.grading.intake.files import Changed, open_submission
 from pipeline.grading.judge.reweigh import findings_text
@@ -23,49 +23,9 @@ from pipeline.submission import Submission, load_submission
 from pipeline.submission.complaints import quote
 from pipeline.submission.load import MAX_TOML_BYTES, NAME
 
-OUT_OF_MEMORY = "needs more memory than allowed"
 _DETAIL = 20_000  # characters of a traceback
 _TABLE = re.compile(r"\s*\[+\s*([\w.-]+)")
 _ID = re.compile(r"""\s*id\s*=\s*["'“”„]?([^"'“”#]+)""")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Setup:
-    """Settings for grading, the same for all submissions of a batch.
-
-    Attributes
-    ----------
-    scratch : folder for copies of the submissions during grading.
-    time_limit : for each submission, in s.
-    memory_limit : for each submission, in bytes beyond the worker's own need.
-    figures : draw the figures of the feedback.
-    """
-
-    rubric: Rubric
-    scratch: Path
-    time_limit: float = 120.0
-    memory_limit: int = 1_000_000_000
-    figures: bool = False
-
-
-@dataclass(frozen=True, kw_only=True)
-class Task:
-    """One submission to grade.
-
-    Attributes
-    ----------
-    id, owner, days_late : see `intake.HandIn`.
-    key : hash of everything that affects the outcome; see `gradings.Member`.
-    sources : paths of the submitted files.
-    digest : the hash of the files that the key contains; "" if it need not be checked.
-    """
-
-    id: str
-    key: str
-    sources: tuple[str, ...]
-    digest: str = ""
-    owner: str = ""
-    days_late: float = 0.0
 
 
 def grade_task(task: Task, *, rubric: Rubric, scratch: Path, figures: bool = False) -> Grading:
@@ -165,59 +125,6 @@ def _figures(
 
 def _traceback() -> str:
     return traceback.format_exc()[-_DETAIL:]
-
-
-def failed(
-    task: Task,
-    reason: str,
-    *,
-    out_of: float,
-    authors: Sequence[str] = (),
-    settled: bool = True,
-    detail: str = "",
-) -> Grading:
-    """Return the outcome of a submission that could not be graded.
-
-    Parameters
-    ----------
-    reason : one reason per line.
-    out_of : points of the rubric.
-    settled : whether the outcome is final; if not, the next run tries again.
-    detail : traceback of an error in the grader.
-    """
-    lines = (" ".join(line.split()) for line in reason.split("\n"))
-    reason = "".join(c if c.isprintable() or c == "\n" else "�" for c in "\n".join(lines))
-    people = tuple(authors)
-    grade = Grade.failed(task.id, reason, out_of=out_of, authors=people, days_late=task.days_late)
-    return Grading(
-        submission=task.id,
-        authors=people,
-        key=task.key,
-        status="failed",
-        reason=reason,
-        settled=settled,
-        days_late=task.days_late,
-        grade=grade_text(grade),
-        owner=task.owner,
-        detail=detail,
-    )
-
-
-def plain_grading(outcome: Grading) -> dict[str, Any]:
-    """Return an outcome as a dictionary that JSON can store."""
-    return asdict(outcome) | {"fingerprints": base64.b64encode(outcome.fingerprints).decode()}
-
-
-def read_grading(plain: Mapping[str, Any]) -> Grading:
-    """Return the outcome from a dictionary that `plain_grading` made and JSON stored."""
-    return Grading(
-        **{
-            **plain,
-            "fingerprints": base64.b64decode(plain["fingerprints"]),
-            "authors": tuple(plain["authors"]),
-            "figures": tuple((name, svg) for name, svg in plain["figures"]),
-        }
-    )
 
 
 def _prepare(

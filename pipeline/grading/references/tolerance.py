@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from decimal import Decimal
 from fractions import Fraction
 from functools import lru_cache
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
-from pipeline.grading.references.reference import Reference
 from pipeline.grading.rubric import Late
+
+if TYPE_CHECKING:
+    from pipeline.grading.references.reference import Reference
 
 Number = TypeVar("Number", float, Fraction)
 
@@ -50,7 +52,7 @@ def exact(value: float) -> Fraction:
     return Fraction(repr(value))
 
 
-def percent_off(typed: Decimal, reference: Reference, *, sigmas: float) -> Fraction:
+def percent_off(typed: Decimal, reference: "Reference", *, sigmas: float) -> Fraction:
     """Return the error of a number against its reference, in percent of the smaller of the two.
 
     So an error of 5 % is a factor of 1.05 either way. Rounding, and `sigmas` standard errors of the
@@ -89,7 +91,7 @@ class Typed:
             digits=len(typed.as_tuple().digits),
         )
 
-    def percent_off(self, reference: Reference, *, sigmas: float) -> float:
+    def percent_off(self, reference: "Reference", *, sigmas: float) -> float:
         """Return the same as the function `percent_off`, in floating point.
 
         Not for exact limits.

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from pipeline.grading.grade import Flag
 
@@ -87,6 +85,11 @@ def renamed(clusters: Iterable[Cluster], names: Mapping[str, str], *, other: str
 
 def _joined(pairs: Sequence[tuple[Any, Any]]) -> list[tuple[Any, ...]]:
     """Join pairs that have an element in common into sorted groups."""
+    if not pairs:
+        return []
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     nodes = sorted({node for pair in pairs for node in pair})
     at = {node: i for i, node in enumerate(nodes)}
     ends = np.array([(at[a], at[b]) for a, b in pairs], dtype=int).reshape(-1, 2).T

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import next_fast_len
 
 from pipeline.grading.similarity.prints import PASSED, STEPS_PER_SIGMA, Print
 
@@ -173,6 +172,8 @@ def equal_rows(a: Print, b: Print, *, shift: int) -> Likeness | None:
 
 def align(a: Print, b: Print) -> tuple[float, int]:
     """Return the best agreement of the noise of two recordings, and the shift that gives it."""
+    from scipy.fft import next_fast_len
+
     n = a.residual.shape[1] + b.residual.shape[1]
     length = next_fast_len(n, real=True)
     spectrum = np.conj(np.fft.rfft(a.noise, length)) * np.fft.rfft(b.noise, length)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from math import isqrt
 
 import numpy as np
-from scipy.linalg import expm
 
 from pipeline.arrays import Array
 from pipeline.plant.linear.chain import Chain
@@ -51,6 +50,8 @@ def propagate(A: Array, B: Array, t: Array, u: Array, *, x0: Array, linear: bool
     exact. It uses the matrix exponential of the augmented system (Van Loan, IEEE Trans. Automatic
     Control 23, 1978), one for each distinct interval.
     """
+    from scipy.linalg import expm  # a tenth of a second: imported where it is used
+
     n_states = A.shape[0]
     n_augmented = n_states + (2 if linear else 1)
     augmented = np.zeros((n_augmented, n_augmented))

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import brentq, minimize_scalar
 
 from pipeline.arrays import Array, ComplexArray
 from pipeline.errors import DataError
@@ -114,6 +113,8 @@ def stability_margins(
 
 def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
     """Return where a real curve crosses zero; `omega` must separate the crossings."""
+    from scipy.optimize import brentq  # a fifth of a second: imported where it is used
+
     sign = np.sign(curve(omega))
     between = np.flatnonzero(sign[1:] * sign[:-1] < 0)
 
@@ -126,6 +127,8 @@ def _crossings(curve: Callable[[Array], Array], omega: Array) -> Array:
 
 def _least(curve: Callable[[Array], Array], omega: Array) -> float:
     """Return the least value of a curve, searched around the frequency where it is least."""
+    from scipy.optimize import minimize_scalar
+
     omega = np.unique(omega)
     values = curve(omega)
     i = int(values.argmin())

@@ -20,7 +20,8 @@ from pipeline.errors import ConfigError
 from pipeline.grading.autograder import run
 from pipeline.grading.autograder.pack import write_autograder
 from pipeline.grading.autograder.pins import pin_requirements
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import Grade, read_grade
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.resources import RUBRICS

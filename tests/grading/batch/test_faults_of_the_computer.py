@@ -12,7 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.unpack import HAND_IN, unpack
 from pipeline.grading.rubric_file import load_rubric
@@ -108,7 +109,8 @@ def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
 _STARVED = """
 import json, resource, sys
 from pathlib import Path
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.rubric_file import load_rubric
 
 source, scratch, limit, *soft = sys.argv[1:]

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from pipeline.grading.batch.runner import Grader, grade_batch, run_here
-from pipeline.grading.batch.worker import Setup, Task, grade_task
+from pipeline.grading.batch.task import Setup, Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import grade_text, read_grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pipeline.grading.batch.runner import grade_batch
-from pipeline.grading.batch.worker import Setup
+from pipeline.grading.batch.task import Setup
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.intake.hand_ins import find_hand_ins
 from pipeline.grading.publish.rubric_preview import preview_rubric

@@ -7,7 +7,8 @@ import sys
 import jsonschema
 import pytest
 
-from pipeline.grading.batch.worker import Task, grade_task
+from pipeline.grading.batch.task import Task
+from pipeline.grading.batch.worker import grade_task
 from pipeline.grading.grade import read_grade
 from pipeline.grading.rubric_file import load_rubric
 from pipeline.grading.self_check.log import FILE, read_answers
