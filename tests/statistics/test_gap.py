@@ -21,7 +21,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
         pytest.param("presliding_friction", 1, marks=LONG),
         pytest.param("cubic_spring", 2, marks=LONG),
         pytest.param("slack_spring", 1, marks=LONG),
-        ("drive_damping", 1),
+        pytest.param("drive_damping", 1, marks=LONG),
         pytest.param("dead_zone", 1, marks=LONG),
         ("input_delay", 1),
         ("extra_mode", 1),
@@ -78,12 +78,12 @@ def test_two_effects_are_found_together():
 @pytest.mark.parametrize(
     ("effect", "hardness", "part"),
     [
-        pytest.param("end_stop", 25.0, 0.6, marks=LONG),
+        pytest.param("end_stop", 25.0, 0.6, marks=pytest.mark.slow),
         ("slack_spring", 3.0, 0.6),
         pytest.param("end_stop", 5.0, 0.9, marks=LONG),
-        pytest.param("end_stop", 5.0, 0.6, marks=LONG),
+        pytest.param("end_stop", 5.0, 0.6, marks=pytest.mark.slow),
         pytest.param("slack_spring", 0.5, 0.9, marks=LONG),
-        pytest.param("slack_spring", 8.0, 0.6, marks=LONG),
+        pytest.param("slack_spring", 8.0, 0.6, marks=pytest.mark.slow),
     ],
 )
 def test_a_stop_and_a_stiffening_spring_are_told_apart(effect, hardness, part):

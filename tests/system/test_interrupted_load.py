@@ -38,7 +38,7 @@ def test_ctrl_c_while_the_commands_load_is_quiet(at):
     assert (done.returncode, done.stderr) == (130, "")
 
 
-@pytest.mark.parametrize("at", range(400, 1300, 100))
+@pytest.mark.parametrize("at", range(400, 1300, 200))
 def test_ctrl_c_while_a_command_loads_what_it_needs_is_one_line(tmp_path, at):
     """Numbers, figures and pages are loaded by the command that needs them, while it runs."""
     out = tmp_path / "out"

@@ -132,7 +132,7 @@ def _cases() -> Iterator[Any]:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
             short = case in ("cart 1 turned in four dwells", "a step exchanged")
-            yield pytest.param(case, ", sign = 1", marks=() if short else LONG)
+            yield pytest.param(case, ", sign = 1", marks=() if short else pytest.mark.slow)
 
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
