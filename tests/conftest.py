@@ -47,11 +47,13 @@ _WITH_BENCHES = {
     "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
     "simulated/emulator/test_server", "system/test_live_page",
 }  # fmt: skip
-_LONGEST = {  # which end long after the others where they begin last
-    "experiments/exploring/test_exploration", "desk/test_grades", "desk/test_student",
-    "gap/test_explain",
-    "grading/mistakes/test_faults", "grading/test_class", "report/test_report",
-    "statistics/test_gap", "simulated/test_hidden", "system/test_desk_rooms",
+_LONGEST = {  # over ten seconds of a processor: they would end long after the others
+    "desk/test_bench", "desk/test_ending", "desk/test_grades", "desk/test_jobs",
+    "desk/test_student", "experiments/exploring/test_exploration", "gap/test_explain",
+    "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
+    "grading/mistakes/test_faults", "grading/similarity/test_shared_data",
+    "grading/test_class_so_far", "report/test_gap", "report/test_report", "simulated/test_hidden",
+    "system/test_desk", "system/test_desk_grades", "system/test_desk_rooms",
     "system/test_report_pages",
 }  # fmt: skip
 _FEW = 2  # files that are sooner done here than other processes are started
