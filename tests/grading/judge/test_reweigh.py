@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from decimal import Decimal
+from functools import cache
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -13,10 +14,12 @@ from pipeline.grading.judge.reweigh import (
     read_findings,
     reweigh,
 )
+from pipeline.grading.judge.run import Graded
 from pipeline.grading.rubric import Rubric
 from tests.helpers.grading_students import Student, student
 
 
+@cache
 def _erring(carts: int) -> Student:
     """Return a team that is right in some places, near in others, and wrong in the rest."""
     honest = student(carts)
@@ -35,6 +38,11 @@ def _erring(carts: int) -> Student:
         state_space=space.model_copy(update={"A": tuple(map(tuple, rows))}),
         feedback=claimed,
     )
+
+
+@cache
+def _graded(carts: int) -> Graded:
+    return _erring(carts).graded(days_late=1.3)
 
 
 @st.composite
@@ -65,9 +73,8 @@ def _changes(draw, rubric: Rubric) -> Rubric:
 @given(data=st.data())
 def test_points_are_those_of_grading_again(carts, data):
     """For any points, tolerances, costs, lateness and step: every criterion, and the total."""
-    team = _erring(carts)
+    team, before = _erring(carts), _graded(carts)
     now = data.draw(_changes(team.rubric))
-    before = team.graded(days_late=1.3)
     kept = read_findings(findings_text(before.verdicts))
 
     weighed = reweigh(before.grade, kept, rubric=now)
@@ -86,8 +93,7 @@ def test_points_are_those_of_grading_again(carts, data):
 
 def test_the_same_rubric_gives_the_same_points():
     """The test's team loses points in several ways, so equality means something."""
-    team = _erring(2)
-    before = team.graded(days_late=1.3)
+    team, before = _erring(2), _graded(2)
     weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
     assert weighed.points == before.grade.points
     assert {c.outcome for c in weighed.criteria} == {"pass", "partial", "fail"}
