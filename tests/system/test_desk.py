@@ -255,6 +255,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
     assert (submission.title, submission.system.springs[0]) == ("typed", False)
 
 
+@pytest.mark.usefixtures("work_here")
 def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
     """On a phone; what is settled folds, and what is left comes first."""
     folder = tmp_path / "team"

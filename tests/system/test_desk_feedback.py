@@ -65,6 +65,7 @@ def press(window, control, key: str = "Enter") -> None:
         window.keyboard.press(key)
 
 
+@pytest.mark.usefixtures("work_here")
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
     """Released, asked on a phone, answered with points, read; in dark mode, checked by axe."""
     prof = show(f"{lab}/", extra_http_headers=named("prof"))

@@ -2,6 +2,7 @@
 
 import re
 
+import pytest
 from playwright.sync_api import expect
 
 from pipeline.desk.app import DeskServer
@@ -23,6 +24,7 @@ def shown(window) -> str:
     return window.evaluate("location.hash")
 
 
+@pytest.mark.usefixtures("work_here")
 def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
     """Two runs, one cart, the residual, the spectrum, by keys alone; kept until a file changes."""
     folder = a_submission(tmp_path / "team", "two-cart")
