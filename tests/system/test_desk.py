@@ -100,7 +100,7 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         expect(window.locator("#details").get_by_text("Saved.")).to_be_visible()
         assert load_submission(folder).system.position.unit == "cm"
         expect(window.get_by_role("button", name="Use cm")).to_have_count(0)
-        window.get_by_text("The controller you are asked for").click()
+        window.get_by_text("The controller to design").click()
         window.get_by_label("Cart whose position").fill("2")
         save = window.locator("#details").get_by_role("button", name="Save")
         save.click()

@@ -20,7 +20,7 @@ _TO_ADD = """\
 #[[authors]]
 #id = "s1024"
 
-# The controller you are asked for; `cartlab new` writes every key with a comment.
+# The controller to design; `cartlab new` writes every key with a comment.
 #[design]
 #cart = 1                         # whose position is controlled
 #reference = 1.0                  # size of the step, in position units

@@ -37,7 +37,7 @@ _GROUPS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     ),
     (
         "design",
-        "The controller you are asked for",
+        "The controller to design",
         ("design.cart", "design.reference", "design.overshoot_percent", "design.settling_time",
          "design.input_limit", "design.sample_time", "design.method"),
     ),
