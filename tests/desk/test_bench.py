@@ -200,12 +200,12 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
         shares = [float(share) for share in re.findall(r"<td>± ([\d.e-]+) %</td>", answer.text)]
         now, after, best = shares
         assert now > after > best
-        said = f"The damping ratio ζ: ± {now:.2g} % now, ± {after:.2g} % after yours"
+        said = f"The damping ratio ζ: ± {now:.2g} % now, ± {after:.2g} % after your experiment"
         assert said in answer.text
         assert answer.text.index(said) < answer.text.index("What would cartlab have chosen?")
         assert 'value="0,01"' in answer.text  # as it was typed
         decay = visitor.get("/bench/0/weigh?kind=decay&seconds=20&cart=1")
-        assert "and this is a decay" in decay.text
+        assert "but this is a decay" in decay.text
         for name, typed in (("amplitude", "20"), ("amplitude", "nan"), ("kind", "closed_loop"),
                             ("cart", "9"), ("seconds", "1e999"), ("goal", "zeta_9")):  # fmt: skip
             wrong = {**mine, name: typed}

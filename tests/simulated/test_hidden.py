@@ -329,7 +329,7 @@ def test_carts_that_run_away_are_refused():
 def test_a_loop_cannot_look_ahead():
     """A drive may lead its log by one sample at most: later inputs are unknown."""
     assert np.all(np.isfinite(bench(usual("input_delay", delay=-SAMPLE_TIME)).move(control()).x))
-    with pytest.raises(DataError, match="lead its log by over one sample"):
+    with pytest.raises(DataError, match="lead its log by more than a sample"):
         bench(usual("input_delay", delay=-0.02)).move(control())
 
 
@@ -430,7 +430,7 @@ def test_a_model_too_stiff_to_simulate_is_one_line(command, sizes, tmp_path):
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        ("{", r"no JSON from line 1, character 2 on: give a file as `cartlab gap` writes it"),
+        ("{", r"not valid JSON from line 1, character 2: give a complete gap.json"),
         ("[" * 100_000, "not the JSON"),
         ("[]", "no JSON object"),
         ({"effects": []}, "chain: missing"),

@@ -85,7 +85,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
         expect(title).not_to_have_text(first)
         press(window, "k")
         expect(title).to_have_text(first)
-        while "recordings hold" not in chosen.inner_text():
+        while "ound recordings" not in chosen.inner_text():
             press(window, "j")
         window.keyboard.press("3")
         window.keyboard.type("the plot is cleara1n")  # a letter in a field is a letter
