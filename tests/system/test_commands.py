@@ -40,6 +40,20 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.strip() == "False"
 
 
+@pytest.mark.parametrize(
+    ("module", "unneeded"),
+    [
+        ("report.draft.write", ("pipeline.plant.nonlinear.effects", "scipy.ndimage", "control")),
+        ("grading.batch.grade_class", ("pipeline.workflow", "scipy.linalg", "pandas")),
+    ],
+)
+def test_a_command_loads_only_what_it_needs(module, unneeded):
+    """A report loads the effects only for a gap; grading leaves the analysis to its workers."""
+    code = f"import sys, pipeline.{module}; print({set(unneeded)} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
 def test_report_writes_everything_and_ends_well(tmp_path):
     """A consistent submission gives all files and exit status 0; --json prints results.json."""
     out = tmp_path / "out"
