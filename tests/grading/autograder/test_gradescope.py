@@ -1,4 +1,7 @@
-"""The autograder's zip in Gradescope's folders: set up, run, and what students then read."""
+"""The autograder's zip runs in Gradescope's folders:
+
+setup, grading, and what students then read.
+"""
 
 import json
 import os
@@ -42,7 +45,7 @@ NUMBER = re.compile(r"\d+\.\d+")
 
 @pytest.fixture(scope="module")
 def team(tmp_path_factory) -> Path:
-    """A submission with one wrong number among its reported ones."""
+    """Return a submission with one wrong number among its reported ones."""
     folder = tmp_path_factory.mktemp("team") / "lab"
     write_submission(
         folder, "throne-1dof", seed=5, compact=True, reported=True,
@@ -59,7 +62,7 @@ def team(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
-    """Gradescope's folders after `setup.sh`; the packages are those installed here."""
+    """Return Gradescope's folders after `setup.sh`; the packages are those installed here."""
     root = tmp_path_factory.mktemp("autograder")
     write_autograder(RUBRIC, root / "autograder.zip")
     source = root / "source"
@@ -77,7 +80,7 @@ def root(tmp_path_factory) -> Path:
 
 
 def start(*command: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a program from elsewhere, with no sight of this checkout."""
+    """Start a program in another folder, so that it cannot import from this checkout."""
     return subprocess.run(
         list(map(str, command)),
         capture_output=True,
@@ -131,7 +134,7 @@ def put(root: Path, submission: Path, *, rubric: str = "") -> None:
 
 
 def read_results(root: Path) -> dict[str, Any]:
-    """Return `results.json`, which has the keys and values of Gradescope's specification only."""
+    """Return `results.json` after checking it against Gradescope's specification."""
     results = json.loads((root / "results" / "results.json").read_text(encoding="utf-8"))
     assert set(results) == TOP
     assert isinstance(results["score"], float)
@@ -151,7 +154,10 @@ def grade_here(submission: Path, scratch: Path) -> Grade:
 
 
 def test_a_submission_gets_the_points_of_cartlab_grade(shown, team, tmp_path):
-    """Criterion by criterion, each with its message, visible; a late one loses nothing."""
+    """Points and total equal those of `cartlab grade`, and lateness costs nothing.
+
+    Each criterion is visible and has a message. Gradescope itself deducts points for late work.
+    """
     results, grade = shown, grade_here(team, tmp_path)
 
     assert 0 < grade.points < grade.out_of
@@ -170,7 +176,7 @@ def test_a_submission_gets_the_points_of_cartlab_grade(shown, team, tmp_path):
 
 @pytest.mark.parametrize("form", ["one folder", "zip in the folder", "loose files"])
 def test_all_ways_to_upload_have_the_same_result(root, team, shown, tmp_path, form):
-    """Files with their folders, an archive, or files one by one, which lose theirs."""
+    """A folder, an archive and loose files (without their folders) all give the same result."""
     given = tmp_path / "given"
     given.mkdir()
     if form == "one folder":
@@ -184,7 +190,10 @@ def test_all_ways_to_upload_have_the_same_result(root, team, shown, tmp_path, fo
 
 
 def test_students_who_find_the_numbers_read_none(root, team, shown):
-    """With `see = "check"` no computed number is in it, and points wait for the due date."""
+    """If the rubric says `see = "check"`, the results show no computed number.
+
+    Points stay hidden until the due date.
+    """
     hidden = upload_here(
         root, team, rubric=RUBRIC.read_text(encoding="utf-8") + '\n[students]\nsee = "check"\n'
     )
@@ -206,7 +215,10 @@ HOSTILE = (  # one of a kind; `tests/system/test_hostile.py` grades all of them 
 
 
 def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
-    """Bombs, links, two submissions: each has a result, and nothing outside is read or written."""
+    """Zip bombs, links and the like get a result that names the reason.
+
+    No file outside the upload is read or written.
+    """
     school = tmp_path / "school"
     school.mkdir()
     good = {p.relative_to(team).as_posix(): p.read_bytes() for p in team.rglob("*.*")}
@@ -235,7 +247,7 @@ def test_hostile_uploads_get_a_sentence_and_no_more(root, team, tmp_path):
     ],
 )
 def test_an_upload_that_is_no_submission_is_told_why(root, tmp_path, files, said):
-    """Without `submission.toml`, and with two."""
+    """An upload without `submission.toml`, or with two of them, gets 0 points and the reason."""
     for name in files:
         (tmp_path / "given" / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "given" / name).touch()
@@ -246,7 +258,7 @@ def test_an_upload_that_is_no_submission_is_told_why(root, tmp_path, files, said
 
 
 def test_code_in_an_upload_is_not_run(root, team, shown, tmp_path):
-    """Nor is anything that bears the name of what the grader imports, reads or writes."""
+    """No code in an upload is run, even if a file has the name of one that the grader uses."""
     given, mark = tmp_path / "given", tmp_path / "was-run"
     shutil.copytree(team, given)
     code = f"open({str(mark)!r}, 'w')\n"
@@ -263,7 +275,10 @@ def test_code_in_an_upload_is_not_run(root, team, shown, tmp_path):
 
 
 def test_a_grader_that_is_killed_leaves_a_result(root, team):
-    """Here it has no memory even to start in; the points are 0, and the text says what to do."""
+    """If the grader is killed, the result has 0 points and says to submit again.
+
+    Here the grader is killed because it has too little memory even to start.
+    """
     put(root, team)
     done = start("bash", "-c", f"ulimit -v 100000; '{root}/run_autograder'")
     assert done.returncode != 0
@@ -273,7 +288,10 @@ def test_a_grader_that_is_killed_leaves_a_result(root, team):
 
 
 def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
-    """And its result says so, before Gradescope would end it without one."""
+    """If grading exceeds its time limit, the result says so.
+
+    The limit is shorter than Gradescope's own, after which there would be no result.
+    """
     put(root, team)
     (root / "results").mkdir()
     monkeypatch.setattr(run, "_TIME_LIMIT", 0.0)
@@ -286,7 +304,10 @@ def test_a_grading_that_takes_too_long_is_stopped(root, team, monkeypatch):
 
 
 def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
-    """Both scripts lie at its top, executable; a shipped rubric's name is enough."""
+    """Two zips of one rubric are equal byte by byte, with both scripts executable at their top.
+
+    The rubric may be given by the name of one that ships with cartlab.
+    """
     done = cartlab_here("export", "--autograder", "throne-1dof", cwd=tmp_path)
     assert done.returncode == 0
     assert done.stderr.splitlines() == [
@@ -309,7 +330,10 @@ def test_the_zip_is_made_for_gradescope_and_always_the_same(tmp_path):
 
 
 def test_all_that_grading_needs_is_pinned_to_what_is_installed():
-    """Also what is needed only by what cartlab needs; nothing of the tests."""
+    """Every package that grading needs, directly or indirectly, is pinned to its installed version.
+
+    Packages that only the tests need are left out.
+    """
     pins = dict(pin.split("==") for pin in pin_requirements())
     for name in ("numpy", "scipy", "h5py", "pydantic-core", "python-dateutil"):
         assert pins[name] == version(name)
@@ -328,7 +352,7 @@ def test_all_that_grading_needs_is_pinned_to_what_is_installed():
     ],
 )
 def test_export_says_what_it_needs(tmp_path, arguments, said):
-    """Grades and a platform, or a rubric and perhaps a zip: any other mixture is refused."""
+    """`export` takes grades and a platform, or a rubric for a zip; it refuses any other mixture."""
     done = cartlab_here("export", *arguments, cwd=tmp_path)
     assert done.returncode == 2
     assert said in done.stderr
@@ -336,6 +360,6 @@ def test_export_says_what_it_needs(tmp_path, arguments, said):
 
 
 def test_a_package_that_is_not_installed_cannot_be_pinned():
-    """A checkout that nobody installed has no versions to pin."""
+    """A package cannot be pinned if it is not installed, since its version is then unknown."""
     with pytest.raises(ConfigError, match="not installed here"):
         pin_requirements("no-such-package-as-this")

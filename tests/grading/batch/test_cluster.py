@@ -1,4 +1,4 @@
-"""The same batch on a real Dask cluster on this machine, with one worker killed."""
+"""A batch is graded on a real Dask cluster on this machine, with one worker killed."""
 
 import os
 import socket
@@ -21,7 +21,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 
 def _dask(*arguments):
-    """Start a part of a cluster without its dashboard and supervisor."""
+    """Start one part of a cluster, without a dashboard and a supervisor."""
     return subprocess.Popen(
         [sys.executable, "-m", *map(str, arguments), "--no-dashboard"],
         stdout=subprocess.DEVNULL,
@@ -32,7 +32,7 @@ def _dask(*arguments):
 
 @pytest.fixture
 def cluster(tmp_path):
-    """A scheduler and two workers; yields the address and the workers' processes."""
+    """Start a scheduler and two workers; yield the address and the workers' processes."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -72,7 +72,7 @@ def grade(folder, out, execute, progress=lambda *_: None):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp_path):
-    """Submissions travel to two workers; one worker is killed midway, and no row differs."""
+    """A cluster gives the same rows as this machine, even if one of two workers is killed."""
     address, workers = cluster
     for number in range(5):
         write_submission(
@@ -100,7 +100,7 @@ def test_a_cluster_grades_as_this_machine_does_though_a_worker_dies(cluster, tmp
 
 
 def test_an_address_that_is_no_schedulers_is_refused():
-    """Only a scheduler's address is accepted, and beyond this machine only an encrypted one."""
+    """An address is refused unless it is a scheduler's, and encrypted if on another machine."""
     with pytest.raises(ConfigError, match="expected a scheduler's address"):
         run_on("http://localhost:8786")
     with pytest.raises(ConfigError, match=r"tls://"):
@@ -110,10 +110,10 @@ def test_an_address_that_is_no_schedulers_is_refused():
 
 
 def test_nobody_there_is_said(monkeypatch):
-    """If no scheduler listens, the batch does not begin."""
+    """If no scheduler listens at the address, the batch stops with an error that says so."""
     monkeypatch.setattr("pipeline.grading.batch.cluster._CONNECT_LIMIT", 1)
     setup = Setup(rubric=RUBRIC, scratch=Path())
-    with socket.socket() as bound:  # a port that nobody answers
+    with socket.socket() as bound:  # a port on which nothing listens
         bound.bind(("127.0.0.1", 0))
         execute = run_on(f"tcp://127.0.0.1:{bound.getsockname()[1]}")
         with pytest.raises(ConfigError, match="no scheduler answers"):

@@ -22,12 +22,12 @@ from tests.helpers.places import ROOT
 
 RUBRIC = load_rubric(Path("throne-1dof"))
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such limits")
-_MEMBER = 3_000_000  # bytes of a file that compresses to a tenth
+_MEMBER = 3_000_000  # length in bytes of a file that compresses to a tenth
 
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """Return two teams with a step in common; each zip is small, its content large."""
+    """Return two teams that share a step recording; each zip is small, its content large."""
     folder = tmp_path_factory.mktemp("teams")
     for number in (0, 2):
         write_submission(
@@ -56,7 +56,7 @@ def zips(teams, tmp_path_factory) -> Path:
 
 @contextmanager
 def small_disk(at: Path, *, size: str) -> Iterator[None]:
-    """Mount a disk of that size at a folder; skip where that is not permitted."""
+    """Mount a disk of the given size at a folder; skip the test if mounting is not permitted."""
     at.mkdir()
     words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(at)]
     if shutil.which("mount") is None or subprocess.run(words, check=False).returncode:
@@ -76,7 +76,7 @@ def grade(zips: Path, out: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a small disk is made of memory")
 def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
-    """The message names the lack of space, not the rubric; the next run grades everybody."""
+    """If the disk is full, the message says so, and the next run grades everybody."""
     disk = tmp_path / "disk"
     with small_disk(disk, size="1200k"):
         full = grade(zips, disk / "out")
@@ -96,7 +96,10 @@ def test_a_full_disk_costs_nobody_a_grade(zips, tmp_path):
 
 
 def test_a_name_that_cannot_be_is_still_the_archives_own(tmp_path):
-    """A file in place of a folder, or a name too long, is refused for good: a retry cannot help."""
+    """If the file system cannot hold a member's name, the member is refused for good.
+
+    The name is too long, or a file has the name that a folder needs. A retry cannot help.
+    """
     archive = tmp_path / "odd.zip"
     with zipfile.ZipFile(archive, "w") as packed:
         packed.writestr("a", "a file")
@@ -133,7 +136,7 @@ print(json.dumps(told))
 
 
 def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
-    """Grade without a limit, then with each.
+    """Grade once without a limit, then once with each limit.
 
     Return whether settled, short of space, reason and grade.
     """
@@ -147,7 +150,10 @@ def starved(source: Path, scratch: Path, limit: str, soft: range) -> list[list]:
 
 @POSIX
 def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
-    """The limit on file size is met while a zip is unpacked or a folder is copied."""
+    """If a file cannot grow beyond a size limit, the submission is graded in the next run.
+
+    The limit is reached while a zip is unpacked or a folder is copied.
+    """
     for number, source in enumerate((zips / "team-0.zip", teams / "team-0")):
         size = range(_MEMBER // 2, _MEMBER // 2 + 1)
         _, (settled, no_room, why, _) = starved(
@@ -160,21 +166,24 @@ def test_a_file_that_may_not_grow_costs_nobody_a_grade(zips, teams, tmp_path):
 @POSIX
 @pytest.mark.parametrize("packed", [True, False])
 def test_too_few_files_at_a_time_cost_nobody_a_point(zips, teams, tmp_path, packed):
-    """However early the files run out: the grade is the same or still missing."""
+    """If few files may be open at a time, the grade is either the same or still missing."""
     source = zips / "team-0.zip" if packed else teams / "team-0"
-    few = range(3, 12)  # open at the start are three, and a few of the libraries'
+    few = range(3, 12)  # three files are open at the start, and a few more belong to libraries
     (_, _, _, whole), *others = starved(source, tmp_path / "s", "RLIMIT_NOFILE", few)
     assert any(not settled for settled, *_ in others)
     assert {grade for settled, _, _, grade in others if settled} <= {whole}
 
 
 def test_the_faults_of_a_decoder_are_the_archives(tmp_path):
-    """An error without a number comes from the content, so the archive is refused for good."""
+    """If an archive's content cannot be decoded, the submission is refused for good.
+
+    The operating system gives no error number then, so the archive itself is at fault.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_BZIP2) as packed:
         packed.writestr("submission.toml", "version = 1\n" * 1000)
     content = bytearray(buffer.getvalue())
-    content[60:70] = b"\xff" * 10  # in the packed bytes
+    content[60:70] = b"\xff" * 10  # within the compressed bytes
     archive = tmp_path / "broken.zip"
     archive.write_bytes(content)
     outcome = grade_task(

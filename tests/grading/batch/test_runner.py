@@ -1,4 +1,4 @@
-"""The batch: one row for every submission, in any order, and nothing done twice."""
+"""A batch makes one row for every submission, in any order, and grades nothing twice."""
 
 import json
 import random
@@ -32,7 +32,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory):
-    """A small class: three teams, one of them with another's step, and a broken submission."""
+    """Return a class of three teams, one of which copied a step, and a broken submission."""
     folder = tmp_path_factory.mktemp("class")
     for number in range(3):
         write_submission(
@@ -74,14 +74,14 @@ def run(paths, out, *, jobs=1, time_limit=PATIENCE, execute=None, progress=lambd
 
 @pytest.fixture(scope="module")
 def graded(school, tmp_path_factory):
-    """The class graded by two processes: folder, batch, rows and messages."""
+    """Grade the class with two processes; return folder, batch, rows and messages."""
     out, seen = tmp_path_factory.mktemp("graded"), []
     batch, rows = run([school], out, jobs=2, progress=lambda *what: seen.append(what[0]))
     return out, batch, rows, seen
 
 
 def test_a_class_is_graded_and_sharing_is_flagged(graded):
-    """Every submission has a row in the order of ids; the copied step is flagged on both sides."""
+    """Every submission gets a row, and both owners of a copied step are flagged."""
     _, batch, rows, seen = graded
     assert list(rows) == ["team-0", "team-1", "team-2", "team-3"]
     assert [outcome.status for outcome, _ in rows.values()] == ["graded"] * 3 + ["failed"]
@@ -94,14 +94,14 @@ def test_a_class_is_graded_and_sharing_is_flagged(graded):
 
 
 def test_the_number_of_processes_does_not_show(school, graded, tmp_path):
-    """One process gives the same rows as two, in any order."""
+    """A class graded with one process gets the same rows as with two."""
     _, _, rows, _ = graded
     _, alone = run([school], tmp_path, execute=in_this_process)
     assert alone == rows
 
 
 def test_only_what_changed_is_graded_again(school, graded, tmp_path):
-    """A second run starts no process.
+    """A second run of the same class starts no process.
 
     A changed file causes only its own submission to be graded.
     """
@@ -145,7 +145,7 @@ def kill_next(monkeypatch):
 
 
 def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next):
-    """If a worker dies during a task, that row says so; the next task is graded."""
+    """If a worker process dies during a task, that row says so and the next task is graded."""
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
         kill_next()
@@ -156,14 +156,17 @@ def test_a_crash_costs_one_row_and_the_worker_is_replaced(task, setup, kill_next
 
 
 def test_a_worker_killed_while_it_starts_is_started_again(task, setup, kill_next):
-    """The submission that it was started for is graded all the same."""
+    """If a worker process is killed while it starts, another one grades its submission."""
     kill_next()
     with closing(Grader(setup)) as worker:
         assert worker.run(task).status == "graded"
 
 
 def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
-    """The row has its points and no figure; the next run tries again."""
+    """If figures cannot be drawn, the row has its points without figures.
+
+    The next run tries again.
+    """
 
     def undrawable(*_):
         raise np.linalg.LinAlgError("Singular matrix")
@@ -180,15 +183,18 @@ def test_a_grade_stands_where_its_figures_fail(school, tmp_path, monkeypatch):
 
 
 def test_what_this_machine_fails_at_is_tried_again(task, tmp_path):
-    """If the scratch folder is full or gone, the row says so and the next run tries again."""
-    (tmp_path / "scratch").touch()  # no folder can be made in it
+    """If the scratch folder cannot be written, the row says so and the next run tries again."""
+    (tmp_path / "scratch").touch()  # no folder can be made in a file
     outcome = grade_task(task, rubric=RUBRIC, scratch=tmp_path / "scratch")
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert outcome.reason.startswith("cannot be read (")
 
 
 def test_memory_is_limited(school, setup, tmp_path):
-    """A submission that needs more than the limit gets a row that says so; the next is graded."""
+    """A submission that needs more memory than the limit gets a row that says so.
+
+    The next submission is graded.
+    """
     large = shutil.copytree(school / "team-0", tmp_path / "large")
     rows = "".join(f"{i / 1000:.3f},1,{i % 7}\n" for i in range(1_500_000))
     (large / "data" / "step-1.csv").write_text("time,input,x1\n" + rows, encoding="utf-8")
@@ -202,7 +208,7 @@ def test_memory_is_limited(school, setup, tmp_path):
 
 
 def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
-    """Past the time limit a row says so; a run with more time grades the submission."""
+    """A submission that takes too long gets a row that says so; a run with more time grades it."""
     _, hung = run([school / "team-0"], tmp_path, time_limit=0.01)
     assert hung["team-0"][0].reason == "stopped after 0.01 s"
     _, graded = run([school / "team-0"], tmp_path, execute=in_this_process)
@@ -210,7 +216,7 @@ def test_a_hang_is_stopped_and_tried_again(school, tmp_path):
 
 
 def killed_within(rng, book, command):
-    """Run a command and kill it, with its children, at some point of its work.
+    """Run a command and kill it, with its children, at a random point of its work.
 
     The point is measured in work done, since a machine's speed varies.
     """
@@ -223,7 +229,7 @@ def killed_within(rng, book, command):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
-    """A run killed at random times, again and again, ends like an undisturbed one."""
+    """A run that is killed at random times and started again ends like an undisturbed one."""
     killed = tmp_path / "killed"
     command = [sys.executable, "-m", "pipeline", "grade", school, "--rubric", "throne-1dof",
                "--no-figures", "--out", killed]  # fmt: skip
@@ -231,7 +237,7 @@ def test_killed_at_any_moment_it_goes_on(school, graded, tmp_path):
     for _ in range(30):
         killed_within(rng, killed, [*command, "--jobs", "2"])
     done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 1, done.stderr  # team-3 could not be graded
+    assert done.returncode == 1, done.stderr  # since team-3 could not be graded
     assert "team-3: team-3/submission.toml line 1" in done.stderr
     out, batch, rows, _ = graded
     with Gradebook(killed) as book:
@@ -264,7 +270,7 @@ HOSTILE = {
 
 
 def test_hostile_submissions_are_rows(tmp_path):
-    """Every submission has a row with printable reasons, one line each; nothing gets out."""
+    """Every hostile submission gets a row with a printable reason; no file outside is written."""
     for name, text in HOSTILE.items():
         folder = tmp_path / "class" / name.replace("/", "_")
         folder.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""Places for gradebooks: a SQLite file, and a PostgreSQL server."""
+"""Fixtures that give a place for a gradebook: a SQLite file or a PostgreSQL server."""
 
 import os
 
@@ -10,7 +10,7 @@ from tests.helpers import postgres
 
 @pytest.fixture(scope="session")
 def server():
-    """A PostgreSQL server for the tests."""
+    """Start a PostgreSQL server for the tests."""
     if why := postgres.missing():
         (pytest.fail if os.environ.get(postgres.NEEDED) else pytest.skip)(why)
     with postgres.running() as url:
@@ -19,7 +19,7 @@ def server():
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def place(request, tmp_path):
-    """An empty place where a gradebook can be made."""
+    """Return an empty place where a gradebook can be made."""
     if request.param == "sqlite":
         yield str(tmp_path)
         return
@@ -28,7 +28,7 @@ def place(request, tmp_path):
 
 @pytest.fixture
 def place_in_postgresql(server):
-    """An empty database; what a test put there is removed."""
+    """Return an empty database; remove afterwards what a test put there."""
     url = server
     yield url
     engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))

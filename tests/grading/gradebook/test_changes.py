@@ -1,4 +1,4 @@
-"""The summary after a regrade: what changed in the rubric, and whose points changed."""
+"""After a regrade, the summary says what changed in the rubric and whose points changed."""
 
 import os
 import signal
@@ -20,9 +20,9 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_rubric_is_compared_by_its_criteria():
-    """New and removed criteria, changed numbers, changed order.
+    """A new, removed or reordered criterion is named, and so is each changed number.
 
-    The rest of the rubric by its keys.
+    Beside the criteria, changes of the rubric are named by their keys.
     """
     first, second, *rest = RUBRIC.criteria
     dearer = first.model_copy(update={"points": first.points + 1})
@@ -45,21 +45,24 @@ def test_a_rubric_is_compared_by_its_criteria():
 
 
 def test_a_rubric_of_another_version_is_said_to_be_one():
-    """A rubric that cannot be read is not compared."""
+    """If the earlier rubric was written by another version, the summary says only that."""
     assert rubric_changes('{"version": 0}', RUBRIC.model_dump_json()) == [
         "the earlier rubric was written by another version of cartlab"
     ]
 
 
 def test_points_are_compared_by_name():
-    """Teams with other points, new teams and teams that left."""
+    """Teams whose points changed, new teams and removed teams are listed by name."""
     assert points_changes({"a": 1.0, "b": 2.0, "c": 3.0}, {"a": 1.5, "b": 2.0, "d": 0.0}) == [
         "a: 1 → 1.5", "d is new", "c was removed",
     ]  # fmt: skip
 
 
 def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
-    """The first class list is not a change, nor is a second run with the same result."""
+    """After a regrade the changes are printed and kept in the history.
+
+    The first class list is no change, nor is a second run with the same result.
+    """
     outcome = make_outcome(make_grade("a", share=0.5))
     batch = Batch(keys=(outcome.key,), shared={})
     late = RUBRIC.model_copy(update={"anonymous": True})
@@ -76,13 +79,16 @@ def test_the_gradebook_tells_and_history_keeps_it(tmp_path):
     assert events[-1].text == "rubric: anonymous False → True"
 
 
-# Submissions still to be graded when the first is done, in case Ctrl-C comes late.
+# Number of submissions left when the first one is graded, in case Ctrl-C comes late.
 _LEFT = 4
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Ctrl-C is a signal on POSIX")
 def test_ctrl_c_says_how_to_go_on(tmp_path):
-    """One line, the exit status of an interrupt, no worker left; the same command goes on."""
+    """After Ctrl-C one line says how to continue, and the same command then continues.
+
+    No worker is left, and the exit status is that of an interrupt.
+    """
     for number in range(_LEFT + 1):
         write_submission(tmp_path / "c" / f"t{number}", "throne-1dof", seed=number,
                          compact=True, students=Students(authors=(f"s{number}",)))  # fmt: skip
@@ -95,7 +101,7 @@ def test_ctrl_c_says_how_to_go_on(tmp_path):
         os.killpg(process.pid, signal.SIGINT)
         _, said = process.communicate()
     assert process.returncode == 130, said
-    *progress, last = said.splitlines()  # progress, if that took more than two seconds
+    *progress, last = said.splitlines()  # a progress line, if grading took over two seconds
     assert all(f" of {_LEFT + 1}" in line for line in progress)
     assert last == (
         f"stopped; finished grades are kept in {tmp_path / 'out'}; repeat the command to continue"

@@ -1,4 +1,4 @@
-"""A comment beside points: the team reads it, and the points stay automatic."""
+"""A TA's comment on a criterion is shown to the team, and the points stay automatic."""
 
 import sqlite3
 from contextlib import closing
@@ -19,7 +19,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture
 def book(place):
-    """A gradebook with a team that has half of all points."""
+    """Return a gradebook with a team that has half of all points."""
     with OpenBook(place, assignment="lab", create=True) as opened:
         grade(opened, share=0.5)
         yield opened
@@ -33,7 +33,7 @@ def grade(book, *, share):
 
 
 def change(book, points, why="Mind the unit.", criterion="pieces"):
-    """Save the form of a criterion, as the desk does."""
+    """Save the form of a criterion as the desk does."""
     seen = book.team("team-1").versions[criterion]
     book.change("team-1", criterion, points, why=why, by="Ada", seen=seen)
 
@@ -51,7 +51,7 @@ def pieces(book):
 
 @pytest.mark.parametrize("say", [lambda book: change(book, 0.5), comment_all])
 def test_a_comment_does_not_freeze_points(book, say):
-    """When graded again the team gets the new points and keeps the comment."""
+    """When a team with a comment is graded again, it gets the new points and keeps the comment."""
     assert pieces(book).points == 0.5
     say(book)
     assert pieces(book).message == "omega_1 is off. Mind the unit."
@@ -65,7 +65,7 @@ def test_a_comment_does_not_freeze_points(book, say):
 
 @pytest.mark.parametrize("say", [lambda book: change(book, 0.0), comment_all])
 def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
-    """Points given by hand stay, with the new reason."""
+    """If points were given by hand, a comment replaces their reason and the points stay."""
     change(book, 0.0, why="copied")
     say(book)
     assert "to 0 of 1: Mind the unit." in pieces(book).message
@@ -74,7 +74,7 @@ def test_points_by_hand_stay_by_hand_with_a_comment(book, say):
 
 
 def test_a_comment_is_undone_and_given_back(book):
-    """Undo removes a comment, or restores the earlier one."""
+    """Undo removes a comment, or restores the comment that was there before."""
 
     def undo():
         book.undo("team-1", "pieces", by="Ada", seen=book.team("team-1").versions["pieces"])
@@ -94,7 +94,7 @@ def test_a_comment_is_undone_and_given_back(book):
 
 
 def test_what_a_comment_would_change_is_shown_first(book):
-    """Only the message changes."""
+    """The preview of a comment shows the new message and unchanged points."""
     wish = WantedPoints(submission="team-1", criterion="pieces", points=None, why="x", comment=True)
     (tried,) = book.try_all([wish])
     assert tried.after.points == tried.now.points
@@ -102,7 +102,7 @@ def test_what_a_comment_would_change_is_shown_first(book):
 
 
 def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
-    """An answer that confirms the points does not fix them."""
+    """If an answer confirms the automatic points, a later regrade may still change them."""
     with RequestBook(place) as shared:
         shared.release(True, by="prof")
         shared.ask("team-1", "pieces", why="please", by="s1")
@@ -113,7 +113,7 @@ def test_an_answer_with_the_same_points_leaves_them_automatic(book, place):
 
 
 def test_a_gradebook_without_comments_gets_them(book, place):
-    """Overrides of an earlier version stay as they are, and comments can be added."""
+    """A gradebook of a version without comments opens, keeps its overrides and accepts comments."""
     book.override("team-1", "laws", 0.0, why="no", by="Ada")
     book.close()
     if "://" in place:

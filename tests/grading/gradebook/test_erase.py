@@ -19,11 +19,14 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.grades import make_grade, make_outcome, shared_flag, two_cart_rubric
 
 GONE, KEPT = "zebra-çelik", "team-2"
-TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a number, what was typed
+TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a reported number, a typed text
 
 
 def _fill(place: str, *, folder: Path | None = None) -> None:
-    """Grade two teams that share a recording; one is asked about, changed by hand, looked at."""
+    """Grade two teams that share a recording;
+
+    let one ask a question, and change and mark it by hand.
+    """
     with RequestBook(place, create=True, assignment="lab") as book:
         gone = make_grade(GONE, share=0.5)
         first = gone.criteria[0].model_copy(update={"found": {"omega_1": 31.41592}})
@@ -51,7 +54,10 @@ def _found(content: bytes) -> list[str]:
 
 
 def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
-    """Every file of the folder, the database's free pages included, is searched."""
+    """After erasing, no file of the folder contains the student.
+
+    The free pages of the database are searched too.
+    """
     folder = tmp_path / "grades"
     folder.mkdir()
     _fill(str(folder), folder=folder)
@@ -78,7 +84,7 @@ def test_in_a_folder_no_file_keeps_a_trace(tmp_path):
 
 
 def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
-    """A dump of the whole database is searched, and so are the files of its tables."""
+    """After erasing, neither a dump of the database nor its table files show the student."""
     url = place_in_postgresql
     _fill(url)
     assert set(_found(_dump(url))) == {"zebra", "s-zebra", "31.41592", "quagga"}
@@ -97,7 +103,7 @@ def test_in_postgresql_no_row_keeps_a_trace(server, place_in_postgresql):
 
 
 def test_a_backup_of_a_file_is_the_same_gradebook(tmp_path):
-    """SQLite's own copy, made while the gradebook is open, has the same history."""
+    """A copy that SQLite makes of an open gradebook has the same entries and history."""
     _fill(str(tmp_path))
     copy = tmp_path / "copy.sqlite"
     with Gradebook(tmp_path) as book:
@@ -110,7 +116,7 @@ def test_a_backup_of_a_file_is_the_same_gradebook(tmp_path):
 
 
 def test_a_dump_of_a_database_is_the_same_gradebook(server, place_in_postgresql):
-    """`pg_dump` and `psql` bring back rows, and the rule that rows are only added."""
+    """A dump restored by `psql` has the same rows, and still refuses to change or delete them."""
     url = place_in_postgresql
     _fill(url)
     with Gradebook(url) as book:

@@ -39,7 +39,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture
 def open_book(place):
-    """Open the gradebook with a clock that ticks once a call."""
+    """Open the gradebook with a clock that advances at each call."""
     opened, tick = [], count()
 
     def opener(assignment="lab", create=True):
@@ -68,7 +68,7 @@ def finish(book, *outcomes, shared=None):
 
 
 def test_what_is_put_in_comes_back(open_book):
-    """An outcome is the same after the gradebook was closed and reopened, Unicode included."""
+    """An outcome is unchanged after the gradebook is closed and reopened, Unicode included."""
     grade = make_grade("tëam 学 '\"; DROP TABLE gradings; --", share=0.5, flags=(hertz_flag(),))
     outcome = make_outcome(
         grade,
@@ -88,7 +88,7 @@ def test_what_is_put_in_comes_back(open_book):
 
 
 def test_runs_that_begin_at_once_make_one_gradebook(place):
-    """On a database without tables, each run finds or makes all of them."""
+    """Runs that start at the same time on an empty database share one gradebook."""
     with ThreadPoolExecutor(8) as runs:
         books = list(runs.map(lambda n: Gradebook(place, assignment=f"{n}", create=True), range(8)))
     for book in books:
@@ -98,7 +98,7 @@ def test_runs_that_begin_at_once_make_one_gradebook(place):
 
 
 def test_a_folder_may_be_called_like_a_database(tmp_path):
-    """The content decides, not the name."""
+    """Whether a place is a folder or a file is found by looking at it, not from its name."""
     (tmp_path / "lab.db").mkdir()
     Gradebook(tmp_path / "lab.db", create=True).close()
     assert (tmp_path / "lab.db" / FILE).is_file()
@@ -107,7 +107,7 @@ def test_a_folder_may_be_called_like_a_database(tmp_path):
 
 
 def test_the_newest_of_a_key_counts(open_book):
-    """A submission that ran out of time and was tried again has its second outcome."""
+    """If a submission was graded again under the same key, the second outcome counts."""
     book = open_book()
     book.put(make_outcome(failed_grade("team-1", "too slow"), key="k", settled=False))
     second = make_outcome(make_grade("team-1"), key="k")
@@ -118,7 +118,10 @@ def test_the_newest_of_a_key_counts(open_book):
 
 
 def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
-    """One for every submission with its authors, also those of other assignments."""
+    """Each submission has one fingerprint, that of its newest outcome.
+
+    Fingerprints of other assignments are included.
+    """
     earlier = open_book("lab of last year")
     earlier.put(make_outcome(make_grade("team-1", authors=("old",)), key="1", fingerprints=b"o"))
     book = open_book()
@@ -131,10 +134,10 @@ def test_fingerprints_are_those_of_the_newest_outcomes(open_book):
 
 
 def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypatch):
-    """Outcomes can be stored while fingerprints are being read."""
+    """Outcomes can be stored while another program reads the fingerprints."""
     monkeypatch.setattr(rows, "_PAGE", 10)
     book = open_book()
-    for n in range(15):  # more than a page
+    for n in range(15):  # more than one page
         book.put(make_outcome(make_grade(f"team-{n}")))
     prints = book.prints()
     next(prints)
@@ -145,7 +148,10 @@ def test_reading_fingerprints_does_not_keep_a_writer_waiting(open_book, monkeypa
 
 
 def test_the_class_list_is_the_last_batch_that_ended(open_book):
-    """Outcomes of a run that was killed count only when a later batch ends with them."""
+    """The class list is that of the last batch that ended.
+
+    Outcomes of a killed run count only when a later batch ends with them.
+    """
     book = open_book()
     with pytest.raises(ConfigError, match="no grading of 'lab' is complete"):
         list(book.entries())
@@ -159,7 +165,7 @@ def test_the_class_list_is_the_last_batch_that_ended(open_book):
 
 
 def test_shared_data_is_flagged_in_the_class_list(open_book):
-    """The flag comes with the batch, in the order of codes, and goes with the next batch."""
+    """The flag for shared data is in its batch's class list and gone after the next batch."""
     book = open_book()
     outcomes = [make_outcome(make_grade(name, flags=(hertz_flag(),))) for name in "ab"]
     finish(book, *outcomes, shared={"a": shared_flag("b"), "b": shared_flag("a")})
@@ -172,9 +178,9 @@ def test_shared_data_is_flagged_in_the_class_list(open_book):
 
 
 def test_points_given_by_hand_survive_regrading(open_book):
-    """They replace the automatic points, lateness is computed again, and they can be removed."""
+    """Points given by hand survive a regrade until they are removed; lateness is computed again."""
     book = open_book()
-    # A tenth is lost, to the rubric's quarter of a point: 1.1 is 1, and 0.65 is 0.75.
+    # Lateness costs a tenth, rounded to the rubric's quarter of a point: 1.1 → 1 and 0.65 → 0.75.
     first = make_grade("team-1", share=0.5, days_late=1.0)
     finish(book, make_outcome(first, key="1"))
 
@@ -197,7 +203,7 @@ def test_points_given_by_hand_survive_regrading(open_book):
 
 
 def test_a_broken_submission_can_be_graded_by_hand(open_book):
-    """Its criteria get those points; it stays marked as not graded automatically."""
+    """A broken submission can get points by hand; it stays marked as not graded automatically."""
     book = open_book()
     finish(book, make_outcome(failed_grade("team-1", "no submission.toml")))
 
@@ -208,7 +214,10 @@ def test_a_broken_submission_can_be_graded_by_hand(open_book):
 
 
 def test_an_override_goes_with_the_people(open_book):
-    """Another year's team of the same name does not get it; a team that grows keeps it."""
+    """An override belongs to the people: a team that grows keeps it.
+
+    Another year's team of the same name does not get it.
+    """
     book = open_book()
     finish(book, make_outcome(make_grade("team-1", share=0.0, authors=("ann",)), key="1"))
     book.override("team-1", "pieces", 1.0, why="seen", by="Ada")
@@ -220,7 +229,10 @@ def test_an_override_goes_with_the_people(open_book):
 
 
 def test_assignments_in_one_database_stay_apart(open_book):
-    """An override of one lab has no effect in another; without a name, the latest lab is meant."""
+    """An override in one lab has no effect in another lab of the same database.
+
+    If no lab is named, the latest one is opened.
+    """
     one, two = open_book("lab 1"), open_book("lab 2")
     finish(one, make_outcome(make_grade("team-1", share=0.0), key="1"))
     finish(two, make_outcome(make_grade("team-1", share=0.0), key="2"))
@@ -233,7 +245,10 @@ def test_assignments_in_one_database_stay_apart(open_book):
 
 
 def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
-    """Under a copy of the rubric the key is the same, but each assignment grades for itself."""
+    """If two assignments grade the same submission, each has its own grade and overrides.
+
+    The key is the same, since the second assignment uses a copy of the rubric.
+    """
     one, two = open_book("lab 1"), open_book("lab 2")
     for book in (one, two):
         finish(book, make_outcome(make_grade("team-1"), key="same"))
@@ -246,7 +261,7 @@ def test_one_hand_in_under_one_rubric_is_graded_in_each_assignment(open_book):
 
 
 def test_no_override_is_above_what_the_rubric_has_now(open_book):
-    """If a rubric later gives a criterion fewer points, an override gives no more than that."""
+    """If the rubric now gives fewer points for a criterion, an override gives at most those."""
     book = open_book()
     outcome = make_outcome(make_grade("team-1", share=0.0))
     finish(book, outcome)
@@ -274,7 +289,7 @@ def test_no_override_is_above_what_the_rubric_has_now(open_book):
     ],
 )
 def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, message):
-    """The message says what is allowed; nothing is stored."""
+    """An override that makes no sense is refused; the message says what is allowed."""
     book = open_book()
     finish(book, make_outcome(make_grade("team-1")))
 
@@ -285,7 +300,7 @@ def test_an_override_that_makes_no_sense_is_refused(open_book, arguments, why, m
 
 
 def test_a_team_is_found_by_its_members(open_book):
-    """An author of two submissions does not identify a team."""
+    """An author's name finds the team, unless the author is in several submissions."""
     book = open_book()
     finish(
         book,
@@ -299,7 +314,7 @@ def test_a_team_is_found_by_its_members(open_book):
 
 
 def test_the_history_says_who_did_what_when_and_why(open_book):
-    """Every grading, every change of the class list and every override, in order of time."""
+    """The history lists every grading, change of the class list and override in order of time."""
     book = open_book()
     late = make_outcome(make_grade("team-1", share=0.5, flags=(hertz_flag(),)), key="1")
     finish(book, late)
@@ -329,7 +344,7 @@ def test_the_history_says_who_did_what_when_and_why(open_book):
 
 
 def test_the_history_tells_under_which_name_a_team_goes_on(open_book):
-    """If a folder has a new name in the next run, the old and the new history say so."""
+    """If a team's folder has a new name in the next run, the histories of both names say so."""
     book = open_book()
     finish(
         book, make_outcome(make_grade("team-1", authors=("ann",))), make_outcome(make_grade("b"))
@@ -380,7 +395,7 @@ def test_rows_are_only_added(open_book, place):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
-    """If a process is killed while it writes, every outcome is whole or not there at all."""
+    """If a process is killed while it writes, each outcome is stored either whole or not at all."""
     assert_nothing_lost(str(tmp_path), kills=8)
 
 
@@ -388,14 +403,14 @@ def test_a_kill_at_any_moment_loses_nothing_that_was_put_in(tmp_path):
 @pytest.mark.sample
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_dozen_kills_lose_nothing(place):
-    """The same with a dozen kills, on a server too."""
+    """If a process is killed twelve times while it writes, each stored outcome is whole."""
     assert_nothing_lost(place, kills=12)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_three_hundred_kills_lose_nothing(place):
-    """The same with three hundred kills."""
+    """If a process is killed three hundred times while it writes, each stored outcome is whole."""
     assert_nothing_lost(place, kills=300)
 
 
@@ -409,11 +424,11 @@ def assert_nothing_lost(place: str, *, kills: int) -> None:
     assert within > kills // 4  # most children lived long enough to write
 
 
-# --------------------------------------------------------------- places that will not do
+# --------------------------------------------------------- places without a gradebook
 
 
 def test_a_place_without_a_gradebook_is_an_error(tmp_path):
-    """Reading makes no file."""
+    """If a place has no gradebook, reading it is an error and makes no file."""
     with pytest.raises(ConfigError, match=r"holds no gradebook\.sqlite; give the --out folder"):
         Gradebook(tmp_path)
     assert list(tmp_path.iterdir()) == []
@@ -429,7 +444,10 @@ def test_a_place_without_a_gradebook_is_an_error(tmp_path):
     ],
 )
 def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, message):
-    """Missing drivers, servers that do not answer, text that is not a URL."""
+    """An address that cannot be used gives an error of one line without the password.
+
+    A driver is missing, no server answers, or the text is not a URL.
+    """
     with pytest.raises(ConfigError, match=message) as error:
         Gradebook(url, create=True)
     assert "secret" not in str(error.value)
@@ -437,7 +455,10 @@ def test_an_address_that_leads_nowhere_is_one_line_without_the_password(url, mes
 
 
 def test_a_file_that_is_no_gradebook_is_an_error(tmp_path):
-    """Text, another program's database, a gradebook of a later version: left as they are."""
+    """A file that is not a gradebook of this version is an error and stays as it is.
+
+    Such files are text, another program's database, and a gradebook of a later version.
+    """
     file = tmp_path / FILE
     file.write_text("name,points\n" * 100, encoding="utf-8")
     with pytest.raises(ConfigError, match="file is not a database"):

@@ -1,4 +1,4 @@
-"""Requests for another look, on a real SQLite file and on a real PostgreSQL server."""
+"""Students can ask for another look, with a SQLite file and with a PostgreSQL server."""
 
 import os
 import re
@@ -28,7 +28,7 @@ CRITERIA = [criterion.id for criterion in RUBRIC.criteria]
 
 @pytest.fixture
 def book(place):
-    """A released class of two teams that lost half of every criterion."""
+    """Return a released class of two teams that lost half of every criterion."""
     with RequestBook(place, assignment="lab", create=True) as book:
         finish(book, *(make_grade(name, share=0.5) for name in ("team-1", "team-2")))
         book.release(True, by="prof")
@@ -59,7 +59,10 @@ def answer(book, points, text="looked", by="Ada"):
 
 
 def test_an_answer_and_its_points_count_at_once(book):
-    """The students read both; the history lists each step, and a regrade keeps them."""
+    """The students see an answer and its points at once, and a regrade keeps both.
+
+    The history lists each step.
+    """
     book.ask("team-1", "laws", why="  see\npage 3 ", by="s1")
     assert book.n_waiting() == 1
     (asked,) = book.queue().waiting
@@ -86,7 +89,7 @@ def test_an_answer_and_its_points_count_at_once(book):
 
 
 def test_points_stay_where_the_answer_gives_none(book):
-    """There is an answer but no change by hand."""
+    """If an answer gives no points, the points stay as they are."""
     book.ask("team-1", "laws", why="see page 3", by="s1")
     answer(book, None, text="page 3 is about cart 2")
     own = book.own_feedback("team-1")
@@ -95,7 +98,10 @@ def test_points_stay_where_the_answer_gives_none(book):
 
 
 def test_a_criterion_is_asked_for_once_unless_reopened(book):
-    """Nobody else in the team can ask either; other criteria and teams are free."""
+    """A team can ask about a criterion only once, unless a TA reopens the request.
+
+    Other criteria and other teams are not affected.
+    """
     book.ask("team-1", "laws", why="one", by="s1")
     for state in ("asked", "answered"):
         with pytest.raises(RequestRefused, match="look at this criterion already"):
@@ -125,14 +131,17 @@ def test_a_criterion_is_asked_for_once_unless_reopened(book):
     ],
 )
 def test_a_request_that_makes_no_sense_is_refused(book, criterion, why, message):
-    """Nothing is stored."""
+    """A request that makes no sense is refused, and nothing is stored."""
     with pytest.raises(RequestRefused, match=message):
         book.ask("team-1", criterion, why=why, by="s1")
     assert book.n_waiting() == 0
 
 
 def test_whole_points_are_not_asked_about(book):
-    """A criterion that was never judged can be asked about: its points are lost too."""
+    """A criterion with all its points cannot be asked about.
+
+    One that was never judged can, since its points are lost too.
+    """
     finish(book, make_grade("team-1"), failed_grade("team-2", "no submission.toml"), key="new ")
     with pytest.raises(RequestRefused, match="points were lost"):
         book.ask("team-1", "laws", why="more", by="s1")
@@ -142,7 +151,7 @@ def test_whole_points_are_not_asked_about(book):
 
 
 def test_few_requests_wait_at_once(book):
-    """After an answer there is room for one more."""
+    """A team can have only a few open requests; after an answer it can ask again."""
     for criterion in CRITERIA[:MOST_OPEN]:
         book.ask("team-1", criterion, why="x", by="s1")
     with pytest.raises(RequestRefused, match=f"{MOST_OPEN} of your requests are waiting"):
@@ -153,7 +162,7 @@ def test_few_requests_wait_at_once(book):
 
 
 def test_students_read_and_ask_nothing_before_the_release(place):
-    """Nor after it was withdrawn, nor about another class in the same database."""
+    """Students can read and ask only while their class is released."""
     with RequestBook(place, assignment="lab", create=True) as book:
         assert book.own_feedback("team-1") is None
         finish(book, make_grade("team-1", share=0.5))
@@ -168,7 +177,7 @@ def test_students_read_and_ask_nothing_before_the_release(place):
         assert book.own_feedback("team-1", assignment="lab") is not None
         assert book.own_feedback("team-1", assignment="lab-2") is None
         with pytest.raises(ConfigError, match="not the name of a submission"):
-            book.own_feedback("s-team-1")  # an author of it
+            book.own_feedback("s-team-1")  # one of the authors
         with pytest.raises(ConfigError, match="no such submission"):
             book.own_feedback("team-9")
     with RequestBook(place, assignment="lab-2", create=True) as other:
@@ -177,7 +186,10 @@ def test_students_read_and_ask_nothing_before_the_release(place):
 
 
 def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
-    """Another TA's answer, a change by hand or a regrade came first: nothing is written."""
+    """An answer is refused if the request has changed since the TA saw it.
+
+    Another TA's answer, a change by hand or a regrade may have come first.
+    """
     for criterion in ("laws", "pieces"):
         book.ask("team-1", criterion, why="x", by="s1")
     laws, pieces = book.queue().waiting
@@ -210,14 +222,17 @@ def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
 
 
 def test_of_two_answers_at_one_moment_one_counts(book, place):
-    """In ten rounds of two TAs with the same queue, one is accepted and one gets a conflict."""
+    """If two TAs answer a request at the same moment, one answer counts;
+
+    the other is a conflict.
+    """
     with RequestBook(place) as other:
         for number in range(10):
             book.ask("team-1", "laws", why=f"round {number}", by="s1")
             seen = book.queue().waiting[0].version
             ready = Barrier(2)
 
-            points = 0.25 + 0.5 * (number % 2)  # others than before
+            points = 0.25 + 0.5 * (number % 2)  # points that differ from those of the round before
 
             def give(who, by, *, seen=seen, ready=ready, points=points):
                 ready.wait()
@@ -236,7 +251,7 @@ def test_of_two_answers_at_one_moment_one_counts(book, place):
 
 
 def test_of_two_who_ask_at_one_moment_one_asks(book, place):
-    """The second team member gets a message."""
+    """If two members of a team ask at the same moment, one request is stored, the other refused."""
     with RequestBook(place) as other:
         ready = Barrier(2)
 
@@ -254,7 +269,10 @@ def test_of_two_who_ask_at_one_moment_one_asks(book, place):
 
 
 def test_a_request_goes_with_the_people(book):
-    """Under a new name it stays; another team of the same name does not get it."""
+    """A request stays with its people under a new team name.
+
+    Another team with the old name does not get it.
+    """
     book.ask("team-1", "laws", why="see page 3", by="s1")
     moved = {"team-1": "group-1"}
     finish(book, make_grade("group-1", share=0.5, authors=("s-team-1",)), moved=moved, key="b ")
@@ -266,7 +284,7 @@ def test_a_request_goes_with_the_people(book):
 
 
 def test_a_criterion_that_is_gone_can_still_be_answered(book):
-    """In words only; points for it would mean nothing."""
+    """If a criterion was removed, a request about it can be answered in words, without points."""
     book.ask("team-1", "laws", why="x", by="s1")
     less = tuple(c for c in RUBRIC.criteria if c.id != "laws")
     finish(
@@ -279,7 +297,7 @@ def test_a_criterion_that_is_gone_can_still_be_answered(book):
 
 
 def test_an_anonymous_history_does_not_say_who_asked(book):
-    """Neither by name nor in the text, if the names are known."""
+    """An anonymous history hides who asked, even if the student's own text contains a name."""
     anonymous = RUBRIC.model_copy(update={"anonymous": True})
     finish(book, make_grade("team-1", share=0.5), rubric=anonymous)
     book.ask("team-1", "laws", why="I, u42 of team-1 (S-team-1), see page 3", by="u42")
@@ -291,7 +309,7 @@ def test_an_anonymous_history_does_not_say_who_asked(book):
 
 
 def test_a_gradebook_made_before_opens(tmp_path):
-    """It gets the missing tables; its content stays."""
+    """A gradebook of a version without requests gets the missing tables and keeps its content."""
     with OpenBook(tmp_path, assignment="lab", create=True) as book:
         finish(book, make_grade("team-1", share=0.5))
     with closing(sqlite3.connect(tmp_path / FILE)) as old:
@@ -308,14 +326,14 @@ def test_a_gradebook_made_before_opens(tmp_path):
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_kill_leaves_an_answer_with_its_points_or_neither(place):
-    """Whenever the answering process is killed."""
+    """If the answering process is killed, an answer is stored with its points or not at all."""
     assert_whole(place, kills=8)
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="processes are forked here")
 def test_a_hundred_kills_leave_no_half_of_an_answer(place):
-    """The same with a hundred kills."""
+    """After a hundred kills, every stored answer still has its points."""
     assert_whole(place, kills=100)
 
 
@@ -325,5 +343,5 @@ def assert_whole(place: str, *, kills: int) -> None:
     assert said.returncode == 0, said.stderr
     done, within, told, _ = map(int, re.findall(r"\d+", said.stdout))
     assert done == kills
-    assert within > kills // 4  # most lived long enough to answer
+    assert within > kills // 4  # most processes lived long enough to answer
     assert told >= within

@@ -1,4 +1,4 @@
-"""Submissions as teachers have them: folders, trees, and downloads of learning platforms."""
+"""Submissions are found in folders, in trees of folders, and in downloads of learning platforms."""
 
 import os
 import sys
@@ -52,7 +52,7 @@ def opened(tmp_path, hand_in):
 
 
 def test_a_tree_gives_a_row_for_every_team(tmp_path):
-    """Sections, wrapping folders, zip files and a folder without a submission all have a row."""
+    """Each team of a class gets a row: in a section, a zip file, or without a submission."""
     tree(
         tmp_path / "class",
         {
@@ -81,7 +81,10 @@ def test_two_of_one_name_have_the_parents_before_it(tmp_path):
 
 
 def test_a_canvas_download(tmp_path):
-    """Names, late marks, resubmissions and several files of one student are understood."""
+    """In a Canvas download, names, late marks and resubmissions are understood.
+
+    Several loose files of one student make one submission.
+    """
     inner = zip_bytes(tmp_path, {"lab3/submission.toml": TOML, "lab3/data/a.csv": "1"})
     download = archive(
         tmp_path / "submissions.zip",
@@ -108,7 +111,7 @@ def test_a_canvas_download(tmp_path):
         1.0,
         "anon_x7Yb2",
     )
-    assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later attempt
+    assert opened(tmp_path, found["team-07"]) == ["submission.toml"]  # of the later resubmission
     loose = opened(tmp_path, found["loose"])
     assert loose == ["data/step.csv", "step.csv", "submission.toml"]
     assert found["roeric-lab3"].days_late == 1.0
@@ -119,7 +122,7 @@ def test_a_canvas_download(tmp_path):
 
 
 def test_a_moodle_download(tmp_path):
-    """One folder for each student, with a zip file or the files themselves in it."""
+    """A Moodle download has one folder for each student, with a zip file or the files in it."""
     inner = zip_bytes(tmp_path, {"submission.toml": TOML})
     download = archive(
         tmp_path / "Lab 3.zip",
@@ -139,7 +142,10 @@ def test_a_moodle_download(tmp_path):
 
 
 def test_a_gradescope_download(tmp_path):
-    """Names come from the metadata; a folder that is not listed keeps its own name."""
+    """In a Gradescope download, names come from the metadata.
+
+    A folder that the metadata do not list keeps its own name.
+    """
     metadata = (
         "submission_77:\n  :submitters:\n  - :name: Jane Doe\n    :sid: A1\n"
         "  - :name: Ric Roe\n  :created_at: 2026-11-20 10:00:00.123456000 -08:00\n"
@@ -160,7 +166,7 @@ def test_a_gradescope_download(tmp_path):
 
 
 def test_metadata_that_explode_are_only_text(tmp_path):
-    """Nested YAML aliases are not names: nothing is expanded a billion times."""
+    """Metadata with nested YAML aliases are not expanded, so they cannot fill the memory."""
     laughs = "".join(f"  - &l{i} [{', '.join([f'*l{i - 1}'] * 9)}]\n" for i in range(1, 30))
     metadata = f"x:\n  - &l0 [ha]\n{laughs}submission_77:\n  :submitters:\n  - :name: *l29\n"
     tree(tmp_path / "c", {"submission_metadata.yml": metadata + "  :created_at: *l29\n",
@@ -176,7 +182,7 @@ def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
 
 
 def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
-    """Teams named like Canvas' files get one row each, under their own names."""
+    """A team's folder keeps its name, even if it looks like the name of a Canvas file."""
     names = ("throne_2026_03_alpha", "throne_2026_03_beta", "sec_01_02_x", "ME405_03_07_team")
     tree(tmp_path / "c", {f"{name}/submission.toml": TOML for name in names})
     found = hand_ins(tmp_path, tmp_path / "c")
@@ -185,7 +191,10 @@ def test_a_folder_keeps_its_name_whatever_platform_it_looks_like(tmp_path):
 
 @pytest.mark.parametrize("wrapped", ["", "class/", "term/class/"])
 def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
-    """However deep the class lies, there is no extra row, and one for an emptied submission."""
+    """A refused file in a class archive marks only its own submission, at any depth.
+
+    It adds no row, except for a submission that has no other files.
+    """
     members = {f"{wrapped}team-{n}/submission.toml": TOML for n in range(3)}
     class_ = archive(tmp_path / "all.zip", members)
     with zipfile.ZipFile(class_, "a") as opened_:
@@ -200,7 +209,7 @@ def test_what_is_refused_costs_the_hand_in_it_is_in(tmp_path, wrapped):
 
 
 def test_metadata_of_a_students_own_are_not_read(tmp_path):
-    """Names come from the top of a download, where no student can write."""
+    """Metadata are read only at the top of a download, where no student can write."""
     own = "submission_1:\n  :submitters:\n  - :name: Nobody\n"
     tree(tmp_path / "c", {"a/submission_1/submission.toml": TOML,
                           "a/submission_metadata.yml": own,
@@ -223,7 +232,7 @@ def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
 
 
 def test_one_students_zip_is_one_hand_in(tmp_path):
-    """A zip that is not a class is one submission, and a broken zip has a row."""
+    """One student's zip file is one submission, and a broken zip file gets a row."""
     good = archive(tmp_path / "team-07.zip", {"submission.toml": TOML})
     bad = tmp_path / "team-08.zip"
     bad.write_bytes(b"PK\x03\x04 no more")
@@ -238,7 +247,10 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
-    """Nobody is graded from half a download, whatever comes with it; one submission has a row."""
+    """If a class archive is incomplete, nobody is graded;
+
+    a single incomplete submission gets a row.
+    """
     teams = {f"team-{n}": {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99} for n in range(4)}
     files = {f"{team}/{name}": text for team, own in teams.items() for name, text in own.items()}
     if packed:
@@ -268,17 +280,20 @@ def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
 
 
 def test_a_zip_out_of_which_a_file_was_taken_is_whole(tmp_path):
-    """Deleting the first member in place leaves its bytes, but the table of contents is valid."""
+    """A zip file from which a member was deleted is complete if its table of contents is valid."""
     taken = archive(tmp_path / "team-1.zip", {"draft.txt": "x", "submission.toml": TOML})
     with zipfile.ZipFile(taken, "a") as opened_again:
         del opened_again.filelist[0]
-        opened_again.comment = b"tidied"  # the contents are written again
+        opened_again.comment = b"tidied"  # the table of contents is written again
     (found,) = hand_ins(tmp_path, taken)
     assert opened(tmp_path, found) == ["submission.toml"]
 
 
 def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
-    """Paths that lead out, depth, a password, broken bytes: all other submissions are graded."""
+    """A hostile submission in a class download fails alone; all others are graded.
+
+    The faults are paths that lead out, too deep folders, a password and broken bytes.
+    """
     download = archive(
         tmp_path / "class.zip",
         {
@@ -294,8 +309,8 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
     for signature, name_at, flags_at in ((b"PK\x03\x04", 30, 6), (b"PK\x01\x02", 46, 8)):
         at = raw.find(b"evil-3/", raw.find(signature)) if signature == b"PK\x03\x04" else 0
         at = at or raw.find(b"evil-3/", raw.find(b"PK\x01\x02"))
-        raw[at - name_at + flags_at] |= 1  # encrypted, so its checksum is wrong
-    raw[raw.find(b"0" * 500) + 7] ^= 1  # its checksum is wrong now
+        raw[at - name_at + flags_at] |= 1  # now encrypted, so its checksum is wrong
+    raw[raw.find(b"0" * 500) + 7] ^= 1  # now its checksum is wrong
     download.write_bytes(raw)
     found = {h.id: h.problem for h in hand_ins(tmp_path, download)}
     assert {name: why for name, why in found.items() if not why} == {
@@ -308,7 +323,7 @@ def test_one_bad_hand_in_of_a_download_costs_its_own_row(tmp_path):
 
 
 def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
-    """`.git` is ignored; a team named `...` is graded, and `~$x` can be a folder's name."""
+    """A hidden folder counts only if it holds a submission; `.git` is ignored."""
     tree(
         tmp_path / "c",
         {name + "/submission.toml": TOML for name in ("...", ".lab", "~$x", "a")}
@@ -318,7 +333,10 @@ def test_what_is_hidden_counts_only_with_a_submission(tmp_path):
 
 
 def test_results_of_a_grading_are_no_hand_ins(tmp_path):
-    """Whether beside or among the submissions, with a message; a team may have such a name."""
+    """Folders of earlier results are not submissions, and a message names them.
+
+    A team may still have such a folder's name.
+    """
     made = ("class.html", "feedback/.made.json", "feedback/a/feedback.html", "gradescope/a/x")
     tree(tmp_path / "c", dict.fromkeys(("a/submission.toml", *made), TOML))
     tree(tmp_path / "c" / "grades", dict.fromkeys(made, ""))
@@ -332,7 +350,10 @@ def test_results_of_a_grading_are_no_hand_ins(tmp_path):
 
 @pytest.mark.parametrize("name", ["t.tar.gz", "t.tgz", "t.7z", "t.rar", "t.tar"])
 def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
-    """Beside folders and zip files it is a row; in a team's own folder it is the team's backup."""
+    """An archive in a format that is not opened gets a row, except inside a team's own folder.
+
+    There it is taken for the team's backup.
+    """
     tree(tmp_path / "c", {"a/submission.toml": TOML, "b/lab/submission.toml": TOML, name: "packed"})
     tree(tmp_path / "c" / "b", {name: "packed"})
     found = {h.id: h for h in hand_ins(tmp_path, tmp_path / "c")}
@@ -343,7 +364,7 @@ def test_an_archive_that_is_not_opened_is_a_row(tmp_path, name):
 
 @pytest.mark.parametrize("beside", [(), ("figures/bode.png",), ("notes.md",)])
 def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
-    """The folder of the recordings names no team, in a class, alone or under a section."""
+    """A team without `submission.toml` gets a row with its own name, not its data folder's."""
     for where in ("c/team-7", "alone", "section/only/team-7"):
         tree(tmp_path / where, dict.fromkeys(("data/step.csv", *beside), "1,2"))
     tree(tmp_path / "c", {"a/submission.toml": TOML})
@@ -353,7 +374,7 @@ def test_a_team_without_its_file_keeps_its_name(tmp_path, beside):
 
 
 def test_a_name_of_many_numbers_is_read_at_once():
-    """A name is matched once, not from each of its letters: that would take hours.
+    """A long name with many numbers is read at once, not in a time that grows with its square.
 
     A member's name has at most 65,535 letters.
     """
@@ -362,7 +383,7 @@ def test_a_name_of_many_numbers_is_read_at_once():
 
 
 def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
-    """A zip in a zip is opened; the tenth level is not."""
+    """A zip file in a zip file is opened, but not one ten levels deep."""
     content = zip_bytes(tmp_path, {"submission.toml": TOML})
     nested = zip_bytes(tmp_path, {"inner.zip": content})
     (found,) = hand_ins(tmp_path, archive(tmp_path / "a.zip", {"b.zip": nested}))
@@ -375,7 +396,7 @@ def test_archives_in_archives_are_opened_to_a_depth(tmp_path):
 
 
 def test_many_nested_archives_share_one_limit(tmp_path):
-    """Ten archives in one share the limit of one."""
+    """All archives in one submission together share the limit on the number of files."""
     part = zip_bytes(tmp_path, {str(i): "" for i in range(HAND_IN.members // 5)})
     whole = archive(tmp_path / "a.zip", {f"{i}.zip": part for i in range(10)})
     with pytest.raises(SubmissionError, match="files"):
@@ -383,7 +404,7 @@ def test_many_nested_archives_share_one_limit(tmp_path):
 
 
 def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
-    """With two at the same depth nothing is guessed; one at a higher level wins."""
+    """Two submissions at the same depth are refused; one at a higher level is graded."""
     files = {"a/submission.toml": TOML, "b/submission.toml": TOML}
     folder = tree(tmp_path / "t", files)
     with pytest.raises(SubmissionError, match=r"which one.*'a/submission\.toml' and 'b/"):
@@ -394,7 +415,7 @@ def test_two_submissions_in_one_hand_in_are_a_question(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links and pipes need rights on Windows")
 def test_links_and_pipes_are_not_followed(tmp_path):
-    """A link to one of our files is not copied, a pipe is not read, a linked folder is a row."""
+    """Links and pipes in a submission are not read; a linked folder in a class gets a row."""
     secret = tree(tmp_path / "ours", {"secret.csv": "secret"})
     folder = tree(tmp_path / "c/team/", {"submission.toml": TOML})
     (folder / "data").symlink_to(secret)
@@ -408,7 +429,7 @@ def test_links_and_pipes_are_not_followed(tmp_path):
 
 
 def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
-    """The reason says that the file is too large, not that it is missing."""
+    """If a recording is too large, the reason says so, and not that the file is missing."""
     team = tree(tmp_path / "team-01", {"submission.toml": TOML, "data/long.csv": ""})
     os.truncate(team / "data" / "long.csv", MAX_DATA_BYTES + 1)
     folder = open_submission([team], tmp_path / "opened")
@@ -416,7 +437,7 @@ def test_a_recording_that_is_too_large_is_refused_and_not_missed(tmp_path):
 
 
 def test_too_many_files_are_said_to_be_too_many(tmp_path):
-    """Many small files beside a submission give the same clear reason on every machine."""
+    """A submission with too many files is refused with the same reason on every machine."""
     team = tree(
         tmp_path / "team", {NAME: TOML, **{f"junk/{i}": "" for i in range(HAND_IN.members)}}
     )
@@ -430,7 +451,7 @@ def test_too_many_files_are_said_to_be_too_many(tmp_path):
 
 
 def test_a_hand_in_travels_whole(tmp_path):
-    """A submission packed for another machine holds what would be graded here, and its hash."""
+    """A submission sent to another machine has the same files and hash there."""
     folder = tree(tmp_path / "t", {"submission.toml": TOML, "data/ü.csv": "1", ".DS_Store": "x"})
     unpacked(packed([folder]), tmp_path / "there")
     assert digest([tmp_path / "there"]) == digest([folder])
@@ -440,7 +461,7 @@ def test_a_hand_in_travels_whole(tmp_path):
 
 
 def test_nothing_to_grade_is_said(tmp_path):
-    """An empty or missing folder cannot be graded."""
+    """An empty or missing folder is an error."""
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match="nothing to grade"):
         hand_ins(tmp_path, tmp_path / "empty")

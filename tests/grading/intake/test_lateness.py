@@ -1,4 +1,4 @@
-"""Lateness, by the deadline or by a table."""
+"""Lateness follows from the deadline or from a table."""
 
 from datetime import datetime
 
@@ -29,7 +29,10 @@ def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime |
 
 
 def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
-    """In any time zone; early is not late; without a time the platform's mark counts."""
+    """If the time of submission is known, the deadline decides, in any time zone;
+
+    else the late mark.
+    """
     days, _ = settle(
         tmp_path,
         hand_in("late", handed_in="2026-11-21T19:59:00+00:00"),
@@ -41,7 +44,10 @@ def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_p
 
 
 def test_a_table_of_ones_own_goes_first(tmp_path):
-    """A zero in it is an extension; an unknown name gives a warning."""
+    """A table of days overrides the deadline:
+
+    0 is an extension; an unknown name gives a warning.
+    """
     days, remarks = settle(
         tmp_path,
         hand_in("Team-01", days_late=1.0),
@@ -65,14 +71,14 @@ def test_a_table_of_ones_own_goes_first(tmp_path):
     ],
 )
 def test_what_cannot_be_understood_is_said(tmp_path, text, message):
-    """An error names the line, so that a misread table makes nobody punctual."""
+    """If the table cannot be read, the error names the line."""
     with pytest.raises(ConfigError) as error:
         settle(tmp_path, hand_in("x"), text=text)
     assert message in str(error.value)
 
 
 def test_a_deadline_needs_its_zone(tmp_path):
-    """A time without a zone is an error with its line, unless the rubric gives the zone."""
+    """A deadline without a time zone is an error that names the line."""
     path = tmp_path / "lab.toml"
     shipped = load_rubric_text()
     path.write_text(

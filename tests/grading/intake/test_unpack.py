@@ -1,4 +1,4 @@
-"""Hostile archives: nothing outside the folder, nothing too large, one line of reason."""
+"""A hostile archive writes nothing outside its folder or beyond the limits, and gets one reason."""
 
 import struct
 import zipfile
@@ -48,7 +48,7 @@ def test_what_was_packed_comes_out_without_debris(tmp_path):
     "name", ["../x", "a/../../x", "/etc/x", "C:/x", "..\\x", "a\\..\\..\\x", "\\\\host\\share\\x"]
 )
 def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
-    """A member that would land outside is not written; the others are."""
+    """A member with a path outside the archive is not written; the other members are."""
     archive = zipped(tmp_path / "a.zip", {name: "evil", "good.txt": "good"})
     refused = unpack(archive, tmp_path / "in" / "out", limits=SMALL)
     assert "points outside the archive" in "".join(refused.values())
@@ -57,7 +57,7 @@ def test_a_path_that_leaves_the_archive_is_refused(tmp_path, name):
 
 @pytest.mark.parametrize("name", ["data/run:1.csv", "x.csv.", "a /x", "nul.csv", "COM1", "a?b"])
 def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name):
-    """On Windows such a name is another file, a stream or a device; elsewhere it is a name."""
+    """A name that is not valid on Windows is refused there and accepted elsewhere."""
     packed = zipped(tmp_path / "a.zip", {name: "x", "good.txt": "good"})
     assert not unpack(packed, tmp_path / "here", limits=SMALL)
     monkeypatch.setattr("pipeline.grading.intake.unpack.sys.platform", "win32")
@@ -70,7 +70,7 @@ def test_what_is_no_name_on_windows_is_refused_there(tmp_path, monkeypatch, name
     ("mode", "reason"), [(0o120777, "is a link"), (0o010644, "regular"), (0o020644, "regular")]
 )
 def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
-    """Only regular files are written, whatever Unix calls the member."""
+    """A link, pipe or device in an archive is refused; only regular files are written."""
     archive = zipped(tmp_path / "a.zip", {"t/x": "/etc/passwd"}, mode=mode)
     (refused,) = unpack(archive, tmp_path / "out", limits=SMALL).values()
     assert reason in refused
@@ -86,7 +86,7 @@ def test_links_pipes_and_devices_are_refused(tmp_path, mode, reason):
     ],
 )
 def test_bombs_do_not_go_off(tmp_path, members, reason):
-    """Size, ratio and number are limited, as measured while unpacking."""
+    """Limits on size, ratio and number of files are checked while a zip bomb is unpacked."""
     archive = zipped(tmp_path / "bomb.zip", members)
     with pytest.raises(SubmissionError, match=reason):
         unpack(archive, tmp_path / "out", limits=SMALL)
@@ -94,7 +94,7 @@ def test_bombs_do_not_go_off(tmp_path, members, reason):
 
 
 def test_the_contents_that_count_are_those_that_are_read(tmp_path):
-    """A 64-bit record states their length, whatever the older record says."""
+    """If two records state the length of the table of contents, the 64-bit record counts."""
     archive = zipped(tmp_path / "a.zip", {"y" * 4_000 + str(i): "" for i in range(19)})
     with pytest.raises(SubmissionError, match="table of contents"):
         unpack(archive, tmp_path / "plain", limits=BRIEF)
@@ -113,14 +113,14 @@ def test_the_contents_that_count_are_those_that_are_read(tmp_path):
 
 
 def test_the_ratio_counts_where_the_size_would_still_do(tmp_path):
-    """A file that unpacks to hundreds of times its size is refused, even below the size limit."""
+    """A file that unpacks to over 200 times its size is refused, even below the size limit."""
     archive = zipped(tmp_path / "bomb.zip", {"zeros": "0" * 20_000_000})
     with pytest.raises(SubmissionError, match="200 times its size"):
         unpack(archive, tmp_path / "out", limits=HAND_IN)
 
 
 def test_a_header_that_lies_about_the_size_does_not_help(tmp_path):
-    """A bomb whose headers claim ten bytes is a broken archive, not a full disk."""
+    """A bomb whose headers claim ten bytes is refused as a broken archive."""
     archive = zipped(tmp_path / "a.zip", {"x": "0" * 3_000_000})
     raw = archive.read_bytes().replace(struct.pack("<L", 3_000_000), struct.pack("<L", 10))
     archive.write_bytes(raw)
@@ -129,10 +129,10 @@ def test_a_header_that_lies_about_the_size_does_not_help(tmp_path):
 
 
 def test_an_encrypted_archive_says_so(tmp_path):
-    """The reason names the password."""
+    """If an archive is encrypted, the reason says so."""
     archive = zipped(tmp_path / "a.zip", {"x": "secret"})
     raw = bytearray(archive.read_bytes())
-    raw[6] |= 1  # the local header's flags, and those of the table of contents
+    raw[6] |= 1  # the flags of the local header and of the table of contents
     raw[raw.find(b"PK\x01\x02") + 8] |= 1
     archive.write_bytes(raw)
     with pytest.raises(SubmissionError, match="encrypted"):
@@ -140,14 +140,14 @@ def test_an_encrypted_archive_says_so(tmp_path):
 
 
 def test_names_are_read_as_they_were_meant(tmp_path):
-    """Unmarked UTF-8 is read as UTF-8, and letters with accents become one character."""
+    """UTF-8 names are recognised without their flag, and combining accents join their letters."""
     path = tmp_path / "a.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mu\u0308ller/x.txt", "1")  # u and a combining diaeresis
     raw = path.read_bytes()
     for signature, at in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         where = raw.find(signature) + at
-        raw = raw[:where] + b"\0\0" + raw[where + 2 :]  # the flag that says UTF-8
+        raw = raw[:where] + b"\0\0" + raw[where + 2 :]  # clears the flag that marks UTF-8
     path.write_bytes(raw)
     assert member_names(path) == [PurePosixPath("m\u00fcller/x.txt")]
     unpack(path, tmp_path / "out", limits=SMALL)
@@ -168,7 +168,7 @@ def test_any_bytes_are_unpacked_or_refused(tmp_path_factory, junk, at, patch):
 
 
 def test_debris_is_told_from_work():
-    """Hidden halves of macOS files are ignored; a file with an odd name is kept."""
+    """Hidden files that macOS adds are ignored; a student's file with an odd name is kept."""
     assert is_debris(PurePosixPath("a/._step.csv"))
     assert is_debris(PurePosixPath("__MACOSX/a"))
     assert not is_debris(PurePosixPath("a/_step.csv"))

@@ -1,4 +1,4 @@
-"""Points follow consequences: harmful models, the least cost of a flag, the rubric's step."""
+"""Points follow consequences: a harmful model, the least cost of a flag, the rubric's step."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -17,7 +17,7 @@ from tests.helpers.grading_students import Student, student, typed
 
 
 def model(one: Student) -> tuple[np.ndarray, np.ndarray]:
-    """Return A and B as a student reports them."""
+    """Return the A and B that a student would report."""
     space = one.reported.state_space
     assert space is not None
     return np.array(space.A, dtype=float), np.array(space.B, dtype=float)
@@ -89,7 +89,7 @@ def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("first", ["positions", "last cart"])
 def test_another_order_of_the_states_is_no_harm(carts, first):
-    """It is the same motion under other names: wrong, but it costs only what the flag costs."""
+    """A model with its states in another order loses points, but is not judged as harmful."""
     one = student(carts)
     A, B = model(one)
     both = [[*range(0, 2 * carts, 2), *range(1, 2 * carts, 2)]]
@@ -102,7 +102,7 @@ def test_another_order_of_the_states_is_no_harm(carts, first):
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_an_honest_model_does_no_harm(preset):
-    """Entries up to a tenth off: three carts may then be unstable, but that is no mistake."""
+    """A model with entries up to 10 % off is not judged as harmful, even if it is unstable."""
     chain, rng = PRESETS[preset], np.random.default_rng(5)
     A, B, _, _ = chain.state_space()
     right = np.hstack([A, B])
@@ -120,7 +120,7 @@ def test_an_honest_model_does_no_harm(preset):
 
 
 def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
-    """Gains for carts ten times too heavy are stable only on paper."""
+    """Gains that are stable only for a wrong model keep at most a quarter of the points."""
     one = student(2)
     feedback, times = one.reported.feedback, 30
     assert feedback is not None
@@ -132,11 +132,14 @@ def test_gains_that_only_work_on_paper_keep_a_quarter_at_most():
     assert "On your carts: the loop is unstable" in found.message
 
 
-# ------------------------------------------------------------- what a remark costs at least
+# -------------------------------------------------------------- the least cost of a flag
 
 
 def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
-    """A coupling that is too weak is one entry of many, but makes another model."""
+    """If the rubric states no cost, a wrong state model costs at least half of the criterion.
+
+    Here one coupling is too weak.
+    """
     one = student(2)
     A, B = model(one)
     A[1, 2] *= 0.5
@@ -149,7 +152,7 @@ def test_an_error_in_the_model_costs_half_where_the_rubric_says_nothing():
 
 
 def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
-    """Hz in the final frequencies costs those criteria; gains and initial estimates keep theirs."""
+    """A flag on a table costs points only in the criteria of the numbers that it names."""
     one = student(2)
     hertz = {
         name: one.value("final", name) / (2 * np.pi)
@@ -165,7 +168,7 @@ def test_a_remark_on_a_table_costs_the_criteria_of_its_numbers():
 
 
 def test_of_two_remarks_on_one_criterion_the_dearer_counts():
-    """A slip in one number and an error in another: the larger cost counts, not the sum."""
+    """If two flags concern one criterion, the larger cost counts, not the sum."""
     one = student(2)
     off = {"omega_1": one.value("final", "omega_1") / (2 * np.pi)}
     off |= {"omega_b": one.value("final", "omega_b") * 1.35}
@@ -181,7 +184,7 @@ def test_of_two_remarks_on_one_criterion_the_dearer_counts():
 
 @pytest.mark.parametrize("step", [0.01, 0.1, 0.25, 0.5, 1.0])
 def test_points_are_multiples_of_the_step(step):
-    """Whatever a student got wrong, points and total are multiples a person would give."""
+    """Points of each criterion and in total are multiples of the rubric's step."""
     one = under(student(2), step=step)
     off = {name: one.value("final", name) * 1.11 for name in one.reported.final}
     grade = one.reporting(final=off).grade(days_late=1.5)
@@ -197,7 +200,7 @@ def test_points_are_multiples_of_the_step(step):
 
 
 def test_halves_are_rounded_for_the_student():
-    """1.75 in steps of a half is 2; a day late takes 10 % of 17.5, which is 1.5 and not 2."""
+    """Half a step is rounded in the student's favour, in points and in the late deduction."""
     assert to_step(Fraction("1.75"), 0.5) == 2
     late = Late(percent_per_day=10.0)
     assert late_deduction(Fraction("17.5"), late=late, step=0.5, days_late=1.0) == Fraction("1.5")

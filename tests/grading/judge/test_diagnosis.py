@@ -1,4 +1,4 @@
-"""Named mistakes: each gets its own code and no other; an honest student gets none."""
+"""Each named mistake gets its own flag and no other; an honest student gets none."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,7 +14,7 @@ from tests.helpers.textbook_student import by_eye, final_table, initial_table
 
 TURN = 2 * np.pi
 FRICTION = ("coulomb_friction",)
-FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # criteria begin so
+FROM_TABLES = {"initial", "final", "comparison", "laws", "state"}  # beginnings of criteria's ids
 
 
 def codes(one: Student) -> list[str]:
@@ -42,7 +42,10 @@ def scaled(one: Student, table: str, names: list[str], factor: float) -> Student
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
 def test_an_honest_student_gets_no_flag(carts, hide):
-    """Rounded numbers, some percent of error, guessed dampings, a sticking cart: no flag."""
+    """An honest student gets no flag.
+
+    Rounding, small errors, guessed dampings and a sticking cart are honest.
+    """
     one = student(carts, hide=hide)
     assert one.grade().flags == ()
     assert one.grade().points >= 0.95 * one.rubric.out_of
@@ -50,7 +53,7 @@ def test_an_honest_student_gets_no_flag(carts, hide):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_numbers_typed_with_two_digits_are_honest_too(carts):
-    """As in the paper's tables: 0.10, 13, 29."""
+    """Numbers typed with two digits, as in the paper's tables, get no flag."""
     one = student(carts)
     coarse = {
         table: {n: Decimal(f"{float(v):.1e}") for n, v in getattr(one.reported, table).items()}
@@ -61,7 +64,10 @@ def test_numbers_typed_with_two_digits_are_honest_too(carts):
 
 @pytest.mark.parametrize(("carts", "hide"), [(1, ()), (2, ()), (3, ()), (2, FRICTION)])
 def test_a_student_with_a_textbook_is_honest(carts, hide):
-    """Means, peaks, half the swing and a fit in dB, last cart first: no flag."""
+    """Numbers that a student reads by textbook methods get no flag.
+
+    The student starts with the last cart.
+    """
     one = student(carts, hide=hide)
     records = one.analysis.records
     initial = by_eye(records, carts) if carts > 1 else {}
@@ -76,7 +82,7 @@ def test_a_student_with_a_textbook_is_honest(carts, hide):
 
 @pytest.mark.parametrize("digits", [2, 3])
 def test_a_right_first_estimate_may_be_found_again(digits):
-    """For one cart on a quiet bench both estimates of a careful student may be equal."""
+    """For one cart on a quiet bench, equal initial and final estimates get no flag."""
     one = student(1)
     right = {row.name: row.final.value for row in one.analysis.rows if row.final}
     table = {name: Decimal(f"{value:.{digits - 1}e}") for name, value in right.items()}
@@ -85,7 +91,7 @@ def test_a_right_first_estimate_may_be_found_again(digits):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
-    """A student who lists the last cart first has the same table."""
+    """The order in which a student lists the numbers does not matter."""
     one = student(carts)
     reported = one.reported.model_copy(
         update={
@@ -102,7 +108,7 @@ def test_the_order_in_which_numbers_are_listed_does_not_matter(carts):
 
 
 def test_a_student_who_reports_first_estimates_only_misses_the_rest():
-    """Numbers that were not reported are missing; nothing else is flagged."""
+    """If only initial estimates are reported, all other numbers are flagged as missing."""
     one = student(2)
     reported = Reported(initial=one.reported.initial)
     submission = one.submission.model_copy(update={"reported": reported})
@@ -112,7 +118,7 @@ def test_a_student_who_reports_first_estimates_only_misses_the_rest():
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_frequencies_in_hz(carts, table):
-    """All frequencies of a table divided by 2π are in Hz; the message gives the evidence."""
+    """If all frequencies of a table are divided by 2π, the flag says Hz and gives the ratio."""
     one = student(carts)
     names = [n for n in getattr(one.reported, table) if n.startswith("omega")]
     flag = only_flag(scaled(one, table, names, 1 / TURN))
@@ -124,7 +130,7 @@ def test_frequencies_in_hz(carts, table):
 
 
 def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
-    """Hz in both tables gives one flag that names the numbers, and no talk of peaks."""
+    """Frequencies in Hz in both tables give one flag that names them, without other advice."""
     one = student(2)
     names = [n for n in one.reported.final if n.startswith("omega")]
     hertz = scaled(scaled(one, "initial", names, 1 / TURN), "final", names, 1 / TURN).grade()
@@ -139,7 +145,7 @@ def test_a_named_mistake_is_told_once_and_nothing_else_is_advised():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
-    """One flag for gains in counts, although one is 7 % off, as initial estimates may be."""
+    """Gains in counts give one flag, even if one of the gains is also 7 % off."""
     one, names = student(carts), own("K", carts)
     counted = {n: one.value("initial", n) / 0.00227 for n in names}
     counted[names[-1]] *= 1.07
@@ -149,7 +155,7 @@ def test_numbers_beside_a_slip_are_as_far_off_as_honest_ones(carts):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
-    """One damping that is 2.3 times too small, beside right ones, is not a logarithm slip."""
+    """A single damping that is 2.3 times too small is not called a logarithm slip."""
     one = student(carts)
     flag = only_flag(scaled(one, "initial", ["zeta_1"], np.log10(np.e)))
     assert (flag.code, flag.parameters) == ("initial_off", ("zeta_1",))
@@ -158,7 +164,7 @@ def test_a_mistake_that_is_made_everywhere_shows_everywhere(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("k", [1, 2, 3])
 def test_one_period_counted_too_many(carts, k):
-    """ω is (k + 1)/k of its true value, and ζ is smaller in proportion."""
+    """A peak too many is recognised: ω is (k + 1)/k of its value, and ζ smaller in proportion."""
     one = student(carts)
     omegas, zetas = own("omega", carts), own("zeta", carts)
     wrong = scaled(one, "initial", omegas, (k + 1) / k)
@@ -169,7 +175,7 @@ def test_one_period_counted_too_many(carts, k):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_decrement_with_log10(carts):
-    """Every ζ of a decay is 2.303 times too small."""
+    """If every ζ of the decays is 2.303 times too small, the flag says log10 instead of ln."""
     one = student(carts)
     flag = only_flag(scaled(one, "initial", own("zeta", carts), np.log10(np.e)))
     assert flag.code == "log10_for_ln"
@@ -179,12 +185,12 @@ def test_a_decrement_with_log10(carts):
 @pytest.mark.parametrize("carts", [1, 2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_gains_from_peak_to_peak_and_in_counts(carts, table):
-    """Twice the gain is peak to peak.
+    """Gains twice too large are flagged as peak to peak.
 
-    Divided by the encoder step it is in counts; both can meet.
+    Gains divided by the encoder step are flagged as counts; a gain can have both flags.
     """
     one, names = student(carts), own("K", carts)
-    count = 0.00227  # cm, of the simulated encoder
+    count = 0.00227  # cm per count of the simulated encoder
     assert codes(scaled(one, table, names, 2.0)) == ["peak_to_peak"]
     assert codes(scaled(one, table, names, 1 / count)) == ["counts_for_length"]
     both = codes(scaled(one, table, names, 2 / count))
@@ -193,7 +199,7 @@ def test_gains_from_peak_to_peak_and_in_counts(carts, table):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_the_peak_of_the_step(carts):
-    """A gain that is the peak of the student's own step, not its settled level."""
+    """A gain read at the peak of the step, not at its settled level, is recognised."""
     one = student(carts)
     record = next(r for r in one.analysis.records if r.kind == "step")
     assert record.u is not None
@@ -208,7 +214,7 @@ def test_the_peak_of_the_step(carts):
 @pytest.mark.parametrize("vague", ["0e2", "0.0"])
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_digits_that_say_nothing_earn_nothing(carts, vague):
-    """A table of zeros, however they are typed, is impossible, and so are dampings of 0.0."""
+    """Zeros are flagged as physically impossible, however they are typed, and earn no points."""
     one = student(carts)
     zeros = dict.fromkeys(one.rubric.names, Decimal(vague))
     space = ReportedStateSpace(
@@ -217,7 +223,7 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
     )
     grade = one.reporting(initial=zeros, final=zeros, state_space=space).grade()
     told = [flag.message for flag in grade.flags if flag.code == "physically_impossible"]
-    assert len(told) == len(set(told)) == 2  # one of each table
+    assert len(told) == len(set(told)) == 2  # one message per table
     assert all(vague in message for message in told)
     tables = [c for c in grade.criteria if c.id.split("-")[0] in FROM_TABLES]
     assert tables
@@ -231,7 +237,7 @@ def test_digits_that_say_nothing_earn_nothing(carts, vague):
 
 @pytest.mark.parametrize("hide", [(), FRICTION])
 def test_the_peak_of_one_edge_of_both_carts(hide):
-    """If friction blurs the gains, peaks of one edge are still recognised."""
+    """Gains read at the peaks of one edge of the step are recognised even under friction."""
     one = student(2, hide=hide)
     record = next(r for r in one.analysis.records if r.kind == "step")
     assert record.u is not None
@@ -244,7 +250,7 @@ def test_the_peak_of_one_edge_of_both_carts(hide):
 @pytest.mark.parametrize("carts", [2, 3])
 @pytest.mark.parametrize("table", ["initial", "final"])
 def test_carts_swapped(carts, table):
-    """The numbers of cart 1 are in the last cart's place, and the other way round."""
+    """Numbers of the first and the last cart in each other's place are recognised."""
     one = student(carts)
     swapped = {}
     for symbol in ("K", "omega", "zeta"):
@@ -256,7 +262,7 @@ def test_carts_swapped(carts, table):
 
 
 def test_two_mistakes_in_one_number():
-    """Swapped frequencies in Hz are both mistakes: neither alone explains the numbers."""
+    """Swapped frequencies in Hz get both flags, since one mistake alone explains neither number."""
     one = student(2)
     wrong = {
         "omega_1": one.value("initial", "omega_2") / TURN,
@@ -269,7 +275,7 @@ def test_two_mistakes_in_one_number():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_final_table_copied_from_the_first(carts):
-    """Equal in every digit means that no fit was made; this is the only flag."""
+    """A final table equal to the initial one in every digit is flagged only as not fitted."""
     one = student(carts)
     flag = only_flag(one.reporting(final=one.reported.initial))
     assert flag.code == "no_fit_done"
@@ -278,7 +284,7 @@ def test_a_final_table_copied_from_the_first(carts):
 
 @pytest.mark.parametrize("carts", [2, 3])
 def test_tables_of_single_digits_agree_anyway(carts):
-    """A student who types one digit gets the same digit from the fit."""
+    """Equal tables of one-digit numbers get no flag, since a fit could give the same digits."""
     one = student(carts)
     coarse = {n: Decimal(f"{float(v):.0e}") for n, v in one.reported.final.items()}
     assert "no_fit_done" not in codes(one.reporting(initial=coarse, final=coarse))
@@ -286,7 +292,7 @@ def test_tables_of_single_digits_agree_anyway(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_a_number_that_no_mistake_explains_is_only_off(carts):
-    """A frequency 33 % too high in the final table, a gain 19 % too low in the initial one."""
+    """A wrong number that no named mistake explains is only flagged as off."""
     one = student(carts)
     omega, gain = own("omega", carts)[0], own("K", carts)[-1]
     flag = only_flag(scaled(one, "final", [omega], 1.33))
@@ -296,9 +302,9 @@ def test_a_number_that_no_mistake_explains_is_only_off(carts):
 
 
 def test_a_frequency_out_of_order_is_told_by_the_recordings():
-    """One wrong number also breaks the order of the nulls.
+    """A wrong null frequency that also breaks the order is only flagged as off.
 
-    The message gives the recordings' value.
+    The message gives the value from the recordings.
     """
     one = student(3)
     flag = only_flag(scaled(one, "final", ["omega_2"], 1.4))
@@ -306,7 +312,7 @@ def test_a_frequency_out_of_order_is_told_by_the_recordings():
 
 
 def test_what_no_carts_can_do():
-    """A negative damping, and a far cart that moves more than the near one."""
+    """A negative damping is impossible, and so is a far cart that moves more than a near one."""
     one = student(2)
     flag = only_flag(scaled(one, "final", ["zeta_a"], -1.0))
     assert (flag.code, flag.parameters) == ("physically_impossible", ("zeta_a",))
@@ -346,7 +352,7 @@ def exchanged(A: list, n: int) -> list:
     ],
 )
 def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said):
-    """Sign, order of the states, a square forgotten, couplings exchanged."""
+    """If a wrong state model follows from one known slip, the message names the slip."""
     one = student(carts)
     space = one.reported.state_space
     assert space is not None
@@ -358,7 +364,7 @@ def test_a_wrong_state_model_says_which_slip_made_it(carts, slip: Callable, said
 
 
 def test_a_state_model_that_follows_from_a_wrong_table_is_right():
-    """A student with ω in Hz who builds A from it gets a flag for Hz, not one for A too."""
+    """A state model that was built correctly from frequencies in Hz gets no flag of its own."""
     one = student(1)
     hertz = one.value("final", "omega_n") / TURN
     space = one.reported.state_space
@@ -371,9 +377,9 @@ def test_a_state_model_that_follows_from_a_wrong_table_is_right():
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
-    """Gains of reversed sign are wrong gains.
+    """Gains of reversed sign are flagged as wrong gains.
 
-    A prefilter equal to the static gain is its own mistake.
+    A prefilter equal to the static gain is flagged as a wrong prefilter.
     """
     one = student(carts)
     feedback = one.reported.feedback
@@ -390,7 +396,7 @@ def test_wrong_gains_and_wrong_prefilters_are_told_apart(carts):
 
 
 def test_claims_of_other_gains_are_not_these_gains():
-    """Gains that are 2.5 times too large settle later than the student reported."""
+    """Gains 2.5 times too large are flagged if the loop settles later than the student reported."""
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None
@@ -404,14 +410,14 @@ def test_claims_of_other_gains_are_not_these_gains():
 
 
 def test_what_is_missing_is_named():
-    """A parameter that was not reported, and a state model that was not reported."""
+    """A number that was not reported is flagged as missing."""
     one = student(2).without("final", "zeta_b")
     flag = only_flag(one)
     assert (flag.code, flag.parameters) == ("missing", ("final.zeta_b",))
 
 
 def test_gains_that_cancel_all_stiffness_are_judged():
-    """If they leave no stiffness, the typed table gives no prefilter to compare."""
+    """Gains that cancel all stiffness are judged, although no prefilter exists for them."""
     one = student(1)
     feedback = one.reported.feedback
     assert feedback is not None

@@ -1,4 +1,4 @@
-"""Grading one submission from its folder: points, dependencies, lateness, no blind trust."""
+"""One submission is graded from its folder: points, dependencies, lateness, planted results."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ from tests.helpers.grading_students import student
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """One cart's submission on disk."""
+    """Return the folder of a submission for one cart."""
     path = tmp_path_factory.mktemp("grading") / "team-07"
     write_submission(path, "throne-1dof", seed=3, compact=True, reported=True)
     return path
@@ -39,7 +39,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def honest(folder) -> Grade:
-    """Its grade without any change."""
+    """Return the grade of the unchanged submission."""
     return grade(folder)
 
 
@@ -62,7 +62,10 @@ def test_the_same_submission_gives_the_same_bytes(folder, honest):
 
 
 def test_grading_loads_neither_pandas_nor_control(folder):
-    """They would cost half a second a worker; reference design and figures do without them."""
+    """Grading loads neither pandas nor python-control.
+
+    They would take each worker half a second.
+    """
     code = f"""
 import sys
 from pathlib import Path
@@ -85,7 +88,7 @@ print({{"pandas", "control", "scipy.signal"}} & set(sys.modules))
 
 
 def test_results_that_a_submission_brings_along_are_not_believed(folder, honest, tmp_path):
-    """A planted results.json or gap.json changes nothing."""
+    """Result files that a submission brings along do not change its grade."""
     planted = tmp_path / "team-07"
     shutil.copytree(folder, planted)
     for name in ("results.json", "gap.json", "grade.json", "report/results.json", "gap/gap.json"):
@@ -95,7 +98,10 @@ def test_results_that_a_submission_brings_along_are_not_believed(folder, honest,
 
 
 def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
-    """A scale of a record counts only under feedback, where benches log other signals."""
+    """A recording's own input scale counts only under feedback.
+
+    Benches log other signals there; elsewhere the rubric's scale counts.
+    """
     submission, rubric = load_submission(folder), load_rubric(Path("throne-1dof"))
     system = rubric.system.model_copy(update={"input": InputScale(sign=1, per_count=1e-4)})
     own = InputOverride(sign=-1, per_count=0.5)
@@ -119,7 +125,7 @@ def test_a_record_s_own_scale_does_not_win_over_the_rubric_s(folder):
 def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
     folder, honest, tmp_path, turned
 ):
-    """Steps said to be logged the other way are used as the data show: reversed or not."""
+    """If a step's own sign differs from the rubric's, the sign that the data show is used."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     for path in (other / "data").glob("step-*.csv") if turned else ():
@@ -143,7 +149,7 @@ def test_between_a_record_s_own_sign_and_the_rubric_s_the_data_decide(
 
 
 def test_rounding_is_no_error():
-    """The rounding errors that MATLAB leaves in an A of zeros and ones cost nothing."""
+    """The rounding errors that MATLAB leaves in zeros and ones of A are no errors."""
     model = np.array([[0.0, 1.0, 0.0], [-174.0, -2.6, 5000.0]])
     exactly = StateMatrices(right=model, slack=np.zeros_like(model))
     noisy = [["1.2e-17", "1.0000000001"], ["-174", "-2.6"]]
@@ -154,7 +160,7 @@ def test_rounding_is_no_error():
 
 
 def test_the_rubric_s_system_wins(folder, honest, tmp_path):
-    """A submission that denies a spring and reverses the sign is read as the rubric says."""
+    """Springs and sign come from the rubric, even if the submission states others."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     toml = other / "submission.toml"
@@ -166,13 +172,16 @@ def test_the_rubric_s_system_wins(folder, honest, tmp_path):
     found = grade(other)
     assert found.points == honest.points
     assert found.flags == ()
-    assert found.notes == ()  # one cart has one stiffness, whichever spring it comes from
+    assert found.notes == ()  # with one cart only the sum of the two springs matters
 
 
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_delay_is_not_read_as_a_spring(tmp_path):
-    """A spring that the fit puts at zero is not assumed, however much better it then fits."""
+    """A spring that the fit puts at zero is not added, even if the fit is better with it.
+
+    Here a delay makes it look better.
+    """
     bench = prepare_bench(preset="throne-2dof", model=None, hide=["input_delay"])
     write_submission(tmp_path, bench, seed=304)
     rubric = load_rubric(Path("throne-2dof"))
@@ -182,13 +191,13 @@ def test_a_delay_is_not_read_as_a_spring(tmp_path):
 
 
 def test_two_first_and_final_numbers_of_one_sign_agree(folder):
-    """If both tables have the reversed sign they agree; two different signs do not."""
+    """First and final numbers agree if both have the reversed sign, but not if the signs differ."""
     assert between(Decimal("-24.4"), Decimal("-24.3")) == between(Decimal("24.4"), Decimal("24.3"))
     assert between(Decimal("-24.4"), Decimal("24.3")) == between(Decimal("0"), Decimal("24.3"))
 
 
 def test_a_submission_for_another_bench_fails_with_its_reason(folder):
-    """One cart under the rubric for two: no grade, with the reason."""
+    """A submission for one cart under a rubric for two is not graded, and the reason says why."""
     rubric = load_rubric(Path("throne-2dof"))
     failed = grade_submission(load_submission(folder), rubric=rubric, name="team-07").grade
     assert (failed.status, failed.points, failed.out_of) == ("failed", 0.0, 20)
@@ -196,7 +205,7 @@ def test_a_submission_for_another_bench_fails_with_its_reason(folder):
 
 
 def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
-    """The rest is graded; the message names the line at which the file breaks off."""
+    """If a file is cut off, its run is flagged with the line and the rest is graded."""
     cut = tmp_path / "team-07"
     shutil.copytree(folder, cut)
     path = cut / "data" / "sine-05.csv"
@@ -211,7 +220,7 @@ def test_a_cut_file_costs_its_own_run_only(folder, tmp_path):
 
 
 def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
-    """One of two decays: its run is flagged. The only control run: its criterion is missing too."""
+    """A missing file costs its own run, and also a criterion that depends only on this file."""
     less = tmp_path / "team-07"
     shutil.copytree(folder, less)
     (less / "data" / "decay-1a.csv").unlink()
@@ -228,7 +237,7 @@ def test_a_missing_file_costs_what_was_to_be_in_it(folder, honest, tmp_path):
 
 
 def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
-    """A decay in place of a step: the copy and the missing step give one flag."""
+    """A decay copied in place of a step gets one flag for the copy and the missing step."""
     other = tmp_path / "team-07"
     shutil.copytree(folder, other)
     shutil.copyfile(other / "data" / "decay-1a.csv", other / "data" / "step-1.csv")
@@ -254,7 +263,7 @@ def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
 @pytest.mark.parametrize("table", ["initial", "final"])
 @pytest.mark.parametrize("side", [1, -1])
 def test_points_never_rise_with_the_error(table, side):
-    """A gain further off never earns more, and far off it earns nothing."""
+    """The larger the error of a gain, the fewer points it earns, down to none."""
     one = student(1)
     right = one.value(table, "K")
     errors = (0.0, 0.02, 0.06, 0.08, 0.1, 0.15, 0.2, 0.3, 0.5)
@@ -272,7 +281,7 @@ def test_points_never_rise_with_the_error(table, side):
 
 
 def test_a_broken_law_is_told_in_words():
-    """The message says what fails and why it should hold; ids are only in the data."""
+    """If a law fails, the message says in words what fails and why it should hold."""
     honest = student(2)
     final = honest.reported.final
     swapped = honest.reporting(final={"K_1": final["K_2"], "K_2": final["K_1"]})
@@ -285,17 +294,17 @@ def test_a_broken_law_is_told_in_words():
 
 
 def test_lateness_takes_its_share_for_every_day_begun():
-    """Ten percent a day, after an hour of grace, at most half."""
+    """Each day late costs 10 %, after an hour of grace and at most half of the points."""
     one = student(1)
     full = one.grade().points
     for days, share in ((0.0, 0), (0.04, 0), (0.5, 0.1), (1.04, 0.1), (2.0, 0.2), (30.0, 0.5)):
         graded = one.grade(days_late=days)
-        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # to the hundredth
+        assert graded.deducted == pytest.approx(share * full, abs=0.005)  # rounded to a hundredth
         assert graded.points == pytest.approx(full - graded.deducted)
 
 
 def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
-    """Without [reported] everything reported is missing; the recordings still earn points."""
+    """Without [reported], all reported numbers are missing; the recordings still earn points."""
     one = student(2)
     silent = replace(one, submission=one.submission.model_copy(update={"reported": None}))
     graded = silent.grade()
@@ -305,7 +314,7 @@ def test_a_submission_that_reports_nothing_is_graded_for_its_recordings():
 
 
 def test_further_flags_keep_the_order_of_the_codes():
-    """Flags added by the batch are sorted in by their codes."""
+    """A flag that the batch adds is put in the order of the codes."""
     graded = student(2).without("final", "zeta_b").grade()
     flag = Flag(code="shared_data", parameters=("step-1",), message="…", evidence={})
     data = Flag(code="data_problem", parameters=("step-1",), message="…", evidence={})
@@ -315,7 +324,7 @@ def test_further_flags_keep_the_order_of_the_codes():
 
 @pytest.mark.parametrize(("hide", "loosely"), [((), False), (("dead_zone",), True)])
 def test_numbers_that_are_judged_loosely_are_said_to_be(hide, loosely):
-    """If no linear carts fit the recordings, the grader does not vouch for numbers that pass."""
+    """If no linear carts fit the recordings, the message asks a person to look at the numbers."""
     criteria = {c.id: c for c in student(1, hide=hide).grade().criteria}
     for name in ("final-gains", "final-frequencies", "final-dampings"):
         message = criteria[name].message

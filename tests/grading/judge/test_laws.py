@@ -1,4 +1,4 @@
-"""The laws of a final table: the paper's own tables, and tables of real chains."""
+"""The laws of a final table are judged for the paper's own tables and for real chains."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -32,26 +32,29 @@ def broken(table: dict[str, str], *, n: int) -> set[str]:
 
 
 def test_table_2_of_the_paper_passes_but_for_its_first_cart():
-    """ω_1 = 19.8 lies below the recomputed 20.07 to 20.49; R1 holds for ζ_b = 0.034, not 0.03."""
+    """Table 2 of the paper fails in ω_1, and in R1 unless ζ_b is 0.034 instead of 0.03.
+
+    ω_1 = 19.8 is below the recomputed range of 20.07 to 20.49.
+    """
     assert broken({**TABLE_2, "zeta_b": "0.034"}, n=2) == {"recomputed.omega_1"}
     assert broken(TABLE_2, n=2) == {"recomputed.omega_1", "redundancy.R1"}
 
 
 def test_table_3_of_the_paper_fails_where_it_is_known_to():
-    """R4 and R5 fail, the wall spring is negative, ω_2 is off."""
+    """Table 3 of the paper fails R4, R5, the sign of a wall spring and ω_2."""
     failed = {"redundancy.R4", "redundancy.R5", "sign.k_1", "recomputed.omega_2"}
     assert failed < broken(TABLE_3, n=3)
 
 
 def test_one_digit_excuses_no_more_than_two():
-    """The rounding box of a table typed as 1e1 and 0e2 is not wide enough for every law."""
+    """Numbers typed with one digit are not rounded so coarsely that every law holds."""
     vague = {name: f"{float(value):.0e}" for name, value in TABLE_2.items()}
     assert broken(vague, n=2) == {"recomputed.omega_1", "recomputed.zeta_1"}
     assert "positive.K_1" in broken({**TABLE_2, "K_1": "0e2"}, n=2)
 
 
 @pytest.mark.parametrize("n", [2, 3])
-@settings(max_examples=20)  # a box of three carts has 2^15 corners
+@settings(max_examples=20)  # the rounding box of three carts has 2^15 corners
 @given(data=st.data())
 def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
     """A real chain's table lies in its rounding box, however few digits are typed."""
@@ -67,7 +70,7 @@ def test_a_rounded_table_of_a_real_chain_obeys_every_law(n, data):
 
 
 def test_an_incomplete_table_is_not_judged():
-    """If a parameter is missing, there is nothing to propagate."""
+    """A table with a missing parameter is not judged."""
     typed = {name: Decimal(value) for name, value in TABLE_2.items() if name != "K_1"}
     assert judge_laws(typed, n=2, frequency_percent=3.0, damping_percent=30.0) is None
 

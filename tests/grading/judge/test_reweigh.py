@@ -1,4 +1,4 @@
-"""Points under another rubric from stored findings equal those of grading again."""
+"""Stored findings give the same points under another rubric as grading again."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -21,7 +21,7 @@ from tests.helpers.grading_students import Student, student
 
 @cache
 def _erring(carts: int) -> Student:
-    """Return a team that is right in some places, near in others, and wrong in the rest."""
+    """Return a team whose numbers are partly right, partly near, and otherwise wrong."""
     honest = student(carts)
     names = honest.rubric.names
     off = {name: honest.value("final", name) * (1 + 0.03 * i) for i, name in enumerate(names)}
@@ -92,7 +92,7 @@ def test_points_are_those_of_grading_again(carts, data):
 
 
 def test_the_same_rubric_gives_the_same_points():
-    """The test's team loses points in several ways, so equality means something."""
+    """Stored findings give the same points under the same rubric, for a team that loses some."""
     team, before = _erring(2), _graded(2)
     weighed = reweigh(before.grade, before.verdicts, rubric=team.rubric)
     assert weighed.points == before.grade.points
@@ -100,7 +100,7 @@ def test_the_same_rubric_gives_the_same_points():
 
 
 def test_what_needs_the_recordings_is_named():
-    """Keys that decide what is compared with what need the recordings."""
+    """Changed rubric keys that need the recordings are named."""
     rubric = student(2).rubric
     plain = rubric.model_dump(mode="json")
     plain["required"]["final"] = ["K_*"]

@@ -1,4 +1,4 @@
-"""Recordings in counts or millivolts that claim to be in centimetres or volts."""
+"""Recordings whose unit is stated wrongly: counts stated as cm, or mV stated as V."""
 
 import csv
 from pathlib import Path
@@ -16,7 +16,7 @@ COUNT = 0.00227  # cm
 
 
 def scaled(folder: Path, column: str, factor: float, *, whole: bool = False) -> Path:
-    """Write a submission and multiply a column of every recording."""
+    """Write a submission and multiply a column of each recording."""
     write_submission(folder, "throne-1dof", seed=3, compact=True, reported=True)
     for path in (folder / "data").glob("*.csv"):
         with path.open(encoding="utf-8", newline="") as file:
@@ -45,14 +45,17 @@ def in_counts(tmp_path_factory):
 
 
 def test_counts_said_to_be_centimetres_fail_a_check(in_counts):
-    """Every gain is hundreds of times too large, and everything else agrees."""
+    """Counts that are stated as centimetres fail a check, although all recordings agree.
+
+    Every gain is then hundreds of times too large.
+    """
     failed = [c.id.split(".")[0] for c in analyse(load_submission(in_counts)).checks
               if c.outcome == "fail"]  # fmt: skip
-    assert failed == ["position_scale", "hardware"]  # no stated gains are in counts
+    assert failed == ["position_scale", "hardware"]  # gains in counts agree with no stated gain
 
 
 def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_counts):
-    """The recordings are flagged, but neither the student's gain nor the loop that ran."""
+    """If the recordings are in counts, they are flagged, and no reported gain is judged."""
     graded = grade(in_counts)
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     outcomes = {c.id: c.outcome for c in graded.criteria if c.outcome != "pass"}
@@ -62,7 +65,7 @@ def test_the_right_gain_is_not_accused_where_the_recordings_are_in_counts(in_cou
 
 
 def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
-    """The gain is compared with the scaled recordings, so a wrong gain is found."""
+    """If the rubric states the length of a count, gains are judged by the scaled recordings."""
     outcomes = {c.id: c.outcome for c in grade(in_counts, per_count=COUNT).criteria}
     assert outcomes["initial-gains"] == outcomes["final-gains"] == "pass"
     off = {c.id: c.outcome for c in grade(in_counts, per_count=2 * COUNT).criteria}
@@ -70,7 +73,7 @@ def test_a_stated_length_of_a_count_makes_the_gain_known(in_counts):
 
 
 def test_millivolts_said_to_be_volts_fail_a_check(tmp_path):
-    """No amplifier gives hundreds of volts, so no gain is judged by these recordings."""
+    """If the input is in millivolts stated as volts, it is flagged, and no gain is judged."""
     graded = grade(scaled(tmp_path / "team", "input", 1e4))
     assert [flag.code for flag in graded.flags] == ["data_problem"]
     assert {c.id: c.outcome for c in graded.criteria}["final-gains"] == "skip"

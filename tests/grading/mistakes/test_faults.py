@@ -1,4 +1,4 @@
-"""Recordings of something else than they claim are named and left out; honest ones stay."""
+"""A recording that is not what it claims to be is named and left out; honest ones stay."""
 
 import csv
 import re
@@ -32,7 +32,7 @@ Spoil = Callable[[Columns], Columns]
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory) -> Path:
-    """A whole session: two decays for each cart, four steps, dwells, a sweep, a closed loop."""
+    """Write a whole session: two decays per cart, four steps, dwells, a sweep, a closed loop."""
     folder = tmp_path_factory.mktemp("bench")
     write_submission(folder, PRESET, seed=3, compact=True, reported=True)
     return folder
@@ -43,7 +43,7 @@ def files(folder: Path, start: str) -> list[Path]:
 
 
 def spoil(path: Path, how: Spoil) -> None:
-    """Write a data file again, changed."""
+    """Change a data file and write it again."""
     with path.open(encoding="utf-8", newline="") as text:
         heading, *rows = csv.reader(text)
     values = how(dict(zip(heading, np.array(rows, dtype=np.float64).T, strict=True)))
@@ -75,7 +75,7 @@ def cut(columns: Columns) -> Columns:
 
 
 def frozen(name: str) -> Spoil:
-    """Freeze an encoder where the cart first turns after the input step."""
+    """Freeze an encoder at the cart's first turning point after the input step."""
 
     def freeze(columns: Columns) -> Columns:
         x = columns[name].copy()
@@ -87,7 +87,7 @@ def frozen(name: str) -> Spoil:
     return freeze
 
 
-# kind, which of its files, what happened to them, a word of the reason
+# name of the case: kind, which of its files, the change, a word of the reason
 SPOILT = {
     "a decay in milliseconds": ("decay-1", slice(1), in_milliseconds, "milliseconds"),
     "a decay in thousands of seconds": ("decay-1", slice(1), times(1e-3, "time"), "thousands"),
@@ -114,7 +114,7 @@ SPOILT = {
 }
 
 
-# Those with the longest search, and whose reason is the same as that of a shorter one.
+# The slowest cases, and cases whose reason equals that of a faster one.
 SEARCHED = (
     "cart 1 turned in every step",
     "all dwells exchanged",
@@ -127,7 +127,7 @@ LONG = [pytest.mark.slow, pytest.mark.sample]
 
 
 def _cases() -> Iterator[Any]:
-    """Every case without a stated sign; with a stated sign, those that look like a wrong one."""
+    """Return all cases without a stated sign, and with one those that look like a wrong sign."""
     for case in SPOILT:
         yield pytest.param(case, "", marks=LONG if case in SEARCHED else ())
         if "turned" in case or "exchanged" in case:
@@ -137,9 +137,9 @@ def _cases() -> Iterator[Any]:
 
 @pytest.mark.parametrize(("case", "sign"), [*_cases()])
 def test_what_is_wrong_is_named_left_out_and_flagged(case, sign, bench, tmp_path):
-    """The spoilt records, and no others, are left out of all estimates.
+    """Spoilt recordings, and no others, are named, left out of all estimates and flagged.
 
-    Report and grade say why.
+    Report and grade give the reason.
     """
     kind, which, how, word = SPOILT[case]
     folder = shutil.copytree(bench, tmp_path / "spoilt")
@@ -173,7 +173,7 @@ def _failed(analysis: Analysis) -> set[str]:
 
 
 def _numbers_are_right(analysis: Analysis) -> None:
-    """Check that no spoilt record is in any estimate."""
+    """Check that no estimate uses a spoilt recording."""
     for row in analysis.rows:
         assert row.final is not None
         assert row.final.value == pytest.approx(TRUE[row.name], rel=0.02)
@@ -182,7 +182,7 @@ def _numbers_are_right(analysis: Analysis) -> None:
 
 
 def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
-    """Sixty rows are too few for a steady state if they hold less than 1.5 cycles."""
+    """A dwell with less than 1.5 cycles is flagged as too short for a steady state."""
     folder = shutil.copytree(bench, tmp_path / "cut")
     for path in files(folder, "sine"):
         spoil(path, cut)
@@ -203,9 +203,9 @@ def test_dwells_that_were_cut_are_flagged(bench, tmp_path):
 def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
     kind, stated, word, bench, tmp_path
 ):
-    """A flag in grading corresponds to a failed check in the report.
+    """A recording of another kind, or a cut one, is flagged in grading and fails a report's check.
 
-    No number uses the recording.
+    No estimate uses the recording.
     """
     folder = shutil.copytree(bench, tmp_path / "kind")
     path = files(folder, kind)[1]
@@ -241,7 +241,7 @@ def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
 
 
 def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
-    """If rad/s was typed for hertz, no dwell is blamed as the file of another experiment."""
+    """If frequencies in rad/s were stated as Hz, the message says so and blames no file."""
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
     path.write_text(
@@ -258,7 +258,10 @@ def test_grading_says_what_the_stated_frequencies_are_in(bench, tmp_path):
 
 
 def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_path):
-    """If `carts` is left out, all carts are free: the message gives the line that fixes it."""
+    """If a held cart is not declared, the message gives the line that declares the free carts.
+
+    Without `carts`, all carts count as free.
+    """
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8").replace("carts = [1]\n", "", 1)
@@ -268,7 +271,10 @@ def test_a_held_cart_that_nobody_called_free_is_told_with_its_cure(bench, tmp_pa
 
 
 def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
-    """A loop whose clock is in milliseconds is not compared with the model; the reason is given."""
+    """A closed loop with a clock in milliseconds is not compared with the model.
+
+    The reason is given.
+    """
     folder = shutil.copytree(bench, tmp_path / "loop")
     for path in files(folder, "control"):
         spoil(path, in_milliseconds)
@@ -292,7 +298,7 @@ def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
 
 
 def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
-    """All times a thousand times too long agree with one another, but not with what is stated."""
+    """If all clocks are in milliseconds, the dwells fail against their stated frequencies."""
     folder = shutil.copytree(bench, tmp_path / "slow")
     for path in files(folder, ""):
         spoil(path, in_milliseconds)
@@ -308,7 +314,7 @@ def test_one_clock_in_milliseconds_throughout_fails_the_dwells(bench, tmp_path):
 
 
 def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
-    """A repeat that names the file of another is left out and flagged."""
+    """If a repeat names the same file as another recording, the repeat is left out and flagged."""
     folder = shutil.copytree(bench, tmp_path / "copied")
     _change(folder, "data/step-2.csv", "data/step-1.csv")
     graded = grade_submission(
@@ -322,7 +328,10 @@ def test_one_recording_in_two_experiments_counts_once(bench, tmp_path):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
-    """All records fit only if exchanged, so nothing is identified."""
+    """If all driven recordings fit only with columns swapped, the reason says so.
+
+    Then nothing is identified.
+    """
     folder = shutil.copytree(bench, tmp_path / "exchanged")
     driven = [*files(folder, "step"), *files(folder, "sine"), *files(folder, "sweep")]
     for path in driven:
@@ -335,7 +344,10 @@ def test_columns_exchanged_in_every_recording_are_named(bench, tmp_path):
 
 
 def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tmp_path):
-    """Either all dwells or all steps have an input ten times off; both readings are reported."""
+    """If dwells and steps differ in scale by ten, nothing is identified.
+
+    The report gives both explanations: wrong dwells or wrong steps.
+    """
     folder = shutil.copytree(bench, tmp_path / "undecided")
     for path in files(folder, "sine"):
         spoil(path, times(10, "input"))
@@ -355,7 +367,10 @@ def test_dwells_and_steps_that_contradict_one_another_identify_nothing(bench, tm
 
 
 def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench, tmp_path):
-    """The cart in the dwell is moved by something other than its input."""
+    """A recording that no carts could make is left out, but not called wrong.
+
+    Something besides the input moves the cart there.
+    """
     folder = shutil.copytree(bench, tmp_path / "stray")
     path = files(folder, "sine")[4]
 
@@ -370,7 +385,7 @@ def test_a_record_that_follows_no_carts_is_left_out_without_an_accusation(bench,
 
 
 def test_records_of_two_carts_identify_no_third(bench, tmp_path):
-    """Without a recording of the last cart there is no model, and the report fails."""
+    """If the last cart has no recording, nothing is identified and the report fails."""
     folder = shutil.copytree(bench, tmp_path / "three")
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8").partition('[[experiments]]\nid = "control"')[0]
@@ -386,7 +401,10 @@ def test_records_of_two_carts_identify_no_third(bench, tmp_path):
 
 @pytest.mark.parametrize("kind", ["step-3", "sine-05"])
 def test_a_coarse_encoder_that_freezes_for_half_a_second_is_found(kind, tmp_path):
-    """At two counts a sample no reading reveals it, but the cart has moved far meanwhile."""
+    """A freeze of half a second is found even with a coarse encoder.
+
+    The cart has moved far when the encoder counts again.
+    """
     write_submission(tmp_path, replace(preset_bench(PRESET), count=0.03), seed=5, compact=True)
     (path,) = files(tmp_path, kind)
 
@@ -411,12 +429,12 @@ def test_fewer_decimals_in_some_files_are_no_other_unit(bench, tmp_path):
 
 
 def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
-    """In microseconds carts may do anything slow, so such a reading never fits."""
+    """A record of sticking, creeping carts is not taken for one in another unit of time."""
     chain = PRESETS[PRESET]
     dwell = next(
         r for r in analyse(load_submission(bench), design=False).records if r.kind == "sine"
     )
-    creep = 0.02 * dwell.t / dwell.t[-1]  # cm: nine encoder steps in all
+    creep = 0.02 * dwell.t / dwell.t[-1]  # cm, nine encoder steps in total
     stuck = replace(dwell, y=np.array([creep, 0.7 * creep]))
     assert find_misread(stuck, chain, follow([stuck], chain)[stuck.id]) is None
 
@@ -424,7 +442,10 @@ def test_carts_that_stick_and_creep_are_in_no_other_unit_of_time(bench):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_cart_that_moves_farther_than_the_one_that_pulls_it_accuses_no_gain(bench, tmp_path):
-    """One column in another unit in every file: no model, and no right number is called wrong."""
+    """If cart 2 seems to move farther than the cart that pulls it, no gain is called wrong.
+
+    In every file one column is in another unit, so nothing is identified.
+    """
     folder = shutil.copytree(bench, tmp_path / "millimetres")
     for path in files(folder, ""):
         head = path.read_text(encoding="utf-8").partition("\n")[0]

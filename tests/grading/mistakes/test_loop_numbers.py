@@ -1,4 +1,4 @@
-"""The effect of reported gains on a chain, however fast the controller samples."""
+"""Reported gains are judged by their loop on a chain, however fast the controller samples."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ GAINS = np.array(
 
 @pytest.mark.parametrize("sample_time", [1e-2, 1e-3, 5e-4, 1e-4])
 def test_a_fast_controller_is_seen_to_settle(sample_time):
-    """The textbook's overshoot and settling time, within a sample and the delay."""
+    """Overshoot and settling time match the textbook within one sample and the delay."""
     numbers = loop_numbers(CHAIN, GAINS, cart=1, settling=1.0, sample_time=sample_time)
     assert numbers is not None
     assert numbers.stable
@@ -28,7 +28,7 @@ def test_a_fast_controller_is_seen_to_settle(sample_time):
 
 
 def test_a_loop_without_a_static_gain_has_no_numbers():
-    """Carts of a table with 1e20 rad/s do not move, so no prefilter exists."""
+    """If carts are so stiff that the loop has no static gain, no numbers are given."""
     K, omega, zeta = 28.9, 1e20, 2.0
     stiff = Chain(
         m=np.array([1 / (K * omega**2)]),

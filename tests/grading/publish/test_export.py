@@ -1,4 +1,4 @@
-"""Exports as the platforms read them, checked against their importers' rules."""
+"""Each platform's importer, as its rules are written, accepts the exported files."""
 
 import csv
 import io
@@ -44,7 +44,7 @@ def write(tmp_path: Path, *outcomes, platform, roster: str = "", overrides=(), *
 
 
 def test_a_grade_is_better_than_none(tmp_path):
-    """An author of two submissions, one ungraded and one without points, gets the points."""
+    """An author of an ungraded submission and one without points gets the points."""
     unread = failed_grade("a", "too slow")
     unread = unread.model_copy(update={"authors": ("bob",)})
     nothing = make_grade("b", share=0.0, authors=("bob",))
@@ -69,7 +69,7 @@ def canvas_import(rows: list[list[str]]) -> dict[str, dict[str, str]]:
     assert re.search(r"SIS\s+Login\s+ID", head[3])
     columns += 2 + ("Integration ID" in head[4])
     columns += "Root Account" in head[columns - 1]
-    assert "Section" in head[columns - 1]  # the last that is about the student
+    assert "Section" in head[columns - 1]  # the last column about the student
     grades: dict[str, dict[str, str]] = {title: {} for title in head[columns:]}
     for row in rows[1:]:
         if "Points Possible" in row[0]:
@@ -101,7 +101,7 @@ BROKEN = make_outcome(failed_grade("team-3", "<b>broken</b>"), owner="roeric (10
 
 
 def test_canvas_takes_the_grades(tmp_path):
-    """A row for every author; an ungraded one is blank, with a message."""
+    """For Canvas, each author has a row, blank with a message if the submission is not graded."""
     rows, remarks = write(tmp_path, HALF, FULL, BROKEN, platform="canvas", title="Lab 3 (77)")
 
     assert canvas_import(rows) == {
@@ -112,7 +112,7 @@ def test_canvas_takes_the_grades(tmp_path):
 
 
 def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
-    """A grade given by hand counts even if it has no points."""
+    """A broken submission graded by hand is exported, even with 0 points."""
     rows, remarks = write(
         tmp_path, BROKEN, platform="canvas", overrides=[("team-3", "pieces", 0.0)]
     )
@@ -121,7 +121,7 @@ def test_a_broken_submission_graded_by_hand_is_exported(tmp_path):
 
 
 def test_a_submission_that_names_nobody_is_said(tmp_path):
-    """A platform cannot use a row without a student, so a person must find out whose it is."""
+    """If a submission names no author, a message says that it is not exported."""
     nobody = make_outcome(failed_grade("team-8", "broken"))
     rows, remarks = write(tmp_path, FULL, nobody, platform="canvas")
     assert len(rows) == 4
@@ -130,7 +130,7 @@ def test_a_submission_that_names_nobody_is_said(tmp_path):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
-    """The same number means another student there, so nobody gets another's grade."""
+    """A student number of another platform is not used, since it means another student there."""
     others = {"canvas", "moodle", "gradescope"} - {platform}
     entries = [
         make_outcome(make_grade(f"team-{of}"), owner=f"Jane Doe ({of} 1024)") for of in others
@@ -146,7 +146,10 @@ def test_a_number_of_another_platform_is_nobodys(tmp_path, platform):
 
 
 def test_canvas_own_export_is_filled_in(tmp_path):
-    """By id, login or name; the column is found by the assignment's title; other rows stay."""
+    """A Canvas roster is filled in by id, login or name; rows of other students stay unchanged.
+
+    The column is found by the assignment's title.
+    """
     roster = (
         "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3 (77),Final Score\n"
         "    Points Possible,,,,,20,(read only)\n"
@@ -163,7 +166,7 @@ def test_canvas_own_export_is_filled_in(tmp_path):
 
 
 def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
-    """If two rows could be meant, both stay as they were, with the reason."""
+    """If two rows of a roster match an author, neither changes, and a message says why."""
     roster = (
         "Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"
         "    Points Possible,,,,,20\n"
@@ -177,7 +180,7 @@ def test_who_stands_twice_in_a_roster_is_said_to(tmp_path):
 
 
 def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
-    """With feedback as harmless HTML, within the maximum grade."""
+    """If participant numbers are known, Moodle gets a worksheet with feedback as safe HTML."""
     rows, _ = write(tmp_path, HALF, BROKEN, platform="moodle")
 
     found = moodle_import(rows)
@@ -188,7 +191,10 @@ def test_moodle_takes_a_worksheet_where_participants_are_known(tmp_path):
 
 
 def test_moodle_own_worksheet_is_filled_in(tmp_path):
-    """By participant, id number or email; every other cell stays as it was."""
+    """A Moodle worksheet is filled in by participant, id number or email.
+
+    Every other cell stays unchanged.
+    """
     roster = (
         "Identifier,Full name,ID number,Email address,Status,Grade,Maximum Grade,"
         "Grade can be changed,Last modified (submission),Last modified (grade),Feedback comments\n"
@@ -205,7 +211,7 @@ def test_moodle_own_worksheet_is_filled_in(tmp_path):
 
 
 def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
-    """Moodle keeps its own maximum, so every grade would be wrong."""
+    """A worksheet with another maximum grade is refused, since Moodle keeps its own maximum."""
     roster = "Identifier,Full name,Grade,Maximum Grade\nParticipant 1024,Jane Doe,,{}\n"
     write(tmp_path, HALF, platform="moodle", roster=roster.format('"20,00"'))
     with pytest.raises(ConfigError, match=r"maximum grade 18\.00, the rubric 20"):
@@ -213,7 +219,7 @@ def test_a_worksheet_with_another_maximum_is_refused(tmp_path):
 
 
 def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
-    """Canvas keeps its own points possible: it would show 20 of 18."""
+    """A Canvas gradebook with other points possible is refused, since Canvas keeps its own."""
     roster = (
         "Student,ID,Section,Lab 3 (77),Lab 4 (78)\n"
         "    Points Possible,,,{},40\n"
@@ -225,7 +231,7 @@ def test_a_gradebook_with_other_points_possible_is_refused(tmp_path):
 
 
 def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
-    """Also if all points were given by hand."""
+    """The comment for Moodle says why points were given by hand, even if all were."""
     first = RUBRIC.criteria[0]
     given = [("team-b", first.id, first.points)]
     outcome = make_outcome(make_grade("team-b", share=0.0, authors=("bo",)))
@@ -234,7 +240,7 @@ def test_moodle_is_told_why_points_were_given_by_hand(tmp_path):
 
 
 def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
-    """If no participant number is known: by id number."""
+    """Without participant numbers, Moodle gets a table of grades by id number."""
     rows, _ = write(tmp_path, FULL, platform="moodle", title="Lab 3")
     assert rows == [
         ["ID number", "Lab 3 (Real)", "Lab 3 (Feedback)"],
@@ -244,7 +250,7 @@ def test_moodle_takes_a_table_of_grades_otherwise(tmp_path):
 
 
 def test_gradescope_gets_a_result_for_each_submission(tmp_path):
-    """It has the keys and values of the autograder specification, and no others."""
+    """For Gradescope, each submission has a result that follows the autograder specification."""
     late = make_outcome(make_grade("team-4", share=0.5, days_late=1.25, deducted=1.0, points=9.0))
     rows, _ = write(tmp_path, HALF, FULL, BROKEN, late, platform="gradescope")
 
@@ -275,7 +281,10 @@ def test_gradescope_gets_a_result_for_each_submission(tmp_path):
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("author", ["s-team-1", " S-Team-1"])
 def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path, platform, author):
-    """No table or comment shows the higher points; a message names the submissions."""
+    """An author of two submissions with different points gets none until one is removed.
+
+    A message names both submissions.
+    """
     other = make_outcome(make_grade("team-9", share=0.25, authors=(author,)))
     rows, remarks = write(tmp_path, HALF, other, platform=platform)
     assert not [cell for row in rows for cell in row if re.search(r"^(10|5)$|omega_1", cell)]
@@ -286,14 +295,14 @@ def test_who_is_in_two_submissions_has_no_points_until_somebody_decides(tmp_path
 
 
 def test_two_submissions_with_the_same_points_leave_nothing_to_decide(tmp_path):
-    """Partners may each submit the work that both did."""
+    """An author of two submissions with the same points gets these points."""
     other = make_outcome(make_grade("team-9", share=0.5, authors=("s-team-1",)))
     rows, remarks = write(tmp_path, HALF, other, platform="canvas")
     assert (canvas_import(rows), remarks) == ({RUBRIC.title: {"1024": "10"}}, ())
 
 
 def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
-    """One by an author's id, one by the uploader's number: nobody chose between them."""
+    """If two submissions match one row, by author and by uploader, the row stays unchanged."""
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,S1,jane,A,3\n'
     by_id = make_outcome(make_grade("team-1", share=0.5, authors=("s1",)))
     by_number = make_outcome(make_grade("o", authors=("x", "y")), owner="doejane (canvas 1001)")
@@ -321,9 +330,11 @@ def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
 
 @pytest.mark.parametrize("own", [False, True])
 def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
-    """The uploader's number goes first, so an author with a row of their own has no points.
+    """If an author's points go to the uploader's row, a message names the author.
 
-    With an ungraded submission of their `own` they are in two submissions.
+    The uploader's number counts before the authors' ids.
+
+    An author with an ungraded submission of their `own` is in two submissions.
     """
     roster = 'Student,ID,SIS User ID,Section,Lab 3\n"Doe, Jane",1001,s1,A,\n"Roe, Jo",1002,s2,A,\n'
     broken = failed_grade("a", "no TOML").model_copy(update={"authors": ("s1",)})
@@ -347,7 +358,10 @@ def test_an_author_whose_points_another_account_got_is_named(tmp_path, own):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, platform):
-    """Under the folder's name, with a message, or under the authors named before it broke."""
+    """Points given by hand to a submission without names are exported under its folder's name.
+
+    If an earlier version named its authors, those get the points.
+    """
     broken = make_outcome(failed_grade("team-8", "no TOML"))
     rows, remarks = write(
         tmp_path, broken, platform=platform, overrides=[("team-8", "pieces", 0.75)]
@@ -368,9 +382,9 @@ def test_points_by_hand_of_a_submission_without_names_are_exported(tmp_path, pla
 
 
 def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
-    """If no author's id is known to Canvas, the number in the file's name counts.
+    """If Canvas knows no author's id, the number in the file's name decides who gets the points.
 
-    Others are named.
+    The other authors are named in a message.
     """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section\n"Doe, Jane",1001,S1,doejane,A\n'
     team = make_outcome(make_grade("t", authors=("u1a", "u1b")), owner="doejane (canvas 1001)")
@@ -394,7 +408,7 @@ def test_of_several_authors_the_one_who_handed_it_in_is_found(tmp_path):
     ],
 )
 def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
-    """A table of another platform, too: the message names the columns it should have."""
+    """A table that is not a roster of the platform is refused; the message names the columns."""
     with pytest.raises(
         ConfigError, match=rf"roster\.csv: is not {platform.capitalize()}.*{wanted}"
     ):
@@ -402,7 +416,10 @@ def test_a_table_that_is_no_roster_is_refused(tmp_path, platform, head, wanted):
 
 
 def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
-    """It is unclear which one to fill in; columns without a name do not matter."""
+    """A roster with two columns of the same name is refused.
+
+    Columns without a name do not matter.
+    """
     with pytest.raises(ConfigError, match=r"roster\.csv: has two columns 'Lab'"):
         write(tmp_path, HALF, platform="canvas", roster="Student,ID,Lab,Lab\na,1,,\n")
     rows, _ = write(tmp_path, HALF, platform="gradescope", roster="SID,,Name,\ns-team-1,x,y,z\n")
@@ -411,7 +428,7 @@ def test_a_roster_with_two_columns_of_one_name_is_refused(tmp_path):
 
 
 def test_gradescope_must_have_a_score(tmp_path):
-    """Ungraded submissions get zero, and a message tells the person who uploads."""
+    """Gradescope gets 0 for an ungraded submission, and a message says so."""
     _, remarks = write(tmp_path, BROKEN, platform="gradescope")
     (path,) = (tmp_path / "out" / "gradescope").glob("*/results.json")
     assert json.loads(path.read_text("utf-8"))["score"] == 0
@@ -420,7 +437,7 @@ def test_gradescope_must_have_a_score(tmp_path):
 
 @pytest.mark.parametrize("platform", ["moodle", "gradescope"])
 def test_no_comment_names_the_other_team(tmp_path, platform):
-    """The comment says that a recording is also in another submission, but not whose."""
+    """The comment says that a recording is also in another submission, but not in whose."""
     shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
     write(tmp_path, shared, platform=platform)
     texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]

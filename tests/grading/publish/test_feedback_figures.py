@@ -1,4 +1,4 @@
-"""The figures of the feedback: the curve is drawn from the reported numbers."""
+"""The feedback's figures draw the curve of the reported numbers beside the measurement."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from tests.helpers.grading_students import student
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_the_curve_is_that_of_the_table(preset):
-    """The parameters of a chain give the magnitude of its own frequency response."""
+    """The curve drawn from a chain's table is the chain's own frequency response."""
     chain = PRESETS[preset]
     omega = np.geomspace(1.0, 100.0, 50)
     reported = transfer_functions(chain.parameters())
@@ -26,7 +26,7 @@ def test_the_curve_is_that_of_the_table(preset):
 
 
 def test_each_cart_has_a_figure_with_the_reported_curve():
-    """It is dashed beside the fit, and has the same bytes each time."""
+    """Each cart has a figure with the reported curve, and its bytes are the same each time."""
     two = student(2)
     figures = draw_figures(two.analysis, two.reported)
 
@@ -37,7 +37,7 @@ def test_each_cart_has_a_figure_with_the_reported_curve():
 
 @pytest.mark.parametrize("left", ["K_1", "omega_a", "zeta_2"])
 def test_a_table_that_is_not_complete_has_no_curve(left):
-    """Measured response and fit are shown all the same."""
+    """If the table is incomplete, the figure shows measurement and fit without a reported curve."""
     two = student(2).without("final", left)
     figures = draw_figures(two.analysis, two.reported)
     assert len(figures) == 2
@@ -45,7 +45,7 @@ def test_a_table_that_is_not_complete_has_no_curve(left):
 
 
 def test_a_table_without_damping_has_a_curve():
-    """Its peaks and nulls are infinite, and are drawn all the same."""
+    """A table without damping has a curve, although its peaks are infinite."""
     zetas = {name: 0.0 for name in ("zeta_a", "zeta_b", "zeta_1", "zeta_2")}
     two = student(2).reporting(final=zetas)
     assert all("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
@@ -53,13 +53,13 @@ def test_a_table_without_damping_has_a_curve():
 
 @pytest.mark.parametrize("value", [0.0, 1e300, 1e-300])
 def test_numbers_that_stand_for_no_response_have_no_curve(value):
-    """A frequency of zero or beyond all bounds."""
+    """A frequency of zero or infinity gives no reported curve."""
     two = student(2).reporting(final={"omega_a": value})
     assert not any("your numbers" in svg for _, svg in draw_figures(two.analysis, two.reported))
 
 
 def test_a_number_that_lost_points_is_shown_on_its_record():
-    """Reported and recomputed value are drawn; numbers that were right are not."""
+    """Each number that lost points is drawn on its recording, beside the recomputed one."""
     honest = student(2)
     wrong = {"K_1": 1.4 * honest.value("initial", "K_1"), "omega_2": 5.24}
     two = honest.reporting(initial=wrong)
@@ -83,7 +83,7 @@ def test_a_number_that_lost_points_is_shown_on_its_record():
 
 @pytest.mark.parametrize(("omega", "zeta"), [(-3.0, 0.1), (1e9, 0.1), (20.0, 1.5), (20.0, -1.0)])
 def test_numbers_of_no_swing_are_told_and_not_drawn(omega, zeta):
-    """Whatever is reported, the record is shown with the numbers beside it."""
+    """If reported numbers cannot be drawn as a swing, they are written beside the recording."""
     two = student(2)
     criterion = Criterion(
         id="decays", title="", outcome="fail", points=0.0, out_of=1.0, message="",

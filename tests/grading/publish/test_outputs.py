@@ -1,4 +1,4 @@
-"""A grading's files: they depend on the gradebook alone, and are harmless and complete."""
+"""A grading's files depend only on the gradebook; they are safe and complete."""
 
 import csv
 import io
@@ -61,7 +61,7 @@ def test_a_remark_s_evidence_keeps_its_words():
 
 @pytest.fixture(scope="module")
 def graded(tmp_path_factory) -> Path:
-    """A class with all kinds of submissions."""
+    """Write a class with all kinds of submissions."""
     return write_class(tmp_path_factory.mktemp("class"))
 
 
@@ -70,7 +70,7 @@ def rows_of(path: Path) -> list[dict[str, str]]:
 
 
 def tree(folder: Path) -> dict[str, bytes]:
-    """Return all files but the gradebook itself."""
+    """Return all files except the gradebook itself."""
     return {
         path.relative_to(folder).as_posix(): path.read_bytes()
         for path in sorted(folder.rglob("*"))
@@ -82,15 +82,18 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 
 def test_every_submission_has_its_row(graded):
-    """Also a broken one, with its reason; points by criterion, lateness, and points by hand."""
+    """Every submission has a row in `grades.csv`, even a broken one with its reason.
+
+    The row has points by criterion, lateness and points given by hand.
+    """
     rows = {row["submission"].lstrip("'"): row for row in rows_of(graded / "grades.csv")}
 
     assert len(rows) == 16
     broken = rows["broken"]
     assert (broken["status"], broken["points"], broken["pieces"]) == ("failed", "0", "")
     assert broken["reason"] == "submission.toml line 3: <b>cart</b> is no key"
-    by_hand = rows["team-02"]  # 95 % of 20, 1 in place of 0.95 for one criterion, 1 day late
-    # 10 % of 19.05 are 1.905, which is 2 to the rubric's quarter of a point.
+    by_hand = rows["team-02"]  # 95 % of 20, with 1 instead of 0.95 for one criterion, one day late
+    # 10 % of 19.05 is 1.905, rounded to 2 by the rubric's quarter of a point.
     assert float(by_hand["points"]) == pytest.approx(19 - 0.95 + 1 - 2.0, abs=1e-9)
     assert (by_hand["laws"], by_hand["by_hand"], by_hand["remarks"]) == ("1", "laws", "shared_data")
     assert rows["team-03"]["pieces"] == "0.9"
@@ -98,14 +101,14 @@ def test_every_submission_has_its_row(graded):
 
 
 def test_no_cell_is_a_formula(graded):
-    """Text that a spreadsheet would run begins with an apostrophe; numbers stay numbers."""
+    """A cell that a spreadsheet would run as a formula begins with an apostrophe."""
     cells = [cell for row in rows_of(graded / "grades.csv") for cell in row.values()]
     assert "'=cmd'C'!A0" in cells
     assert not [cell for cell in cells if cell.startswith(tuple("=@\t\r"))]
 
 
 def test_a_criterion_may_be_called_like_a_column():
-    """Its column has another heading."""
+    """A criterion with the id of a fixed column gets another heading."""
     criteria = (RUBRIC.criteria[0].model_copy(update={"id": "points"}),)
     rubric = RUBRIC.model_copy(update={"criteria": criteria})
     (head,) = csv.reader([grades_csv([], rubric=rubric).strip()])
@@ -117,13 +120,13 @@ def test_a_criterion_may_be_called_like_a_column():
 
 
 def test_the_same_class_gives_the_same_bytes(graded, tmp_path):
-    """In another folder, and if everything is graded in another order in between."""
+    """The same class gives the same bytes in another folder and after other gradings in between."""
     again = write_class(tmp_path)
     assert tree(again) == tree(graded)
 
 
 def test_nothing_of_a_student_is_markup(graded):
-    """Names, reasons and messages are text on every page."""
+    """Names, reasons and messages with markup appear as plain text on every page."""
     for path in (graded / "class.html", graded / "feedback" / "team-02" / "feedback.html"):
         html = path.read_text(encoding="utf-8")
         assert "<b>cart" not in html
@@ -133,7 +136,7 @@ def test_nothing_of_a_student_is_markup(graded):
 
 
 def test_every_link_of_the_class_leads_to_feedback(graded):
-    """The links work for any name."""
+    """Every link of the class page leads to a feedback page, whatever the submission's name."""
     html = (graded / "class.html").read_text(encoding="utf-8")
     links = set(re.findall(r'href="(feedback/[^"]*)"', html))
     assert len(links) == 16
@@ -141,7 +144,7 @@ def test_every_link_of_the_class_leads_to_feedback(graded):
 
 
 def test_grade_json_says_what_was_given_by_hand(graded):
-    """The reason, but not the person, who is in the gradebook."""
+    """`grade.json` gives the reason for points given by hand, but not the person."""
     text = (graded / "feedback" / "team-02" / "grade.json").read_text(encoding="utf-8")
     grade = json.loads(text)
     assert grade["schema"] == "cartlab-grade/1"
@@ -153,7 +156,7 @@ def test_grade_json_says_what_was_given_by_hand(graded):
 
 
 def test_only_what_changed_is_written_again(tmp_path):
-    """An override writes one feedback; missing files are made again; stale ones are removed."""
+    """Only feedback that changed is written again, missing files are made, stale ones removed."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         outcomes = [make_outcome(make_grade(name, share=0.5)) for name in "abc"]
         for outcome in outcomes:
@@ -179,7 +182,7 @@ def test_only_what_changed_is_written_again(tmp_path):
 
 @pytest.mark.parametrize("name", ["../out", "a/b", "..", ""])
 def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
-    """If a gradebook holds such a name, nothing is written outside."""
+    """If a submission's name would lead outside the folder, nothing is written."""
     with Gradebook(tmp_path / "g.sqlite", assignment="lab", create=True) as book:
         book.put(make_outcome(make_grade(name), key="k"))
         book.finish(Batch(keys=("k",), shared={}), rubric=RUBRIC)
@@ -193,7 +196,10 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
 
 
 def test_without_names_nothing_tells_who_it_was(tmp_path):
-    """Pages, table and order reveal nobody; only the key does."""
+    """In anonymous grading, pages, table and order of rows reveal no name;
+
+    only the key file does.
+    """
     outcomes = [
         make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
         make_outcome(make_grade("ann-lab", authors=("ann",))),
@@ -231,7 +237,7 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
 
 
 def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
-    """Teams may be named 3 or step: numbers and experiments in their feedback stay."""
+    """If teams are named 3 or step, hiding their names changes no number or experiment."""
     grade = make_grade("3", share=0.5, flags=(hertz_flag(), shared_flag("step")))
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
@@ -248,12 +254,12 @@ def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
     ],
 )
 def test_a_reason_names_nobody(reason, shown):
-    """Neither the folder before a file nor an archive with the student's name is shown."""
+    """In anonymous grading, a reason shows no folder or archive that bears a student's name."""
     assert anonymise(failed_grade("3", reason), {"3": "anon-a"}).reason == shown
 
 
 def test_names_that_stand_in_are_all_different():
-    """Ten thousand of them, made from the submissions alone."""
+    """Ten thousand pseudonyms, made from the submissions alone, are all different."""
     names = pseudonyms({f"team-{n}": f"key {n}" for n in range(10_000)})
     assert len(set(names.values())) == 10_000
     assert names["team-7"].startswith(pseudonyms({"renamed": "key 7"})["renamed"])
@@ -263,7 +269,7 @@ def test_names_that_stand_in_are_all_different():
 
 
 def test_every_flag_has_a_name_and_a_place_to_look():
-    """All codes have a title and a place."""
+    """Every flag has a title and a place to look."""
     for said in ("title", "place"):
         assert [k for k in WORDS.by_key if k.startswith(f"{said}_")] == [
             f"{said}_{c}" for c in CODES
@@ -271,7 +277,10 @@ def test_every_flag_has_a_name_and_a_place_to_look():
 
 
 def test_the_feedback_puts_their_numbers_beside_ours():
-    """Both numbers, the difference, the message, the help, and the cost of lateness."""
+    """The feedback shows reported number, recomputed number and difference, with message and help.
+
+    It also shows what lateness costs.
+    """
     grade = make_grade("team-1", share=0.5, days_late=1.5, deducted=2.0, flags=(hertz_flag(),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
@@ -283,7 +292,7 @@ def test_the_feedback_puts_their_numbers_beside_ours():
 
 
 def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
-    """Whatever the points, the page asks for a talk and does not name the other team."""
+    """If data are shared, the feedback neither names the other team nor praises."""
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
@@ -293,7 +302,7 @@ def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
 
 
 def test_a_submission_that_could_not_be_graded_hears_why():
-    """The reason, and what to do."""
+    """If a submission could not be graded, its feedback says why and what to do."""
     grade = failed_grade("team-1", "no submission.toml in it")
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
     assert "No submission.toml in it." in html
@@ -301,7 +310,10 @@ def test_a_submission_that_could_not_be_graded_hears_why():
 
 
 def test_a_broken_submission_hears_every_reason(tmp_path):
-    """Three mistakes in its file are three lines of feedback and one cell of the table."""
+    """If a submission's file has three mistakes, the feedback lists all three in separate lines.
+
+    In the table they are one cell.
+    """
     folder = tmp_path / "class" / "team-1"
     (folder / "data").mkdir(parents=True)
     text = 'version = 1\n[system]\ncarts = 2\nspring = [true]\n[design]\ncart = "two"\n[reportd]\n'
@@ -321,7 +333,7 @@ def test_a_broken_submission_hears_every_reason(tmp_path):
 
 
 def test_numbers_of_a_criterion_have_words_and_units():
-    """An overshoot of 0 equals one of 10⁻⁷ %; points are not a percentage of a percentage."""
+    """Numbers of a criterion are shown with words and units; tiny numbers equal zero."""
     units = Units(position="cm", input="V")
     claims = Criterion(
         id="c", title="claims", outcome="partial", points=1, out_of=2, message="",
@@ -350,7 +362,7 @@ def test_numbers_of_a_criterion_have_words_and_units():
     ],
 )  # fmt: skip
 def test_a_number_has_its_unit(name, unit):
-    """Parameters, and entries of A and B whose states are positions and velocities."""
+    """Each parameter and each entry of A and B is shown with its unit."""
     one = make_grade("a").criteria[0].model_copy(update={"expected": {name: 1.0}, "found": {}})
     units = Units(position="cm", input="V")
     shown = numbers_table(one, check="final", units=units, numbers=count(1))
@@ -382,14 +394,17 @@ def test_any_numbers_can_be_shown(values):
 
 @pytest.mark.parametrize(("points", "percent"), [(19.95, "99"), (4.6, "23")])
 def test_only_all_points_are_100_percent(points, percent):
-    """19.95 of 20 is 99 %, 4.6 of 20 is 23 %: decimals as typed, rounded down."""
+    """Percentages are computed from the decimals as typed and rounded down.
+
+    So only all points give 100 %.
+    """
     page = class_page([Line.of(make_grade("a", points=points))], rubric=RUBRIC)
     cells = re.sub(r"<[^>]+>", " ", page.split("All submissions.")[-1]).split()
     assert cells[cells.index(str(points)) + 1] == percent
 
 
 def test_the_class_page_counts_what_there_is():
-    """Mean and median of the graded ones, outcomes by criterion, mistakes by number of teams."""
+    """The class page shows mean and median, outcomes by criterion, and teams by mistake."""
     grades = [make_grade("a"), make_grade("b", share=0.5, flags=(hertz_flag(),)),
               make_grade("c", share=0.0, flags=(hertz_flag(), missing_flag()))]  # fmt: skip
     lines = [Line.of(grade) for grade in grades]
@@ -405,7 +420,7 @@ def test_the_class_page_counts_what_there_is():
 
 
 def shares(*found: tuple[str, str, str]) -> Flag:
-    """Return the flag of (own recording, other submission, its recording)s."""
+    """Return the flag for tuples of own recording, other submission and its recording."""
     keys = ("experiment", "submission", "other_experiment")
     recordings = [{**dict(zip(keys, one, strict=True)), "sigmas": 9.5} for one in found]
     evidence = {"submissions": [], "recordings": recordings}
@@ -413,7 +428,10 @@ def shares(*found: tuple[str, str, str]) -> Flag:
 
 
 def test_the_class_page_groups_who_shares_with_whom(tmp_path):
-    """Groups, with the recordings of each; a submission of an earlier batch has no page."""
+    """The class page lists groups that share recordings.
+
+    A submission of an earlier batch is named without a link.
+    """
     shared = {
         "a": shares(("step-1", "b", "step-2"), ("sine-1", "b", "sine-1")),
         "b": shares(("step-2", "a", "step-1"), ("sine-1", "a", "sine-1"), ("d", "c", "d")),
@@ -446,7 +464,7 @@ def test_the_class_page_groups_who_shares_with_whom(tmp_path):
 
 
 def test_the_class_is_a_frame(tmp_path):
-    """One row for each submission and criterion; a criterion never judged has no points."""
+    """The class frame has a row per submission and criterion, without points if never judged."""
     outcomes = [make_outcome(make_grade("a", authors=("ann", "bo"), flags=(hertz_flag(),))),
                 make_outcome(make_grade("b", share=0.5, days_late=1.0, deducted=1.0, points=9.0)),
                 make_outcome(failed_grade("c", "broken"))]  # fmt: skip
@@ -480,7 +498,7 @@ def missing_flag() -> Flag:
 
 
 def test_points_by_hand_are_not_asked_for_again():
-    """The page and Gradescope say that it was graded by hand; nothing must be submitted again."""
+    """If points were given by hand, neither page nor Gradescope asks for a new submission."""
     grade = failed_grade("team-7", "no submission.toml in it")
     given = HandPoints(criterion=RUBRIC.criteria[0].id, points=1.0, why="x", by="y", at="")
     given = {given.criterion: given}
@@ -497,25 +515,28 @@ def test_points_by_hand_are_not_asked_for_again():
 
 @pytest.mark.parametrize("grades", [[], [failed_grade("a", "broken")]])
 def test_a_class_without_grades_has_a_page(grades):
-    """Nobody submitted, or nothing could be graded."""
+    """A class with no submission, or no graded one, has a page."""
     html = class_page([Line.of(grade) for grade in grades], rubric=RUBRIC)
     assert "Submissions" in html
 
 
 @pytest.mark.parametrize(("text", "points"), [("2", 2.0), ("1,5", 1.5), ("AUTO", None)])
 def test_points_are_read_as_typed(text, points):
-    """With either decimal mark; auto means the automatic points."""
+    """Points are read with a decimal point or comma; `auto` means the automatic points."""
     assert read_points(text) == points
 
 
 def test_points_that_are_none_are_refused():
-    """The message says what is allowed."""
+    """A text that is not a number of points is refused, and the message says what is allowed."""
     with pytest.raises(ConfigError, match="two: expected a number of points, or auto"):
         read_points("two")
 
 
 def test_a_table_of_a_platform_is_read_whatever_its_separators(tmp_path):
-    """Semicolons, tabs, a byte-order mark, blank lines; each row keeps its line number."""
+    """A table may have semicolons, tabs, a byte-order mark or blank lines.
+
+    Each row keeps its line number.
+    """
     path = tmp_path / "t.csv"
     path.write_text('\ufeffa;b\n\n"x\ny";"1;2"\n', encoding="utf-8")
     table = read_table(path)

@@ -1,4 +1,4 @@
-"""A class under another rubric: the preview equals grading again."""
+"""The preview of a class under another rubric equals grading again."""
 
 import re
 from dataclasses import replace
@@ -22,7 +22,7 @@ LATE = {"team-1": 1.3}
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory) -> Path:
-    """An honest team, one that is late and in hertz, one with a wrong gain, one unreadable."""
+    """Write an honest team, a late one with Hz, one with a wrong gain, and an unreadable one."""
     folder = tmp_path_factory.mktemp("class")
     for number in range(3):
         own = folder / f"team-{number}"
@@ -56,7 +56,10 @@ def _grade(school: Path, out: Path, rubric: Rubric) -> Gradebook:
 
 
 def test_the_preview_is_what_grading_again_gives(school, tmp_path):
-    """Points, tolerances, costs and lateness; points given by hand stay."""
+    """The preview of a changed rubric gives the same points as grading again.
+
+    Points given by hand stay.
+    """
     plain = RUBRIC.model_dump(mode="json")
     plain["late"]["percent_per_day"] = 40.0
     plain["flags"]["hz_for_rad_s"] = 0.75
@@ -95,7 +98,7 @@ def test_the_preview_is_what_grading_again_gives(school, tmp_path):
 
 
 def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
-    """Points of older grades under another rubric are not guessed."""
+    """If grades were made before findings were stored, the preview names them without points."""
     fill_book(tmp_path)
     with Gradebook(tmp_path) as book:
         graded = [e.submission for e in book.entries() if e.grade.status == "graded"]
@@ -104,7 +107,7 @@ def test_who_was_graded_before_findings_were_kept_is_named(tmp_path):
 
 
 def test_who_was_graded_by_another_rubric_is_named(school, tmp_path):
-    """A team left out of a later run was judged by other limits, so it is named."""
+    """If a team was graded with another rubric, the preview names it without points."""
     plain = RUBRIC.model_dump(mode="json")
     plain["required"]["final"] = []
     other = Rubric.model_validate(plain)

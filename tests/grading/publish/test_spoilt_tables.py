@@ -1,4 +1,4 @@
-"""Damaged and hostile tables of platforms and people: a clear error or a result."""
+"""A damaged or hostile table gives a result or one clear error."""
 
 import csv
 import io
@@ -87,6 +87,6 @@ def test_a_hostile_table_is_read_or_refused(tmp_path, reader, table, separator, 
 
 
 def test_the_first_of_several_columns_may_have_no_name(tmp_path):
-    """Columns without a name are ignored."""
+    """If several columns have no name, they are ignored, even the first."""
     (tmp_path / "t.csv").write_text(",,SID\na,b,s1\n", encoding="utf-8")
     READERS["gradescope"](tmp_path / "t.csv")

@@ -1,4 +1,4 @@
-"""The paper's Tables 4 and 5, from answers that give them."""
+"""Answers made to fit the paper's Tables 4 and 5 give these tables again."""
 
 import json
 import re
@@ -8,7 +8,7 @@ import pytest
 from pipeline.errors import ConfigError
 from pipeline.grading.publish.survey import LEVELS, SCALE, read_survey, survey_dict, survey_text
 
-# Table 4 of Throne (2005): whole percents of the twelve who answered each question.
+# Table 4 of Throne (2005) has whole percents of the twelve who answered each question.
 TABLE_4 = {
     "uses of models": (75, 25, 0, 0, 0),
     "limitations of models": (58, 33, 8, 0, 0),
@@ -19,7 +19,7 @@ COUNTS = {
     "limitations of models": (7, 4, 1, 0, 0),
     "frequency response": (5, 7, 0, 0, 0),
 }
-# Table 5: averages with two decimals; all are twelfths.
+# Table 5 has averages with two decimals; all are twelfths.
 TABLE_5 = {
     "approaches to modeling": ("2.83", "2.75", "3.67", "3.67"),
     "model and real system": ("3.00", "2.92", "3.67", "3.58"),
@@ -28,7 +28,7 @@ TABLE_5 = {
 
 
 def answers(average: str) -> list[int]:
-    """Return twelve scores with this average."""
+    """Return twelve scores with the given average."""
     total = round(12 * float(average))
     low, more = divmod(total, 12)
     return [low + (i < more) for i in range(12)]
@@ -53,7 +53,7 @@ def write_paper(path, *, heading="{level}: {concept}"):
     "heading", ["{level}: {concept}", "{level} [{concept}]", "{level} - {concept}"]
 )
 def test_the_tables_of_the_paper_come_out(tmp_path, heading):
-    """Percents and averages agree to the digit; a column of dates is left out."""
+    """The paper's tables are reproduced to the digit; a column of dates is left out."""
     survey = read_survey(write_paper(tmp_path / "answers.csv", heading=heading))
 
     assert {q: tuple(row) for q, *row in survey.percents.itertuples()} == TABLE_4
@@ -67,7 +67,7 @@ def test_the_tables_of_the_paper_come_out(tmp_path, heading):
 
 
 def test_the_tables_read_as_markdown(tmp_path):
-    """Headings as in the paper, columns in line."""
+    """The tables printed as Markdown have the paper's headings and aligned columns."""
     text = survey_text(read_survey(write_paper(tmp_path / "answers.csv")))
     rows = [re.split(r"\s*\|\s*", line.strip("| ")) for line in text.splitlines() if "|" in line]
     assert rows[0] == ["Question", *SCALE]
@@ -91,7 +91,7 @@ def test_the_tables_read_as_markdown(tmp_path):
     ],
 )
 def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
-    """The message has line, question and answer; nothing is guessed or dropped."""
+    """An answer off the scale is an error that names line, question and answer."""
     path = tmp_path / "a.csv"
     path.write_text(rows, encoding="utf-8")
     with pytest.raises(ConfigError, match=re.escape(message)):
@@ -99,7 +99,7 @@ def test_answers_off_the_scale_are_an_error(tmp_path, rows, message):
 
 
 def test_answers_may_be_written_in_many_ways(tmp_path):
-    """Capitals, apostrophes of all sorts, words for scores."""
+    """Answers are read with any capitals and apostrophes; scores may be words."""
     path = tmp_path / "a.csv"
     path.write_text(
         "Q;post_knowledge: x\nstrongly agree;Moderate\nI don’t know;4\nDon't know.;high, used it\n",

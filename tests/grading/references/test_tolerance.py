@@ -1,4 +1,4 @@
-"""Errors and credit: exact at the edge, monotone in the error, rounding subtracted."""
+"""Errors and credit are exact at a tolerance's edge; rounding is subtracted first."""
 
 from decimal import Decimal
 from fractions import Fraction
@@ -28,7 +28,7 @@ def at(value: float, *, std: float = 0.0) -> Reference:
     [("0.10", "0.005"), ("29", "0.5"), ("2.90e1", "0.05"), ("-3.5", "0.05"), ("0", "0.5")],
 )
 def test_half_a_digit_is_that_of_the_typed_number(typed, half):
-    """0.10 was typed to hundredths, 29 to units."""
+    """Half a digit is half of the last digit as typed: hundredths for 0.10, units for 29."""
     assert half_digit(Decimal(typed)) == Fraction(half)
 
 
@@ -70,14 +70,17 @@ def test_the_error_grows_with_the_distance(value, steps, sign):
 
 
 def test_rounding_and_standard_errors_come_off_first():
-    """105 to the unit is 4.5 off 100; with a standard error of 1 and 3 sigmas 1.5/103 is left."""
+    """The error is what remains after rounding and then the standard error are subtracted.
+
+    105, typed to units, is 4.5 off 100; with a standard error of 1 and 3 sigmas 1.5/103 remains.
+    """
     assert percent_off(Decimal("105"), at(100.0), sigmas=3.0) == Fraction(9, 2)
     error = percent_off(Decimal("105"), at(100.0, std=1.0), sigmas=3.0)
     assert error == 100 * (Fraction(209, 2) / 103 - 1)
 
 
 def test_five_percent_is_the_same_factor_either_way():
-    """A number too small by a factor is as wrong as one too large by it."""
+    """A number too small by a factor has the same error as one too large by this factor."""
     high = percent_off(Decimal("120.0000"), at(100.0), sigmas=0.0)
     low = percent_off(Decimal("83.33333"), at(100.0), sigmas=0.0)
     # The digits typed differ: half of a unit in 1e-4 and 1e-5 is 1e-4 percent.
@@ -85,25 +88,28 @@ def test_five_percent_is_the_same_factor_either_way():
 
 
 def test_a_wrong_sign_earns_nothing():
-    """No tolerance is wide enough for a negative gain."""
+    """A number with the wrong sign earns nothing, however wide the tolerance."""
     error = percent_off(Decimal("-24.3"), at(24.3), sigmas=3.0)
     assert credit(error, full=1000.0, none=1000.0) == 0
 
 
 @pytest.mark.parametrize("vague", ["0e2", "0", "0.0", "-0.0"])
 def test_a_zero_is_no_number_that_fits_everything(vague):
-    """Rounding may excuse a share of the number, so nothing of zero."""
+    """A typed zero earns nothing, since rounding may excuse only a share of the number."""
     assert rounding(Decimal(vague)) == 0
     assert credit(percent_off(Decimal(vague), at(0.1), sigmas=0.0), full=50.0, none=200.0) == 0
 
 
 def test_one_digit_is_excused_as_little_as_two():
-    """3e1 may mean 28.5 to 31.5, not 25 to 35."""
+    """A number typed with one digit is excused only as much rounding as with two digits.
+
+    3e1 may mean 28.5 to 31.5, not 25 to 35.
+    """
     assert rounding(Decimal("3e1")) == Fraction(3, 2)
     assert percent_off(Decimal("3e1"), at(35.0), sigmas=0.0) == 100 * (Fraction(70, 63) - 1)
 
 
 @pytest.mark.parametrize("typed", ["0e2", "25.60", "1e-7", "3e5"])
 def test_numbers_are_shown_as_typed(typed):
-    """Not as Python would write them."""
+    """Numbers are shown as the student typed them."""
     assert as_typed(Decimal(typed)) == typed

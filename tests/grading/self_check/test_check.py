@@ -1,4 +1,4 @@
-"""The check names the numbers that disagree and where to look; no answer reveals a value."""
+"""The check names the numbers that disagree and where to look, but no answer reveals a value."""
 
 import json
 import re
@@ -12,7 +12,7 @@ from pipeline.grading.self_check.words import answer_lines
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import OF_SEVERAL_CARTS, SLIPS, reporting, scaled
 
-SEEDS = range(3)  # a bench each of one, two and three carts
+SEEDS = range(3)  # one bench each of one, two and three carts
 NOT_PLACED = {  # no number disagrees with the recordings
     "initial_final_disagree",
     "missing",
@@ -22,7 +22,7 @@ team = cache(make_team)
 
 
 def slipped(slip: str, seed: int) -> Team:
-    """Return the team of a seed with a slip, or unchanged if one cart cannot have it."""
+    """Return a seed's team with a slip, or unchanged if the slip is impossible for its carts."""
     one = team(seed)
     alone = one.bench.chain.n == 1 and slip in OF_SEVERAL_CARTS
     return one if alone else SLIPS[slip](one)
@@ -38,19 +38,19 @@ def asked_twice(found: JudgedNumbers) -> tuple[CheckAnswer, CheckAnswer]:
 
 
 def stripped(text: str, one: Team) -> str:
-    """Return a text without its names of numbers, recordings and carts, and without the counts."""
+    """Return a text without names of numbers, recordings and carts, and without counts."""
     for run in sorted((e.id for e in one.submission.experiments), key=len, reverse=True):
         text = text.replace(run, "")
     text = re.sub(r"(initial|final)\.\w+|state_space\.[AB]\([\d, ]+\)", "", text)
     text = re.sub(r"^(\d+ of|All) \d+ numbers?|Asked \d+ times?", "", text, flags=re.MULTILINE)
-    said = ("2π", "cart 1", "n − 1", "log10", "cartlab-check/1")  # whatever the recordings are
+    said = ("2π", "cart 1", "n − 1", "log10", "cartlab-check/1")  # the names of recordings
     return re.sub("|".join(said), "", text)
 
 
 @pytest.mark.parametrize("slip", sorted(SLIPS))
 @pytest.mark.parametrize("seed", SEEDS)
 def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
-    """In neither stage a digit is left once names and counts are removed, in words or in JSON."""
+    """No answer contains a digit, apart from names and counts, in words or in JSON."""
     one = slipped(slip, seed)
     for answer in asked_twice(judge(one)):
         said = stripped("\n".join(answer_lines(answer)), one)
@@ -62,7 +62,7 @@ def test_no_answer_holds_anything_numeric_of_a_value(seed, slip):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_answer_tells_neither_side_nor_size(seed):
-    """A gain a third too large, half too large or a third too small gives the same answer."""
+    """The answer is the same for a gain that is a third too large, half too large or too small."""
     one = team(seed)
     name = next(iter(one.reported.final))
     answers = set()
@@ -77,7 +77,7 @@ def test_the_answer_tells_neither_side_nor_size(seed):
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_honest_numbers_agree(seed):
-    """For readings and fits of careful students nothing disagrees that would not lose points."""
+    """For careful students the check reports agreement and at most one number that disagrees."""
     one = team(seed)
     found = judge(one)
     assert found.agree
@@ -87,7 +87,7 @@ def test_honest_numbers_agree(seed):
 
 @pytest.mark.parametrize("slip", sorted(SLIPS.keys() - NOT_PLACED))
 def test_each_common_mistake_is_placed(slip):
-    """In the second stage the kind of mistake is named for most numbers that it made wrong."""
+    """In the second stage, the check names the right mistake for most of the wrong numbers."""
     placed = []
     for seed in SEEDS:
         one = slipped(slip, seed)
@@ -102,7 +102,10 @@ def test_each_common_mistake_is_placed(slip):
 
 
 def test_where_is_told_only_of_what_disagreed_and_was_not_changed():
-    """First which, then where for the same numbers; after any change, which again."""
+    """The first answer says which numbers disagree; asked again, it says where to look.
+
+    After any change it says only which numbers disagree.
+    """
     one = SLIPS["peak_to_peak"](team(1))
     found = judge(one)
     first, second = asked_twice(found)
