@@ -1,6 +1,6 @@
-"""The autograder's zip runs in Gradescope's folders:
+"""The autograder's zip sets up and grades in Gradescope's folders.
 
-setup, grading, and what students then read.
+The tests look at what students then read.
 """
 
 import json
@@ -95,7 +95,7 @@ def start(*command: str | Path, **environment: str) -> subprocess.CompletedProce
 
 @pytest.fixture(scope="module")
 def shown(root, team) -> dict[str, Any]:
-    """What the autograder answers to the submission."""
+    """Return the autograder's result for the submission."""
     return upload(root, team)
 
 
@@ -109,7 +109,7 @@ def upload(root: Path, submission: Path) -> dict[str, Any]:
 
 
 def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, Any]:
-    """Do the same with the program's part in this process, as its start takes a second."""
+    """Grade the upload in this process, since a new one takes a second to start."""
     put(root, submission, rubric=rubric)
     (root / "results").mkdir()
     assert run.grade_upload(root) == ""
@@ -117,7 +117,7 @@ def upload_here(root: Path, submission: Path, *, rubric: str = "") -> dict[str, 
 
 
 def put(root: Path, submission: Path, *, rubric: str = "") -> None:
-    """Put a student's files in place, and a rubric other than the usual one."""
+    """Put a student's files in place, and a rubric if it is not the usual one."""
     shutil.rmtree(root / "submission", ignore_errors=True)
     shutil.rmtree(root / "results", ignore_errors=True)
     if submission.is_dir() and not submission.is_symlink():

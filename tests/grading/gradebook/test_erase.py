@@ -23,9 +23,9 @@ TRACES = ("zebra", "s-zebra", "31.41592", "quagga")  # id, name, a reported numb
 
 
 def _fill(place: str, *, folder: Path | None = None) -> None:
-    """Grade two teams that share a recording;
+    """Grade two teams that share a recording, and use every table of the gradebook.
 
-    let one ask a question, and change and mark it by hand.
+    One team asks a question, gets points by hand and is marked.
     """
     with RequestBook(place, create=True, assignment="lab") as book:
         gone = make_grade(GONE, share=0.5)

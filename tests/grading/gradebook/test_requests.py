@@ -222,9 +222,9 @@ def test_an_answer_that_rests_on_what_is_no_longer_so_is_refused(book):
 
 
 def test_of_two_answers_at_one_moment_one_counts(book, place):
-    """If two TAs answer a request at the same moment, one answer counts;
+    """If two TAs answer a request at the same moment, only one answer counts.
 
-    the other is a conflict.
+    The other answer is refused as a conflict.
     """
     with RequestBook(place) as other:
         for number in range(10):

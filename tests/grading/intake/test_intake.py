@@ -176,7 +176,7 @@ def test_metadata_that_explode_are_only_text(tmp_path):
 
 
 def test_unpacked_canvas_archives_are_not_taken_for_one_student(tmp_path):
-    """Folders named like Canvas' files, by chance or unpacked, get one row each."""
+    """Folders whose names look like one Canvas student's files are separate submissions."""
     tree(tmp_path / "c", {f"team_1_{n}_lab/submission.toml": TOML for n in range(3)})
     assert len(hand_ins(tmp_path, tmp_path / "c")) == 3
 
@@ -220,7 +220,7 @@ def test_metadata_of_a_students_own_are_not_read(tmp_path):
 
 
 def test_a_zip_of_two_submissions_is_called_as_it_is(tmp_path):
-    """It gets neither team's name: both may have rows, and nobody knows which is meant."""
+    """A zip file with two submissions keeps its own name, since its team is unknown."""
     twice = {f"{team}/submission.toml": TOML for team in ("team-01", "team-02")}
     (tmp_path / "class").mkdir()
     archive(tmp_path / "class" / "two.zip", twice)
@@ -247,9 +247,9 @@ def test_one_students_zip_is_one_hand_in(tmp_path):
 
 @pytest.mark.parametrize("packed", [False, True])
 def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
-    """If a class archive is incomplete, nobody is graded;
+    """If a class archive is incomplete, nobody is graded.
 
-    a single incomplete submission gets a row.
+    A single incomplete submission gets a row.
     """
     teams = {f"team-{n}": {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99} for n in range(4)}
     files = {f"{team}/{name}": text for team, own in teams.items() for name, text in own.items()}
@@ -268,7 +268,10 @@ def test_a_class_that_was_cut_short_is_refused_by_its_name(tmp_path, packed):
 
 @pytest.mark.parametrize("how", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
 def test_a_class_cut_within_its_first_packed_hand_in_is_refused(tmp_path, how):
-    """Only one packed submission can be seen in it, and that does not become a row."""
+    """A class archive that ends within its first zip file is refused.
+
+    It is not read as one submission.
+    """
     own = zip_bytes(tmp_path, {"submission.toml": TOML, "data/a.csv": "1,2\n" * 99})
     download = tmp_path / "class.zip"
     with zipfile.ZipFile(download, "w", how) as packing:

@@ -29,9 +29,9 @@ def settle(tmp_path, *hand_ins: HandIn, text: str | None = None, due: datetime |
 
 
 def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_path):
-    """If the time of submission is known, the deadline decides, in any time zone;
+    """If the time of submission is known, the deadline decides, in any time zone.
 
-    else the late mark.
+    Otherwise the platform's late mark counts.
     """
     days, _ = settle(
         tmp_path,
@@ -44,9 +44,9 @@ def test_the_deadline_counts_where_it_is_said_when_something_was_handed_in(tmp_p
 
 
 def test_a_table_of_ones_own_goes_first(tmp_path):
-    """A table of days overrides the deadline:
+    """A table of days overrides the deadline.
 
-    0 is an extension; an unknown name gives a warning.
+    A 0 is an extension, and an unknown name gives a warning.
     """
     days, remarks = settle(
         tmp_path,

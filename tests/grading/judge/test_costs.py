@@ -77,7 +77,7 @@ def _flip_couplings(A: np.ndarray, B: np.ndarray) -> None:
     ],
 )
 def test_a_harmful_model_keeps_a_quarter_at_most(slip, said):
-    """One sign makes a model unstable or reversed, so its right entries are of no use."""
+    """A sign that makes the model unstable or reversed leaves at most a quarter of the points."""
     one = student(2)
     A, B = model(one)
     slip(A, B)

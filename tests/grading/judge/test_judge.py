@@ -247,7 +247,7 @@ def test_a_copied_file_and_another_experiment_s_are_seen(folder, tmp_path):
 
 
 def test_what_builds_on_a_failed_criterion_is_skipped_and_says_so():
-    """Unstable gains fail; claims about them are skipped, and the reason names the gains."""
+    """If the gains fail, criteria that depend on them are skipped, and the message says so."""
     one = student(2)
     feedback = one.reported.feedback
     assert feedback is not None

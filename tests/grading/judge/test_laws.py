@@ -79,7 +79,7 @@ def test_an_incomplete_table_is_not_judged():
     ("n", "name"), [*((2, x) for x in ("K_1", "omega_a", "omega_2", "zeta_2")), (3, "omega_2")]
 )
 def test_the_worse_a_number_the_less_its_table_earns(n, name):
-    """The widening until all laws hold grows with the error of any one number, up and down."""
+    """The larger one number's error, the more the tolerances must widen for all laws to hold."""
     table = PRESETS[f"throne-{n}dof"].parameters()
 
     def needed(factor: float) -> Fraction:

@@ -228,7 +228,10 @@ def test_a_recording_of_another_kind_or_a_cut_one_fails_report_and_grade(
 
 @pytest.mark.parametrize("which", [slice(1), slice(None)])
 def test_decays_in_millimetres_are_told_and_used(which, bench, tmp_path):
-    """One or all: a warning names them, and no number is worse."""
+    """If one or all decays are in millimetres, a warning names them.
+
+    They are still used correctly.
+    """
     folder = shutil.copytree(bench, tmp_path / "spoilt")
     paths = files(folder, "decay")[which]
     for path in paths:
@@ -286,7 +289,10 @@ def test_a_loop_that_is_left_out_is_held_against_nothing(bench, tmp_path):
 
 
 def test_the_sound_repeats_stay_where_most_are_exchanged(bench, tmp_path):
-    """Three of four swapped steps are left out, the right one is kept, and no sign is advised."""
+    """If three of four steps have swapped columns, only those three are left out.
+
+    No sign is advised.
+    """
     folder = shutil.copytree(bench, tmp_path / "most")
     steps = files(folder, "step")
     for path in steps[:3]:

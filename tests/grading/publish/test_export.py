@@ -317,7 +317,10 @@ def test_a_row_that_two_submissions_lead_to_stays_as_it_was(tmp_path):
 
 
 def test_the_number_of_who_handed_in_decides_nothing(tmp_path):
-    """An author of two submissions uploaded one; which counts is still open, reported once."""
+    """If an author of two submissions uploaded one of them, the points stay open.
+
+    One message says so.
+    """
     roster = 'Student,ID,SIS User ID,SIS Login ID,Section,Lab 3\n"Doe, Jane",1001,s1,jane,A,3\n'
     one = make_outcome(make_grade("a", share=0.5, authors=("s1", "x")), owner="doejane (1001)")
     other = make_outcome(make_grade("b", share=0.25, authors=("s1",)))

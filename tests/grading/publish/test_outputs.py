@@ -43,7 +43,10 @@ RUBRIC = two_cart_rubric()
 
 
 def test_a_remark_s_evidence_keeps_its_words():
-    """The table meant, a slip that explains it, and yes or no are beside the numbers."""
+    """A flag's evidence is shown with the name of its table and the slip that explains it.
+
+    Truth values appear as yes or no.
+    """
     evidence = {
         "parameter": "A[2,1]", "table": "initial", "reported": 3.0, "stable": False,
         "slip": "rows 1 and 2 are exchanged", "also_in": "final", "ran": [1.0], "gone": "",
@@ -196,9 +199,9 @@ def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
 
 
 def test_without_names_nothing_tells_who_it_was(tmp_path):
-    """In anonymous grading, pages, table and order of rows reveal no name;
+    """In anonymous grading, pages, table and order of rows reveal no name.
 
-    only the key file does.
+    Only the key file does.
     """
     outcomes = [
         make_outcome(make_grade("zoe-lab", authors=("zoe",), share=0.5)),
@@ -232,7 +235,7 @@ def test_without_names_nothing_tells_who_it_was(tmp_path):
     (ann,) = [n for n, row in key.items() if row["authors"] == "ann"]
     (zoe,) = [n for n, row in key.items() if row["authors"] == "zoe"]
     flag = json.loads(before[f"feedback/{zoe}/grade.json"])["flags"][0]
-    assert flag["evidence"]["submissions"] == [ann]  # submitting again changes no name
+    assert flag["evidence"]["submissions"] == [ann]  # a new submission keeps its pseudonym
     assert ann in flag["message"]
 
 
