@@ -1,4 +1,4 @@
-"""Teams and classes that were once judged wrongly, on benches of every kind."""
+"""Teams and classes that were once judged wrongly are now judged right."""
 
 import tempfile
 from dataclasses import replace
@@ -21,7 +21,7 @@ from pipeline.submission import load_submission
 from tests.helpers.grading_class import Team, make_team
 from tests.helpers.grading_slips import SLIPS, scaled
 
-# One of each kind of case that once went wrong runs by default, the others with the sample.
+# By default one of each kind of case that once went wrong runs, the others with the sample.
 LONG = [pytest.mark.slow, pytest.mark.sample]
 TIED = Chain(
     m=np.array([3.1e-4, 1.7e-4]), c=np.array([6.7e-4, 4.4e-4]), k=np.array([0.05, 0.127, 0.061])
@@ -36,7 +36,7 @@ def flags(team: Team) -> list[str]:
     "seed", [30, *(pytest.param(seed, marks=LONG) for seed in (5, 90, 60023, 60066))]
 )
 def test_little_damping_accuses_nobody(seed):
-    """If dwells put a damping at zero, or dry friction is part of it, nobody is wrong."""
+    """If damping is too small for the dwells to show, nobody gets a flag."""
     team = make_team(seed)
     assert team.bench.chain.zeta_carts.max() < 0.02
     assert flags(team) == []
@@ -53,7 +53,7 @@ def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
 
 @pytest.mark.parametrize("seed", [18, *(pytest.param(seed, marks=LONG) for seed in (34, 38))])
 def test_coarse_encoders_cost_no_points(seed):
-    """Steps of a few counts, and dwells off the carts that the records follow."""
+    """On benches with coarse encoders, honest teams lose no points."""
     team = make_team(seed, count=0.2, travel=1.0, friction=0.0)
     grade = team.grade()
     assert [flag.code for flag in grade.flags] == []
@@ -63,7 +63,10 @@ def test_coarse_encoders_cost_no_points(seed):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
-    """Without its negative gain the table does not determine any carts."""
+    """A table without one of its gains is not taken for a table of fewer carts.
+
+    Here the gain is the negative one of three carts.
+    """
     team = make_team(2)
     table = {x: float(v) for x, v in team.reported.final.items()}
     assert own_chain(table, n=3) is not None
@@ -75,7 +78,10 @@ def test_a_table_of_three_carts_without_a_gain_is_none_of_two():
 
 @pytest.mark.parametrize(("seed", "digits"), [pytest.param(11, 2, marks=LONG), (17, 3)])
 def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
-    """Couplings are differences of large numbers: rounding alone changes them by a third."""
+    """A state model computed from coarsely typed numbers is not flagged.
+
+    Rounding alone changes its couplings by a third.
+    """
     team = make_team(seed, digits=digits)
     assert [f for f in flags(team) if f.startswith("wrong_state_space")] == []
 
@@ -87,9 +93,9 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
             72014, 6, ("peak_count", "log10_for_ln"), {"peak_count", "log10_for_ln"}, marks=LONG
         ),
         (73025, 0, ("hz_for_rad_s",), {"hz_for_rad_s"}),  # one resonance seen anywhere by eye
-        # the seventh period, of one decay
+        # the seventh period of one decay
         pytest.param(73026, 0, ("peak_count",), {"peak_count"}, marks=LONG),
-        # typed too coarsely to be 6/5
+        # typed too coarsely to be told from 6/5
         pytest.param(72007, 3, ("initial_off",), {"initial_off"}, marks=LONG),
         pytest.param(
             72021, 0, ("hz_for_rad_s", "log10_for_ln"), {"hz_for_rad_s", "log10_for_ln"}, marks=LONG
@@ -97,7 +103,7 @@ def test_a_model_made_of_a_vague_table_is_no_wrong_one(seed, digits):
     ],
 )
 def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes):
-    """Two mistakes in one number, a vague number beside sharp ones, one that fits by chance."""
+    """If several mistakes overlap, those that make the whole table likeliest are named."""
     team = replace(make_team(seed), rng=np.random.default_rng([9, seed, turn]))
     for slip in slips:
         team = SLIPS[slip](team)
@@ -105,7 +111,10 @@ def test_what_makes_the_whole_table_likeliest_is_named(seed, turn, slips, codes)
 
 
 def test_a_gain_that_two_mistakes_make_is_told_with_both():
-    """With little damping the step peaks at twice its level."""
+    """If two mistakes explain a gain equally well, the flag names both.
+
+    With little damping, the peak of a step is twice its level.
+    """
     team = scaled(make_team(72003), ["K"], 2.0, ["initial"])
     (flag,) = team.grade().flags
     assert {flag.code, *flag.evidence["or_else"]} == {"peak_for_steady_state", "peak_to_peak"}
@@ -125,7 +134,7 @@ def tied(seed: int) -> tuple[Team, Grade]:
 
 
 def test_springs_that_the_rubric_does_not_have_accuse_nobody():
-    """If the rubric's springs leave an error that others remove, those are used to judge."""
+    """If the fit needs a spring that the rubric lacks, the grader uses it and flags nobody."""
     team, grade = tied(1)
     assert grade.springs == ("wall-1",)
     assert [flag.code for flag in grade.flags] == []
@@ -137,7 +146,10 @@ def test_springs_that_the_rubric_does_not_have_accuse_nobody():
 
 
 def test_a_decay_with_friction_is_no_wrong_logarithm(tmp_path):
-    """Any ratio fits a reference so wide; the team's own final value contradicts it."""
+    """If friction makes a decay's damping vague, no logarithm slip is flagged.
+
+    The team's own final value contradicts the slip.
+    """
     bench = prepare_bench(preset="throne-1dof", hide=("coulomb_friction:cart=1,force=0.003",))
     write_submission(tmp_path / "team", bench, seed=3, reported=True)
     submission = load_submission(tmp_path / "team")

@@ -1,4 +1,4 @@
-"""A class is everything graded so far: one submission alone changes nothing for the others."""
+"""A class is everything graded so far; grading one submission alone keeps the others."""
 
 import csv
 import json
@@ -34,7 +34,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory) -> Path:
-    """Two sections with a team-1 each, and a team-2 with the step of the first one."""
+    """Write two sections with a team-1 each, and a team-2 that copied a step of the first."""
     folder = tmp_path_factory.mktemp("school")
     for seed, name in enumerate(("A/team-1", "B/team-1", "B/team-2")):
         write_submission(
@@ -83,7 +83,10 @@ def pages(out: Path) -> dict[str, bytes]:
 
 
 def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
-    """Its id, all rows and feedback, and the sharing on both sides are as in one run of all."""
+    """A late submission graded alone gives the same class as grading all submissions together.
+
+    Its id, all rows, feedback and flags of sharing are the same.
+    """
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     grade(school, out=whole)
     grade(school, out=parts)
@@ -103,7 +106,10 @@ def test_a_late_hand_in_by_itself_keeps_the_class(school, tmp_path):
 
 
 def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
-    """One row, under the new name, with a message; points by hand and requests go with it."""
+    """If a folder is renamed, its submission keeps its row, points by hand and requests.
+
+    A message gives the new name.
+    """
     out = tmp_path / "out"
     grade(school / "B" / "team-1", out=out)
     give(out, "team-1", 0.25)
@@ -125,7 +131,9 @@ def test_a_renamed_folder_is_the_same_submission(school, tmp_path):
 
 @pytest.mark.parametrize("author", ["s0", "s1"])
 def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path, author):
-    """It makes the names longer; the rows of the earlier teams, and points by hand, stay.
+    """A folder of the same name in a stranger's zip file changes no row of an earlier team.
+
+    It only gets a longer id; points given by hand stay.
 
     The same holds if it has the team's id, or if a submission cannot be read.
     """
@@ -155,7 +163,10 @@ def test_a_folder_in_a_strangers_zip_takes_nothing_from_a_team(school, tmp_path,
 
 
 def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
-    """Its files and points by hand would be lost, so the run is refused."""
+    """If a rubric file has another name than the class's rubric, the run is refused.
+
+    Files and points given by hand would be lost otherwise.
+    """
     out, rubric = tmp_path / "out", tmp_path / "lab.toml"
     shutil.copy(RUBRICS / "throne-1dof.toml", rubric)
     grade(school / "B" / "team-1", out=out, rubric=rubric)
@@ -170,7 +181,10 @@ def test_a_rubric_of_another_name_replaces_no_class(school, tmp_path):
 
 
 def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
-    """The platform's number says whose it is, in later runs too."""
+    """A corrected id in another folder is the same submission by the platform's number.
+
+    Nobody is flagged, in later runs either.
+    """
     out, folder = tmp_path / "out", tmp_path / "class"
     for inside, id_ in (("lab", "s 1"), ("lab-final", "s1")):
         shutil.rmtree(folder, ignore_errors=True)
@@ -184,7 +198,7 @@ def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
         assert [one.sharing for one in done] == [0, 0]
         if inside == "lab":
             give(out, "lab", 0.25)
-        else:  # under another id it is another team's, with a message
+        else:  # a folder under another id is another team's, with a message
             assert [r for r in done[0].remarks if "'s1' in place of 's 1'" in r]
     assert {name: row["authors"] for name, row in rows(out).items()} == {
         "lab-final": "s1", "other": "s0",
@@ -192,7 +206,7 @@ def test_a_mended_id_and_another_folder_accuse_nobody(school, tmp_path):
 
 
 def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
-    """Two teams exchange folders and record again: each keeps its own points."""
+    """If two teams exchange folders and record again, each keeps its own points by hand."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         for run, names in enumerate(((("a", "ann"), ("b", "bo")), (("a", "bo"), ("b", "ann")))):
             outcomes = [
@@ -215,7 +229,7 @@ def test_who_exchanges_folders_keeps_what_was_given(tmp_path):
 
 
 def test_what_makes_two_the_same_submission(tmp_path):
-    """First the platform's number, then the files, then the authors; never other people's."""
+    """Two submissions are the same by the platform's number, else by files, else by authors."""
     old = make_outcome(make_grade("old", authors=("ann",)), key="k-files", owner="A (canvas 7)")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)
@@ -240,7 +254,7 @@ def test_what_makes_two_the_same_submission(tmp_path):
 
 
 def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
-    """Without authors the folder decides whose files they are; a longer name is the same one."""
+    """Two empty submissions are not the same; without authors their folders decide."""
     old = make_outcome(failed_grade("team-3", "empty"), key="k-none", fingerprints=b"")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         book.put(old)
@@ -252,7 +266,7 @@ def test_two_that_hand_in_nothing_are_not_the_same(tmp_path):
 
 
 def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
-    """Capitals, blanks or a corrected id with the same recordings are not another team."""
+    """If an author's id is corrected and the recordings are the same, nobody is flagged."""
     own, out = shutil.copytree(school / "B" / "team-1", tmp_path / "team-1"), tmp_path / "out"
     file = own / "submission.toml"
     text = file.read_text(encoding="utf-8")
@@ -267,7 +281,7 @@ def test_a_mended_id_of_an_author_accuses_nobody(school, tmp_path):
 
 
 def test_the_rubric_of_those_kept_is_told(tmp_path):
-    """Submissions that stay on the list keep the rubric that graded them, with a message."""
+    """Submissions kept from an earlier run keep their rubric, and a message says so."""
     a, b = make_outcome(make_grade("a")), make_outcome(make_grade("b"))
     other = RUBRIC.model_copy(update={"criteria": RUBRIC.criteria[:-1]})
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -282,7 +296,7 @@ def test_the_rubric_of_those_kept_is_told(tmp_path):
 
 
 def test_who_is_removed_is_off_every_list_but_history(tmp_path):
-    """The pages omit them; their history keeps them, and when graded again they are back."""
+    """A removed submission is on no page, but in the history; graded again, it is back."""
     outcomes = [make_outcome(make_grade(name)) for name in ("a", "b", "c")]
     everybody = Batch(keys=tuple(o.key for o in outcomes), shared={})
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -311,7 +325,7 @@ def test_who_is_removed_is_off_every_list_but_history(tmp_path):
 
 
 def test_a_failed_second_try_hides_no_recordings(tmp_path):
-    """The first files are still known after a timeout, and so is a replaced version."""
+    """If a second grading fails, the fingerprints of the first one and of all versions remain."""
     grade_ = make_grade("team")
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         for key, prints in (("1", b"first"), ("2", b""), ("3", b"second"), ("4", b"first")):
@@ -323,7 +337,10 @@ def test_a_failed_second_try_hides_no_recordings(tmp_path):
 
 
 def test_an_override_stays_with_the_same_person(tmp_path):
-    """An id in capitals is the same person's; another id is another person's."""
+    """An override stays if the author's id differs only in capitals and blanks.
+
+    Under another id it belongs to another person.
+    """
     grades = [make_grade("team", authors=(who,)) for who in ("ada 1", " Ada  1", "bob")]
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         kept = []
@@ -337,7 +354,10 @@ def test_an_override_stays_with_the_same_person(tmp_path):
 
 
 def test_the_id_of_a_class_so_far_is_kept(school, tmp_path):
-    """Only if the longer id is on the list and the plain one is not."""
+    """A submission graded alone keeps the longer id that it has in the class list.
+
+    If the list has the plain id, the submission gets that one.
+    """
     path = [school / "A" / "team-1"]
     for known, id_ in (
         ((), "team-1"),
@@ -349,7 +369,7 @@ def test_the_id_of_a_class_so_far_is_kept(school, tmp_path):
 
 
 def test_only_the_feedback_that_changes_is_written_again(school, tmp_path):
-    """The page of a kept submission stays the same file, unless a new one shares with it."""
+    """Feedback of a kept submission is written again only if a new one shares its recordings."""
     out = tmp_path / "out"
     grade(school / "B", out=out)
     before = {p: p.stat().st_mtime_ns for p in (out / "feedback").glob("team-1/*")}

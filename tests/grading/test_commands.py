@@ -1,4 +1,4 @@
-"""The commands that follow grading, as they are typed."""
+"""The commands that follow grading are run as typed."""
 
 import csv
 import io
@@ -22,7 +22,7 @@ from tests.helpers.grades import make_grade, make_outcome, two_cart_rubric, writ
 
 @pytest.fixture
 def run(monkeypatch, capsys):
-    """Type a command; return its exit status, stdout and stderr."""
+    """Run a command; return its exit status, stdout and stderr."""
 
     def typed(*words: str | Path) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["cartlab", *map(str, words)])
@@ -36,7 +36,7 @@ def run(monkeypatch, capsys):
 
 @pytest.fixture(scope="module")
 def grades(tmp_path_factory) -> Path:
-    """A graded class that no test changes."""
+    """Return a graded class that no test changes."""
     return write_class(tmp_path_factory.mktemp("grades"))
 
 
@@ -46,7 +46,7 @@ def points_of(folder: Path, team: str) -> float:
 
 
 def test_an_override_reaches_the_pages_at_once(run, tmp_path):
-    """`auto` takes it back; history lists both."""
+    """An override shows on the pages at once, `auto` removes it, and the history lists both."""
     grades = write_class(tmp_path)
     before = points_of(grades, "team-03")
 
@@ -70,7 +70,7 @@ def test_an_override_reaches_the_pages_at_once(run, tmp_path):
 
 
 def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
-    """A TA who grades without names need not look one up, and sees none."""
+    """An anonymous team can be corrected under its pseudonym, and no output shows its name."""
     grades = write_class(tmp_path, anonymous=True)
     with (grades / "anonymous-key.csv").open(newline="", encoding="utf-8") as file:
         names = {row["submission"]: row["anonymous"] for row in csv.DictReader(file)}
@@ -88,7 +88,7 @@ def test_a_team_is_corrected_by_the_name_that_stands_in_for_it(run, tmp_path):
 
 
 def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
-    """A message lists the points by hand that go with a removed submission."""
+    """If a removed submission had points given by hand, a message lists it."""
     grades = write_class(tmp_path)
     status, _, err = run("remove", grades, "team-02", "s2")
     assert status == 0
@@ -100,7 +100,7 @@ def test_what_was_given_by_hand_is_not_taken_off_without_a_word(run, tmp_path):
 
 
 def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
-    """Control characters of an author's id become blanks on the terminal."""
+    """Control characters in an author's id are printed as blanks."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("eve\r\x1b[2Kbob",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -115,7 +115,7 @@ def test_a_name_writes_nothing_over_what_is_said(run, tmp_path):
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 @pytest.mark.parametrize("listed", [False, True])
 def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms, listed):
-    """A table of the platform or of ours leaves them out: exit status 1, with the reason."""
+    """If a person is in two submissions, every export leaves them out and ends with status 1."""
     outcomes = [make_outcome(make_grade(name, share=1 / n, authors=("s1",)))
                 for n, name in ((1, "a"), (2, "b"))]  # fmt: skip
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
@@ -137,7 +137,7 @@ def test_who_is_in_two_submissions_makes_every_export_end_so(run, tmp_path, lms,
 
 
 def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
-    """A letter it cannot show is written as its number; the JSON stays valid."""
+    """A letter that the console cannot show is written as its number, and the JSON stays valid."""
     raw = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding="cp1252"))
     monkeypatch.setattr(
@@ -152,7 +152,7 @@ def test_a_console_of_few_letters_is_no_error(grades, monkeypatch):
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
-    """Or in the folder given; messages go to the terminal."""
+    """An export is written beside the grades or into the folder given."""
     status, out, err = run("export", grades, "--lms", lms)
     assert (status, out) == (0, "")
     assert f"wrote {grades / lms}.csv" in err
@@ -163,7 +163,7 @@ def test_an_export_lies_beside_the_grades(run, grades, tmp_path, lms):
 
 @pytest.mark.parametrize("lms", ["canvas", "moodle", "gradescope"])
 def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
-    """`--out gs.csv` is the table and nothing else; another file's ending is refused."""
+    """With `--out gs.csv` an export writes only that file; another file type is refused."""
     folder = tmp_path / "exported"
     status, _, err = run("export", grades, "--lms", lms, "--out", folder / "gs.csv")
     assert status == 0
@@ -177,7 +177,7 @@ def test_an_export_into_a_file_writes_that_file(run, grades, tmp_path, lms):
 
 
 def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
-    """If the platform's table lacks a row for a team with points: exit status 1."""
+    """If the platform's roster lacks a team with points, the export ends with status 1."""
     roster = tmp_path / "roster.csv"
     roster.write_text("Student,ID,SIS User ID,Section\nDoe,7,nobody-here,A\n", encoding="utf-8")
     status, _, err = run("export", grades, "--lms", "canvas", "--roster", roster)
@@ -186,7 +186,10 @@ def test_an_export_that_leaves_points_out_ends_so(run, grades, tmp_path):
 
 
 def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
-    """The message asks whether the rubric is another lab's; lateness is known all the same."""
+    """If no submission could be graded, the message asks whether the rubric is another lab's.
+
+    Lateness is recorded all the same.
+    """
     for name in ("team-1", "team-2"):
         (tmp_path / "c" / name).mkdir(parents=True)
         (tmp_path / "c" / name / "submission.toml").write_text(
@@ -216,9 +219,9 @@ def test_a_class_that_nobody_could_be_graded_of(run, tmp_path):
 
 
 def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch):
-    """Neither while it works, nor in reasons, warnings or changes of the class list."""
+    """An anonymous grading prints no name on stderr, neither in progress nor in warnings."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.001)
-    # No pseudonym has a 1: they are in base 32, which has 2 to 7 only.
+    # A pseudonym has no 1, since base 32 has only the digits 2 to 7.
     names = ["doe1-jane1", "roe1-richard1", "poe1-anna1", "moe1-max1"]
     toml = 'version = 1\n[[authors]]\nid = "{name}"\n[system]\ncarts = {carts}\n'
     for name, carts in zip(names, ("1", "1", '"two"', "1"), strict=True):
@@ -251,7 +254,10 @@ def test_an_anonymous_grading_names_nobody_on_stderr(run, tmp_path, monkeypatch)
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
-    """Whatever the umask: the folder, the gradebook with its journal, the key; old ones too."""
+    """Only their owner can read the grades' folder, gradebook and key, whatever the umask.
+
+    Files of earlier runs are restricted too.
+    """
     (tmp_path / "c" / "team-1").mkdir(parents=True)
     (tmp_path / "c" / "team-1" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
     out = tmp_path / "new" / "out"
@@ -284,7 +290,7 @@ def test_names_and_grades_are_for_their_owner_alone(run, tmp_path):
 
 
 def test_a_survey_is_told_on_stdout(run, tmp_path):
-    """As Markdown or JSON; columns that are left out are named on stderr."""
+    """A survey is printed as Markdown or JSON; columns left out are named on stderr."""
     file = write_paper(tmp_path / "answers.csv")
     status, out, err = run("survey", file)
     assert status == 0
@@ -309,7 +315,10 @@ def test_a_survey_is_told_on_stdout(run, tmp_path):
     ],
 )
 def test_what_cannot_be_done_is_one_line(run, grades, tmp_path, monkeypatch, words, message):
-    """Exit status 2, a clear message, no traceback, no password."""
+    """A command that cannot be done ends with status 2 and a message of one line.
+
+    It shows neither a traceback nor a password.
+    """
     monkeypatch.chdir(tmp_path)
     status, out, err = run(*(word.replace("{grades}", str(grades)) for word in words))
     assert (status, out) == (2, "")

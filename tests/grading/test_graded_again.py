@@ -1,4 +1,4 @@
-"""Reasons to grade or compare a submission again: everything that its outcome depends on."""
+"""A submission is graded or compared again if anything has changed that its outcome depends on."""
 
 import shutil
 import sys

@@ -1,4 +1,4 @@
-"""Honest students on a real bench: an ECP 210 with dry friction and a reversed motor sign."""
+"""Students on a real ECP 210 bench, with dry friction and a reversed motor, are judged fairly."""
 
 import math
 from dataclasses import dataclass
@@ -58,7 +58,7 @@ def first_estimates(bench: Bench) -> dict[str, Decimal]:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("digits", [2, 3])
 def test_textbook_numbers_get_no_flag(bench, sign, digits):
-    """Levels, periods, decrements and a viscous fit, with either sign, to two or three digits."""
+    """Numbers found by textbook methods get no flag, with either sign and two or three digits."""
 
     def written(name: str, value: float) -> Decimal:
         value = sign * float(value) if name.startswith("K") else float(value)
@@ -76,7 +76,7 @@ def test_textbook_numbers_get_no_flag(bench, sign, digits):
 
 
 def test_a_student_of_every_single_repeat_is_honest(bench):
-    """A student may take any single run for the damping of a cart."""
+    """A student may take any single run for the damping of a cart without a flag."""
     first = first_estimates(bench)
     for record in bench.analysis.records:
         if record.kind in ("decay", "step") and len(record.free) == 1:
@@ -88,7 +88,7 @@ def test_a_student_of_every_single_repeat_is_honest(bench):
 
 
 def test_real_mistakes_are_still_named(bench):
-    """Frequencies in Hz and a gain from the peak, on real recordings."""
+    """Frequencies in Hz and a gain from the peak are flagged on real recordings too."""
     first = first_estimates(bench)
     hertz = {n: typed(float(v) / (2 * math.pi)) for n, v in first.items() if n.startswith("omega")}
     (flag,) = bench.flags(initial={**first, **hertz}, final={})

@@ -49,7 +49,7 @@ def write(folder: Path, text: str) -> Path:
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
-    """Every shipped rubric loads, by path and by name, and says what it asks."""
+    """Each shipped rubric loads by path and by name, and lists its criteria."""
     rubric = load_rubric(path)
     assert load_rubric(Path(path.stem)) == rubric
     assert rubric.out_of == 20
@@ -59,20 +59,20 @@ def test_shipped_rubrics_are_valid_and_worth_twenty_points(path):
 
 
 def test_four_rubrics_are_shipped():
-    """One for each of the paper's systems, and one for a bench in counts."""
+    """The shipped rubrics are one for each of the paper's systems and one for a bench in counts."""
     names = {path.stem for path in SHIPPED}
     assert names == {"throne-1dof", "throne-2dof", "throne-3dof", "ucsd-mae171a"}
 
 
 def test_points_add_up_exactly(tmp_path):
-    """Three criteria of 0.1, 0.2 and 0.3 are 0.6 points."""
+    """Points add up exactly, so that 0.1, 0.2 and 0.3 make 0.6."""
     text = GOOD.replace("points = 2", "points = 0.1").replace("points = 1.5", "points = 0.2")
     text += '\n[[criteria]]\nid = "more"\npoints = 0.3\ncheck = "data"\n'
     assert load_rubric(write(tmp_path, text)).out_of == 0.6
 
 
 def test_a_pattern_is_written_out(tmp_path):
-    """`K_*` stands for every gain of the system."""
+    """A pattern such as `K_*` is expanded to all gains of the system."""
     plain = rubric_dict(load_rubric(write(tmp_path, GOOD)))
     assert plain["criteria"][0]["parameters"] == ["K_1", "K_2"]
     assert plain["required"]["final"] == ["K_1", "K_2"]
@@ -124,7 +124,7 @@ def test_a_pattern_is_written_out(tmp_path):
     ],
 )
 def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
-    """The message has file, line, key, and the expected value or the nearest key."""
+    """An error in a rubric gives file, line and key, and the expected value or nearest key."""
     assert old in GOOD
     path = write(tmp_path, GOOD.replace(old, new, 1))
     with pytest.raises(ConfigError, match=rf"lab\.toml line {line}: .*{what}"):
@@ -132,7 +132,7 @@ def test_a_mistake_is_named_with_its_line(tmp_path, old, new, line, what):
 
 
 def test_every_mistake_has_its_own_line(tmp_path):
-    """Three mistakes are three lines, in the order of the file."""
+    """If a rubric has three mistakes, the error has three lines in the order of the file."""
     text = GOOD.replace("points = 2", "points = -2").replace("version", "vresion")
     text = text.replace('kind = "step"', 'kind = "stop"')
     with pytest.raises(ConfigError) as caught:
@@ -142,7 +142,7 @@ def test_every_mistake_has_its_own_line(tmp_path):
 
 
 def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
-    """A line that is not TOML, a check, a value, a key, two tables that disagree: all at once."""
+    """A line that is not TOML hides no other mistake: all are reported together."""
     text = GOOD.replace("version = 1", "vresion = 1").replace("points = 2", "points = two")
     text = text.replace('kind = "step"', "kind = stpe").replace('unit = "V"', 'unti = "V"')
     text = text.replace('check = "state_space"', 'chek = "state_spaec"\nfull_percent = 30')
@@ -155,7 +155,7 @@ def test_a_slip_in_a_line_hides_no_other_mistake(tmp_path):
 
 
 def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
-    """Keys under a broken heading are not missing, and a criterion stays a criterion."""
+    """A heading without its bracket is reported as one mistake; its keys are not called missing."""
     text = GOOD.replace("[[criteria]]", "[[criteria]", 1).replace("[required]", "[required")
     with pytest.raises(ConfigError) as caught:
         load_rubric(write(tmp_path, text))
@@ -164,25 +164,25 @@ def test_a_table_without_its_bracket_is_one_mistake(tmp_path):
 
 
 def test_a_criterion_may_only_build_on_an_earlier_one(tmp_path):
-    """A criterion that requires a later one is refused, so there are no circles."""
+    """A criterion that requires a later one is refused, so there are no cycles."""
     text = GOOD.replace('parameters = ["K_*"]', 'requires = ["model"]')
     with pytest.raises(ConfigError, match="'model' comes later"):
         load_rubric(write(tmp_path, text))
 
 
 def test_a_rubric_that_is_not_there_names_the_shipped_ones():
-    """A misspelt name is answered with the nearest shipped rubric."""
+    """If a rubric's name is misspelt, the error suggests the nearest shipped rubric."""
     with pytest.raises(ConfigError, match="did you mean 'throne-2dof'"):
         load_rubric(Path("throne-2dofs"))
 
 
 def test_every_remark_has_its_cost():
-    """Each code may have a cost, except the one that a person decides."""
+    """Each flag may have a cost, except the flag for shared data, which a person decides."""
     assert {*FlagCosts.model_fields} == {*CODES} - {"shared_data"}
     assert all(load_rubric(path).flags.of("wrong_state_space") == 0.5 for path in SHIPPED)
 
 
 def test_toml_that_is_none_says_where(tmp_path):
-    """A syntax error keeps the line given by the parser."""
+    """If a rubric is not valid TOML, the error gives the parser's line."""
     with pytest.raises(ConfigError, match=r"line 2: the value after = is missing; found title ="):
         load_rubric(write(tmp_path, "version = 1\ntitle = \n"))

@@ -1,4 +1,4 @@
-"""A rubric's numbers as a form: saving them changes nothing else."""
+"""A form changes a rubric's numbers and nothing else in its file."""
 
 import re
 import tomllib
@@ -24,7 +24,7 @@ SHIPPED = {path.stem: path.read_text(encoding="utf-8") for path in sorted(RUBRIC
 
 
 def typed_into(text: str, **typed: str) -> str:
-    """Return the text of a rubric after a form was filled in."""
+    """Return the text of a rubric after a form with these values was saved."""
     form = rubric_form(parse_rubric(text, where=""))
     return with_values(
         text, changed_fields(form, {k.replace("__", "."): v for k, v in typed.items()})
@@ -66,7 +66,7 @@ def test_a_form_keeps_comments_and_order(data):
             was = was.get(part, {}) if isinstance(was, dict) else was[part]
         cast(Any, was).pop(key[-1], None)
         if key[0] not in before:
-            assert document.pop(str(key[0])) == {}  # a table of its own
+            assert document.pop(str(key[0])) == {}  # a table that is not inline
     assert document == before
     assert _comments(new) == _comments(text)
     left = iter(_without_numbers(new))
@@ -78,7 +78,7 @@ def _without_numbers(text: str) -> list[str]:
 
 
 def test_nothing_changed_is_the_same_text():
-    """Values sent back as shown, or with extra zeros, change no byte."""
+    """If a form is sent back unchanged, or with extra zeros, no byte of the file changes."""
     for text in SHIPPED.values():
         form = rubric_form(parse_rubric(text, where=""))
         shown = {field.name: field.value for field in form.fields()}
@@ -92,7 +92,7 @@ def test_nothing_changed_is_the_same_text():
 
 
 def test_late_work_at_half_and_a_point_for_hertz():
-    """One digit in a line with its comment; one new line in an existing table."""
+    """One changed number changes one line; a new key adds one line to its table."""
     text = SHIPPED["throne-1dof"]
     late = typed_into(text, late__percent_per_day="50")
     assert late == text.replace("percent_per_day = 10", "percent_per_day = 50")
@@ -104,7 +104,7 @@ def test_late_work_at_half_and_a_point_for_hertz():
 
 
 def test_a_table_that_is_not_there_is_made_before_the_criteria():
-    """Not within a criterion, nor between one and the comment above it."""
+    """A missing table is added before the criteria and before the comment above them."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
     bare = f"{text[:start]}# what is judged\n{text[end:]}"
@@ -115,7 +115,7 @@ def test_a_table_that_is_not_there_is_made_before_the_criteria():
 
 
 def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
-    """An inline table is not changed by the form."""
+    """An inline table is not changed by the form; the error says so."""
     text = SHIPPED["throne-1dof"]
     start, end = text.index("[late]"), text.index("[[criteria]]")
     inline = "late = { percent_per_day = 10 }\n" + text[:start] + text[end:]
@@ -124,7 +124,7 @@ def test_what_stands_in_no_line_of_its_own_is_left_to_a_person():
 
 
 def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
-    """A message may show a line of TOML."""
+    """Text within a message that looks like a line of TOML is not changed."""
     text = SHIPPED["throne-1dof"].replace(
         'title = "everything the lab asks for"\npoints = 1',
         'title = """the pieces\npoints = 7\n"""\npoints = 1',
@@ -134,7 +134,7 @@ def test_a_value_within_a_longer_text_is_not_taken_for_the_key():
 
 
 def test_what_students_see_is_chosen_in_a_table_of_its_own_or_in_its_line():
-    """A comment behind the value stays."""
+    """The choice of what students see is saved in its table, and a comment after it stays."""
     text = SHIPPED["throne-1dof"]
     new = typed_into(text, students__see="check")
     assert '[students]\nsee = "check"\n' in new
@@ -145,7 +145,7 @@ def test_what_students_see_is_chosen_in_a_table_of_its_own_or_in_its_line():
 
 
 def test_a_wrong_value_is_named_with_its_field():
-    """All of them at once."""
+    """All wrong values of a form are reported together, each with its field."""
     form = rubric_form(load_rubric(Path("throne-1dof")))
     with pytest.raises(WrongFields) as wrong:
         changed_fields(

@@ -1,4 +1,4 @@
-"""`cartlab check` as it is typed: exit status, file, and changed folders."""
+"""`cartlab check` is run as typed: exit status, its file, and changed folders."""
 
 import json
 import re

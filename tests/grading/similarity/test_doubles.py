@@ -1,4 +1,4 @@
-"""People in several submissions of a class: reported to the TA, without an accusation."""
+"""A person in several submissions is reported to the TA without an accusation."""
 
 import re
 from dataclasses import replace
@@ -21,7 +21,7 @@ RUBRIC = two_cart_rubric()
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory) -> list[bytes]:
-    """The fingerprints of two submissions with recordings of their own."""
+    """Return the fingerprints of two submissions with different recordings."""
     folder = tmp_path_factory.mktemp("teams")
     for seed in (0, 1):
         write_submission(folder / f"{seed}", "throne-1dof", seed=seed, compact=True)
@@ -29,7 +29,7 @@ def recordings(tmp_path_factory) -> list[bytes]:
 
 
 def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
-    """Write a class in which Eve submits Bob's recordings with his id beside hers."""
+    """Write a class in which Eve submits Bob's recordings under both their ids."""
     teams = {"team-1": ("bob",), "team-2": ("carl",), "team-9": ("eve", "Bob ")}
     prints = {"team-1": recordings[0], "team-2": recordings[1], "team-9": recordings[0]}
     outcomes = [
@@ -45,7 +45,10 @@ def told(folder: Path, recordings, *, anonymous: bool = False) -> list[Double]:
 
 
 def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
-    """Page and caller get the person, both submissions, and the number of common recordings."""
+    """If a copied submission names its victim as an author, the class page says so.
+
+    It gives the person, both submissions and their number of common recordings.
+    """
     (double,) = told(tmp_path, recordings)
     assert (double.authors, double.submissions) == (("bob",), ("team-1", "team-9"))
     assert double.recordings >= 3
@@ -57,7 +60,7 @@ def test_a_copy_with_the_victims_id_is_told(recordings, tmp_path):
 
 
 def test_without_names_nobody_is_named(recordings, tmp_path):
-    """Submissions have their stand-in names; the person has no name at all."""
+    """In anonymous grading, the message has pseudonyms of the submissions and no person."""
     (double,) = told(tmp_path, recordings, anonymous=True)
     assert re.fullmatch(
         r"One person is in anon-\w+ and anon-\w+, and these share \d+ recordings", str(double)
@@ -65,7 +68,7 @@ def test_without_names_nobody_is_named(recordings, tmp_path):
 
 
 def test_recordings_are_counted_not_pairs_of_submissions(recordings):
-    """Four submissions with one set of recordings share that many, not six times as many."""
+    """Four submissions with the same recordings share only that number, not six times as many."""
     prints = [
         Member(submission=f"t{i}", authors=("s1",), fingerprints=recordings[0]) for i in range(4)
     ]
@@ -77,7 +80,7 @@ def test_recordings_are_counted_not_pairs_of_submissions(recordings):
 
 
 def test_what_could_not_be_read_was_not_compared(recordings):
-    """Without fingerprints the common recordings are not counted."""
+    """If a submission has no fingerprints, common recordings are not counted."""
     for left, compared in ((b"", False), (recordings[1], True)):
         prints = [
             Member(submission=name, authors=("s1",), fingerprints=kept)
@@ -89,7 +92,10 @@ def test_what_could_not_be_read_was_not_compared(recordings):
 
 
 def test_partners_in_the_same_two_submissions_are_told_of_once():
-    """Their submissions are one pair; an author of a third one is listed apart."""
+    """Partners who are in the same two submissions are reported once, as one pair.
+
+    The author of another pair is reported apart.
+    """
     teams = {"a": ("x", "y"), "b": ("Y", "x"), "c": ("z",), "d": ("z", "x2")}
     both, alone = find_doubles(teams)
     assert (both.authors, both.submissions) == (("x", "y"), ("a", "b"))
@@ -99,7 +105,10 @@ def test_partners_in_the_same_two_submissions_are_told_of_once():
 
 
 def test_one_submission_each_is_nothing_to_tell():
-    """Two authors of one team, or one id typed twice, are in no other submission."""
+    """If each person is in only one submission, nothing is reported.
+
+    An id that one submission gives twice counts once.
+    """
     assert find_doubles({"a": ("x", "y"), "b": ("z", "Z ")}) == []
     (double,) = find_doubles({f"t{i}": ("S\n1",) for i in range(10)})
     assert str(double).startswith("S 1 is in t0, t1, ")

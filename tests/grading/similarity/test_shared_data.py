@@ -1,4 +1,4 @@
-"""Shared recordings are found however disguised, and never on one bench that two teams used."""
+"""A shared recording is found however disguised, but not between teams on one bench."""
 
 import json
 import zlib
@@ -22,7 +22,7 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory):
-    """The recordings of six teams that used the same bench in the same way."""
+    """Return the recordings of six teams that used the same bench in the same way."""
     folder = tmp_path_factory.mktemp("teams")
     for seed in range(6):
         write_submission(folder / str(seed), "throne-2dof", seed=seed, compact=True)
@@ -31,7 +31,7 @@ def teams(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def others(teams):
-    """Four teams of the class that share nothing with anybody."""
+    """Return four teams of the class that share nothing with anybody."""
     return [prints(f"other-{number}", records) for number, records in enumerate(teams[2:])]
 
 
@@ -42,7 +42,7 @@ def prints(name, records, authors=None):
 
 
 def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
-    """Return a copy: cut, shifted in time, rescaled, renamed, with added noise (in counts)."""
+    """Return a copy that is cut, shifted in time, rescaled and renamed, with noise (in counts)."""
     n = record.t.size
     start = int(rng.integers(0, round((1 - keep) * n) + 1))
     part = slice(start, start + round(keep * n))
@@ -59,7 +59,7 @@ def disguised(record, rng, *, noise=0.0, scale=1.0, keep=1.0, later=0.0):
 
 @pytest.fixture(scope="module")
 def quiet_teams(tmp_path_factory):
-    """Return the readings of three teams on one bench whose encoders are too fine to show noise."""
+    """Return three teams' readings on one bench, with encoders too fine to show noise."""
     folder = tmp_path_factory.mktemp("quiet")
     for seed in range(3):
         write_submission(
@@ -72,7 +72,7 @@ def quiet_teams(tmp_path_factory):
 
 
 def rounded(records, *, count, seed):
-    """Return recordings by an encoder of that step, with any zero and without noise.
+    """Return recordings by an encoder with the given step, with any zero and without noise.
 
     Only open-loop runs: a controller would have read the coarse encoder too.
     """
@@ -94,27 +94,30 @@ def of_kind(records, kind):
 
 
 def test_honest_teams_on_one_bench_share_nothing(teams):
-    """The same carts under the same inputs move in the same way; their noise differs."""
+    """Teams that drive the same bench with the same inputs share nothing: their noise differs."""
     assert find_shared([prints(str(i), records) for i, records in enumerate(teams)]) == {}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20, 37, 100, 500])
 def test_rounding_of_one_motion_is_nobodys(quiet_teams, per_cm):
-    """Without noise, one motion is rounded equally if the zeros happen to agree: not evidence."""
+    """If a motion without noise is rounded to equal counts by chance, nobody is flagged."""
     honest = [
         rounded(records, count=1 / per_cm, seed=seed) for seed, records in enumerate(quiet_teams)
     ]
     batch = [prints(str(seed), records) for seed, records in enumerate(honest)]
     assert find_shared(batch) == {}
     rng = np.random.default_rng(4)
-    if per_cm >= 100:  # a whole submission has too many zeros in common
+    if per_cm >= 100:  # a whole submission has too many possible zeros in common
         copied = [disguised(r, rng, keep=0.8, later=2.0) for r in honest[0]]
         assert set(find_shared([*batch, prints("copy", copied)])) == {"0", "copy"}
 
 
 @pytest.mark.parametrize("per_cm", [5, 20])
 def test_honest_teams_with_coarse_encoders_share_nothing(tmp_path, per_cm):
-    """Also if the carts move by one or two counts, and under feedback the input by as few."""
+    """Honest teams with coarse encoders are not flagged, even if a cart moves by one or two counts.
+
+    Under feedback the input then has few levels too.
+    """
     for seed in (1, 2, 7):
         write_submission(
             tmp_path / str(seed),
@@ -153,7 +156,9 @@ def test_one_copied_recording_is_found_however_disguised(teams, others, kind, di
 
 
 def test_under_feedback_the_input_gives_a_copy_away(teams, others):
-    """The controller has turned the carts' noise into input, so more noise cannot hide the copy.
+    """Under feedback, the input reveals a copy, even with added noise.
+
+    The controller turned the carts' own noise into input.
 
     The start, where the reference steps, is cut off as well.
     """
@@ -182,7 +187,7 @@ def test_a_whole_copy_is_found_under_much_noise(teams, others):
 
 
 def test_teammates_and_repeats_do_not_count(teams):
-    """Submissions with a common author, or one recording submitted twice, are not copies."""
+    """Submissions with a common author, and a recording submitted twice, are not flagged."""
     twice = [*teams[0], replace(of_kind(teams[0], "step"), id="again")]
     a = prints("a", twice, authors=("ann", "bob"))
     b = prints("b", teams[0], authors=("bob", "carl"))
@@ -190,7 +195,7 @@ def test_teammates_and_repeats_do_not_count(teams):
 
 
 def test_what_was_handed_out_may_be_used_by_all(teams):
-    """Recordings of an example belong to nobody; a copy of any other is still found."""
+    """Recordings that the instructor handed out are not flagged; a copy of any other one is."""
     given, own = teams[0][:-1], teams[0][-1]
     example = fingerprint(given)
     batch = [prints("a", teams[0]), prints("b", [*teams[1][:3], *given])]
@@ -204,7 +209,7 @@ def test_what_was_handed_out_may_be_used_by_all(teams):
 
 
 def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
-    """However many teams hold one recording, each is compared with the handout."""
+    """However many teams submit a handed-out recording, none of the teams is flagged."""
     rng = np.random.default_rng(11)
     copies = [[disguised(r, rng, scale=2.0, later=1.0) for r in teams[0][:2]] for _ in range(40)]
     batch = [prints(f"t{number:02d}", records) for number, records in enumerate(copies)]
@@ -213,7 +218,10 @@ def test_what_was_handed_out_may_be_used_by_a_whole_class(teams):
 
 
 def test_earlier_batches_count(teams):
-    """A recording of last year is found and named as such; last year's copies are not repeated."""
+    """A recording from an earlier batch is found and named as such.
+
+    Copies within the earlier batch are not reported again.
+    """
     old = [prints("x", teams[0]), prints("y", teams[0])]
     found = find_shared([prints("a", teams[0][:4])], earlier=old)
     assert set(found) == {"a"}
@@ -225,7 +233,7 @@ def test_earlier_batches_count(teams):
 
 @pytest.fixture
 def compared(monkeypatch):
-    """Return every pair of recordings that is compared sample by sample, and each shift."""
+    """Return all pairs of recordings compared sample by sample, and each time shift."""
     pairs, compare = [], shared.compare
 
     def counted(a, b, **how):
@@ -237,7 +245,7 @@ def compared(monkeypatch):
 
 
 def test_a_recording_under_many_names_is_compared_once(teams, compared):
-    """Two submissions with a thousand names for one file cost no more than two recordings."""
+    """A file that two submissions list under a thousand names is compared only once."""
     record = of_kind(teams[0], "decay")
     many = [replace(record, id=f"decay-{number}") for number in range(1_000)]
     a, b = prints("a", many), prints("b", many)
@@ -250,7 +258,7 @@ def test_a_recording_under_many_names_is_compared_once(teams, compared):
 
 @pytest.mark.parametrize("alike", ["cuts of one run", "one hum in all"])
 def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compared):
-    """Two submissions made to look equal everywhere cost no more than their size."""
+    """Submissions made to look equal everywhere cost only time in proportion to their size."""
     rng = np.random.default_rng(5)
     record = of_kind(teams[0], "decay")
     if alike == "cuts of one run":
@@ -260,12 +268,12 @@ def test_the_cost_grows_with_the_recordings_not_their_square(teams, alike, compa
         made = lambda: disguised(replace(record, y=record.y + hum), rng, noise=1.0)  # noqa: E731
     batch = [prints(name, [replace(made(), id=str(k)) for k in range(100)]) for name in "ab"]
     find_shared(batch)
-    assert 0 < len(compared) <= 10 * 200  # there are 10,000 pairs, at many shifts each
+    assert 0 < len(compared) <= 10 * 200  # there would be 10,000 pairs, each with many time shifts
 
 
 @pytest.mark.parametrize("kind", ["step", "decay"])
 def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
-    """Runs of one experiment on one real bench, as if by as many teams, are not copies."""
+    """Repeats of one experiment on a real bench are not flagged as copies of each other."""
     folder = write_two_cart_submission(tmp_path / "s", real_data, steps=(1, 2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.kind == kind]
     teams = [prints(str(i), [record]) for i, record in enumerate(records)]
@@ -277,13 +285,13 @@ def test_real_repeats_on_one_bench_are_not_shared(real_data, tmp_path, kind):
 
 @pytest.fixture(scope="module")
 def knocking():
-    """Eight teams on a bench with backlash, whose impacts are as sharp as noise."""
+    """Return eight teams on a bench with backlash, whose impacts are as sharp as noise."""
     moved = move_class("throne-1dof", "backlash", seeds=range(8), dwells=4)
     return read_class(moved, seed=3)
 
 
 def test_the_knocks_of_a_bench_are_nobodys(knocking):
-    """Honest runs share the impacts; a noisy copy is still found."""
+    """Teams that share only a bench's impacts are not flagged; a noisy copy is still found."""
     honest = [prints(str(number), records) for number, records in enumerate(knocking)]
     assert find_shared(honest) == {}
     rng = np.random.default_rng(1)
@@ -295,7 +303,10 @@ def test_the_knocks_of_a_bench_are_nobodys(knocking):
 
 @pytest.mark.parametrize("members", [2, 3])
 def test_a_small_class_is_told_of_equal_rows_only(teams, members):
-    """Two or three teams are no reference: equal noise might be the bench's own."""
+    """In a class of two or three teams, only a copy with equal rows is flagged.
+
+    Few teams cannot show whether equal noise comes from the bench.
+    """
     rng = np.random.default_rng(2)
     record = of_kind(teams[0], "step")
     others = [prints(str(number), teams[number]) for number in range(2, members)]
@@ -306,7 +317,10 @@ def test_a_small_class_is_told_of_equal_rows_only(teams, members):
 
 
 def test_three_of_six_may_have_the_same_copy(teams):
-    """Teams that have the same copy are no reference for the bench either."""
+    """If three of six teams have the same copy, all three are flagged.
+
+    Copies are not taken as evidence of the bench's own noise.
+    """
     record = of_kind(teams[0], "step")
     rest = [prints(str(number), teams[number]) for number in range(3, 6)]
     rng = np.random.default_rng(4)
@@ -323,7 +337,7 @@ def test_three_of_six_may_have_the_same_copy(teams):
 
 
 def test_a_flag_names_what_can_be_checked(teams):
-    """The evidence and the sentence say which rows at which times are equal."""
+    """The flag's evidence and message say which rows at which times are equal."""
     copied = disguised(of_kind(teams[0], "step"), np.random.default_rng(6), scale=10.0, later=3.0)
     (record,) = find_shared([prints("a", teams[0]), prints("b", [copied])])["b"]
     (evidence,) = shared_flag([record]).evidence["recordings"]
@@ -337,7 +351,7 @@ def test_a_flag_names_what_can_be_checked(teams):
 
 
 def test_fingerprints_of_an_older_version_are_not_compared(teams):
-    """They lack what is compared now, and do no harm."""
+    """Fingerprints of an older version are ignored, since they lack what is compared now."""
     head = {"experiment": "step-1", "group": "step 1,2 ", "shape": [2, 3], "step": [1, 1]}
     old = zlib.compress(json.dumps([head | {"anchors": [], "swing": []}]).encode() + bytes(7))
     assert unpack(old) == ()
@@ -347,7 +361,7 @@ def test_fingerprints_of_an_older_version_are_not_compared(teams):
 
 
 def test_still_or_short_recordings_have_no_fingerprint(teams):
-    """Without motion there is nothing to compare; packing keeps the rest."""
+    """A recording that is too short or without motion has no fingerprint; others keep theirs."""
     record = of_kind(teams[0], "step")
     still = replace(record, y=np.zeros_like(record.y))
     short = replace(record, t=record.t[:50], u=record.u[:50], y=record.y[:, :50])
