@@ -1,4 +1,4 @@
-"""The bench's pages through plain forms: a plan, a session, its buttons, its end."""
+"""The bench's pages work through plain forms: a plan, a session, its buttons, its end."""
 
 import http.client
 import json
@@ -37,7 +37,7 @@ def begun(visitor: Visitor, work: Path, name: str, room: str = "acquire", **fiel
 
 
 def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
-    """Ticked recordings are made; the news arrives; a Stop without scripts ends the session."""
+    """Ticked recordings are made and watched; without scripts, a Stop button ends the session."""
     work = write_work(tmp_path / "team", [sine("short", seconds=1), sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -75,7 +75,10 @@ def test_a_plan_is_proposed_and_a_session_recorded_and_stopped(tmp_path, real):
 
 
 def test_many_viewers_stop_nobody(tmp_path, real):
-    """Of sixty viewers eight see the session and the others get an answer at once; pages open."""
+    """Of sixty viewers of a session eight are connected; the others are refused at once.
+
+    Other pages still open.
+    """
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server, ExitStack() as streams:
         visitor = Visitor.of(server.url)
@@ -104,7 +107,7 @@ def test_many_viewers_stop_nobody(tmp_path, real):
     ],
 )
 def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, fields):
-    """After kill -9 of the desk during a run, its acquisition stops the bench and saves."""
+    """If the desk is killed during a run, the acquisition stops the bench and saves the run."""
     work = write_work(tmp_path / "team", [sine("long", seconds=300), SWEEP])
     command = [sys.executable, "-m", "pipeline", "desk", str(work), "--no-browser"]
     desk = subprocess.Popen(command, stderr=subprocess.PIPE, encoding="utf-8")
@@ -115,7 +118,7 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
         (work / DIARY).write_text("of an older exploration", encoding="utf-8")
         visitor = Visitor.of(url[0])
         begun(visitor, work, name, room, port=real.address, **fields)
-        # The diary is shown once there is one of this exploration.
+        # The diary is shown once this exploration has written one.
         shown = re.findall(r'aria-labelledby="diary-title"(.*)>', visitor.get("/bench/0/").text)
         assert all(how.startswith(" hidden>") for how in shown)
         assert len(shown) == (room == "explore")
@@ -129,11 +132,11 @@ def test_the_bench_is_stopped_when_the_desk_is_gone(tmp_path, real, name, room, 
         kill(desk)
         assert desk.stderr is not None
         desk.stderr.close()
-    assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half of what was there
+    assert len(read_raw(work / "raw" / f"{name}-1.raw").content) > 10_000  # half of the bytes there
 
 
 def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
-    """The plan equals that of `cartlab plan`; a missing bench is named."""
+    """The desk makes the same plan as `cartlab plan`, and an error names a missing bench."""
     work = tmp_path / "team"
     work.mkdir()
     text = 'version = 1\n[system]\ncarts = 1\nposition = { unit = "cm" }\n'
@@ -151,15 +154,15 @@ def test_a_plan_is_made_and_what_is_wrong_is_said(tmp_path):
         assert visitor.post("/bench/0/press", wish="skip", number="0").status == 503
         assert visitor.post("/bench/0/press", wish="stop", number="0").status == 204
         until(lambda: "Waiting for the bench" not in visitor.get("/bench/0/").text)
-        assert not any('id="positions"' in page for page in shown)  # nothing to watch, ever
+        assert not any('id="positions"' in page for page in shown)  # a session that never begins
         assert "no bench listens there" in shown[-1]
     assert load_plan(load_submission(work)).recordings
 
 
 def test_exploring_has_a_form_of_its_own(tmp_path):
-    """Enter in its fields explores, at its own port.
+    """Exploring has a form with its own port; Enter in one of its fields starts exploring.
 
-    Numbers work as elsewhere, errors name a field.
+    Numbers may have a decimal comma as elsewhere, and an error names its field.
     """
     work = a_recorded_cart(tmp_path / "team")
     with DeskServer(folder=work) as server:
@@ -171,7 +174,7 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
             re.findall(r'action="/bench/0/(\w+)"', form)[0]: set(re.findall(r'name="(\w+)"', form))
             for form in forms
         }
-        ports = {"port", "other"} & fields["acquire"]  # to type in if the list is empty
+        ports = {"port", "other"} & fields["acquire"]  # for typing a port, if the list is empty
         assert fields["explore"] == {*ports, "what", "error", "minutes"}
         assert fields["acquire"] == ports
         sound = {"port": "socket://127.0.0.1:1", "what": "all", "error": "1,5", "minutes": "0,5"}
@@ -189,7 +192,10 @@ def test_exploring_has_a_form_of_its_own(tmp_path):
 
 
 def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
-    """± now, ± after your experiment, then the program's own choice; bad input gets a message."""
+    """A proposed experiment shows the standard error now and after it, then is added to the plan.
+
+    The program's own choice is shown too, and bad input gets a message.
+    """
     work = a_recorded_cart(tmp_path / "team")
     mine = {"kind": "sweep", "amplitude": "0,01", "frequency": "0.5", "frequency_end": "5",
             "seconds": "20", "goal": "zeta"}  # fmt: skip
@@ -225,7 +231,10 @@ def test_an_experiment_is_proposed_weighed_and_added(tmp_path):
 
 
 def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
-    """The list has a virtual bench that runs here; a port that is gone stays, marked as gone."""
+    """The list of ports has each virtual bench that runs here.
+
+    A port that was used and is gone stays in the list, marked as gone.
+    """
     work = write_work(tmp_path / "team", [sine("long", seconds=300)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)
@@ -237,14 +246,14 @@ def test_ports_are_listed_and_the_one_used_is_remembered(tmp_path, real):
         begun(visitor, work, "long", port=real.address)
         visitor.post("/bench/0/press", wish="stop", number="0", plain="1")
         until(lambda: "Stopped. Start again" in visitor.get("/bench/0/").text)
-    with DeskServer(folder=work) as server:  # another desk, later
+    with DeskServer(folder=work) as server:  # another desk that starts later
         page = Visitor.of(server.url).get("/bench/0/").text
     first = re.findall(r'<select name="port" id="port"><option value="([^"]+)"', page)
     assert first == [real.address]
 
 
 def test_what_is_new_in_the_plan_is_marked(tmp_path):
-    """The plan shows what is recorded, what is next, and what was added last."""
+    """The plan marks which runs are recorded, which is next, and which was added last."""
     work = write_work(tmp_path / "team", [sine("first", seconds=1), sine("second", seconds=1)])
     with DeskServer(folder=work) as server:
         visitor = Visitor.of(server.url)

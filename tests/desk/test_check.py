@@ -1,4 +1,4 @@
-"""The check at the desk, for students who find the numbers themselves and then submit."""
+"""The desk offers the check to students who must find the numbers themselves."""
 
 import io
 import re
@@ -51,7 +51,7 @@ def retype(folder, old, new):
 
 @pytest.fixture
 def root(tmp_path):
-    """The folders of a lab server; one number of the first team is in Hz, and there is a report."""
+    """Write the folders of a lab server: one team has a number in Hz, and a report exists."""
     for name in ("team", "other"):
         retype(a_submission(tmp_path / name), "omega_n = 13.1", "omega_n = 2.085")
         (tmp_path / name / "report").mkdir()
@@ -64,7 +64,7 @@ def root(tmp_path):
 
 @pytest.fixture
 def lab(root):
-    """A desk behind a proxy that serves them; the visitors, by name."""
+    """Start a desk behind a proxy that serves these folders; return visitors by name."""
     with DeskServer(users=write_users(root, USERS)) as server:
         port = urlsplit(server.url).port or 0
         yield lambda name: through_proxy(port, name)
@@ -78,14 +78,17 @@ def ask_check(visitor: Visitor, **fields: str) -> Answer:
 
 
 def words_of(page: Answer) -> str:
-    """Return what a page says, without its frame."""
+    """Return the words of a page without its frame."""
     main = re.search(r"<main.*</main>", page.text, re.DOTALL)
     assert main
     return " ".join(unescape(re.sub(r"<[^>]*>", " ", main[0])).split())
 
 
 def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
-    """Every page, file and task that may show a number gives 403 with a link to the check."""
+    """Students who must find the numbers get no page, file or task that may show one.
+
+    The answer is 403 with a link to the check.
+    """
     student, other, instructor = lab("s1"), lab("s2"), lab("i")
     for path in ("report/report.html", "report/results.json", "report/report.pdf", "gap/gap.json"):
         refused = student.get(HERE + path)
@@ -103,7 +106,7 @@ def test_who_is_to_find_the_numbers_is_refused_the_report(lab):
 
 
 def test_their_room_offers_the_check_in_place_of_the_report(lab):
-    """The page shows nothing from a report."""
+    """These students' page offers the check instead of the report."""
     page = lab("s1").get(HERE).text
     assert f'href="{HERE}check"' in page
     assert f"{HERE}report" not in page
@@ -113,18 +116,18 @@ def test_their_room_offers_the_check_in_place_of_the_report(lab):
 
 
 def test_nobody_elses_work_tells_them_a_number(lab):
-    """An instructor makes a report in their folder: they only see that work is going on."""
+    """If an instructor makes a report in the students' folder, they see only that work goes on."""
     student, instructor = lab("s1"), lab("i")
     assert instructor.post(f"{HERE}make-report").status == 303
     assert "The report" not in words_of(student.get(f"{HERE}hand-in"))
     told = set(re.findall(r"^data: (.+)$", student.get(f"{HERE}events").text, re.MULTILINE))
     assert told <= {"under way", "done"}
     assert "Work in this folder: done" not in instructor.get(HERE).text
-    assert "asks" not in words_of(student.get(f"{HERE}hand-in"))  # nor what the report asks
+    assert "asks" not in words_of(student.get(f"{HERE}hand-in"))  # nor what the report asks about
 
 
 def test_first_which_then_where_and_the_count_is_shown(lab, root):
-    """Names with a mark, then a hint for the number asked about; no digit of the value anywhere."""
+    """First the check names the wrong number, then it gives a hint; no page shows the value."""
     student = lab("s1")
     assert "not checked yet" in words_of(student.get(f"{HERE}check"))
     which = ask_check(student)
@@ -148,7 +151,7 @@ def test_first_which_then_where_and_the_count_is_shown(lab, root):
 
 
 def test_the_zip_has_the_asks_and_no_report(lab, root):
-    """The folder's report is left out; in a class that sees reports the zip has both."""
+    """The zip has the file of answers, and the report only if the class sees reports."""
     student = lab("s1")
     ask_check(student)
     assert student.post(f"{HERE}hand-in").status == 303
@@ -162,7 +165,7 @@ def test_the_zip_has_the_asks_and_no_report(lab, root):
 
 
 def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
-    """A submission that names results as its data is refused, and the zip lacks them."""
+    """A submission that names a result file as its data is refused, and the zip lacks that file."""
     team = root / "team"
     first = load_submission(team).experiments[0].file
     retype(team, f'"{first}"', '"report/results.json"')
@@ -171,7 +174,7 @@ def test_what_is_computed_goes_into_no_zip_as_a_recording(lab, root):
 
 
 def test_no_upload_replaces_the_asks(lab, root):
-    """The file of questions is not a recording, so an upload of one is refused, also in a zip."""
+    """The file of answers cannot be replaced by an upload, not even inside a zip."""
     student = lab("s1")
     ask_check(student)
     before = (root / "team" / FILE).read_bytes()
@@ -184,7 +187,10 @@ def test_no_upload_replaces_the_asks(lab, root):
 
 
 def test_on_ones_own_computer_the_submission_says_it(tmp_path):
-    """It rests on trust: anyone with the folder can remove the line."""
+    """On one's own computer, a line in the submission hides the report.
+
+    Anyone with the folder can remove the line.
+    """
     folder = a_submission(tmp_path / "team")
     retype(folder, "[system]", '[students]\nsee = "check"\n\n[system]')
     with DeskServer(folder=folder) as server:
@@ -203,13 +209,13 @@ def test_on_ones_own_computer_the_submission_says_it(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_rubric_of_the_list_is_one_line(root, entry, said):
-    """Then no desk is started."""
+    """A wrong rubric in the list of users is an error of one line, and no desk starts."""
     with pytest.raises(ConfigError, match=said):
         read_users(write_users(root, f'[[users]]\nname = "x"\n{entry}\n'))
 
 
 def test_the_ta_reads_the_count_beside_the_grade(root):
-    """It is on the team's page if the graded folder holds the file."""
+    """The team's page for the TA says how often the check was asked."""
     for _ in range(2):
         cartlab_here("check", root / "other")
     cartlab_here("grade", root / "other", "--rubric", RUBRICS / "throne-1dof.toml",

@@ -1,4 +1,4 @@
-"""Errors of `cartlab desk` take one line; what it opens without being told."""
+"""`cartlab desk` reports an error in one line, and sees by itself what kind of folder it opens."""
 
 from urllib.parse import urlsplit
 
@@ -25,7 +25,7 @@ USERS += f'secret_header = "X-Secret"\nsecret = "{"s" * 24}"\n'
     ],
 )
 def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
-    """Exit status 2; nothing is served or made."""
+    """If the command cannot start, it ends with status 2, and nothing is served or written."""
     (tmp_path / "users.toml").write_text(USERS, encoding="utf-8")
     (tmp_path / "users.toml").chmod(0o600)
     done = cartlab_here("desk", "--no-browser", *options, cwd=tmp_path)
@@ -36,7 +36,7 @@ def test_what_it_cannot_do_is_one_line(options, why, tmp_path):
 
 
 def test_what_is_opened_is_known_by_what_lies_in_it(tmp_path):
-    """A gradebook marks a grading's output, as folder or file; everything else is a submission."""
+    """A folder or file with a gradebook opens as a class, any other folder as a submission."""
     grades = tmp_path / "grades"
     grades.mkdir()
     (grades / "gradebook.sqlite").write_bytes(b"")
@@ -64,7 +64,7 @@ ADDRESSES = (
 
 
 def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
-    """A bad address is refused with the right form, and leaves no file behind."""
+    """A wrong database address is refused with the right form and leaves no file."""
     monkeypatch.chdir(tmp_path)
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -77,7 +77,10 @@ def test_no_address_is_a_fault_of_the_desk(tmp_path, monkeypatch):
 
 
 def test_a_listed_address_that_makes_no_sense_shows_the_other_rooms(tmp_path):
-    """A TA sees the home page whatever their list says; the bad gradebook explains itself."""
+    """If a TA's list has a bad gradebook address, the other gradebooks are still shown.
+
+    The page of the bad one says what is wrong.
+    """
     (tmp_path / "grades").mkdir()
     books = '["postgresql://[::1", "grades"]'
     users = f'[[users]]\nname = "ta"\nrole = "ta"\ngradebooks = {books}\n'

@@ -1,4 +1,4 @@
-"""Access to the desk: by a secret that opens once, or through the proxy, and no other way."""
+"""The desk opens only by a secret that works once, or through a proxy."""
 
 import re
 import socket
@@ -28,7 +28,7 @@ PATHS = [re.sub(r"\{\w+:int\}", "0", re.sub(r"\{name(:path)?\}", "x.json", p)) f
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    """A desk with one submission."""
+    """Start a desk with one submission."""
     folder = a_submission(tmp_path_factory.mktemp("desk") / "team")
     with DeskServer(folder=folder) as server:
         yield server
@@ -36,14 +36,16 @@ def server(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def visitor(server):
-    """A visitor who opened the printed address."""
+    """Return a visitor who opened the printed address."""
     return Visitor.of(server.url)
 
 
 def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
-    """Then a cookie is used that no script reads and no other site sends.
+    """The secret address works once; then a cookie takes its place.
 
-    The address is used up.
+    No script can read the cookie, and no other site sends it.
+
+    A second visitor with the same address is refused.
     """
     assert visitor.get("/").status == 200
     assert Visitor(port=visitor.port).get(urlsplit(server.url).path).status == 403
@@ -60,7 +62,7 @@ def test_the_secret_opens_once_and_leaves_the_address(server, visitor):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_nobody_gets_in_without_the_cookie(visitor, path):
-    """No address answers a stranger, and an invented cookie does not help."""
+    """Without the right cookie every address answers 403."""
     for cookie in ("", f"cartlab-{visitor.port}=guess", "cartlab=x"):
         stranger = Visitor(port=visitor.port, headers={"Cookie": cookie})
         assert stranger.get(path).status == 403
@@ -68,7 +70,10 @@ def test_nobody_gets_in_without_the_cookie(visitor, path):
 
 
 def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
-    """Any page on this computer may set one; before or behind the real one, it does no harm."""
+    """A second cookie of the same name does not lock the visitor out.
+
+    Any page on this computer may set one.
+    """
     real = visitor.headers["Cookie"]
     other = f"cartlab-{visitor.port}=guess"
     for sent in (f"{other}; {real}", f"{real}; {other}", f"a=b; {other}; {other}x; {real}"):
@@ -78,7 +83,7 @@ def test_another_cookie_of_the_same_name_locks_nobody_out(visitor):
 
 
 def test_other_pages_cannot_ask(visitor):
-    """Another host name, a foreign origin, a browser that reports a cross-site request."""
+    """A request with another host, a foreign origin or a cross-site mark is refused."""
     port = visitor.port
     for wrong in (
         {"Host": f"evil.example:{port}"}, {"Host": "127.0.0.1"}, {"Origin": "http://evil.example"},
@@ -89,13 +94,13 @@ def test_other_pages_cannot_ask(visitor):
         form = visitor.send("/open", b"folder=/", kind="application/x-www-form-urlencoded", **wrong)
         assert form.status == 403, wrong
     silent = visitor.ask("POST", "/open", b"", {"Content-Type": "text/plain"})
-    assert silent.status == 403  # a form says where it is from
+    assert silent.status == 403  # a browser sends the form's origin
     assert visitor.get("/", Host=f"localhost:{port}").status == 200
 
 
 @pytest.mark.parametrize("path", ["/", "/nowhere", "/static/desk.js", "/student/7/"])
 def test_every_answer_has_its_policy(visitor, path):
-    """Scripts and styles are the desk's own files, and nobody may frame it."""
+    """Each page's policy allows only the desk's own scripts and styles, and no frame around it."""
     for who in (visitor, Visitor(port=visitor.port)):
         policy = who.get(path).headers["content-security-policy"]
         assert "unsafe" not in policy
@@ -108,7 +113,10 @@ def test_every_answer_has_its_policy(visitor, path):
     "length", [f"Content-Length: {MOST_FORM + 1}", "Transfer-Encoding: chunked"]
 )
 def test_nobody_sends_more_than_is_read(visitor, length):
-    """By the stated length or by the bytes received; the desk goes on."""
+    """A request that is too long is refused, by its stated length or by its bytes.
+
+    The desk goes on serving.
+    """
     host = f"127.0.0.1:{visitor.port}"
     head = (
         f"POST /open HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\n{length}\r\n"
@@ -125,7 +133,7 @@ def test_nobody_sends_more_than_is_read(visitor, length):
 
 
 def test_strangers_are_few_and_leave(visitor, monkeypatch):
-    """Of 300 idle connections some are held for a while; a visitor with the cookie is served."""
+    """Of 300 idle strangers only some are held, and not for long; the visitor is still served."""
 
     def held() -> int:
         mine = psutil.Process().net_connections("tcp")
@@ -144,7 +152,7 @@ def test_strangers_are_few_and_leave(visitor, monkeypatch):
 
 
 def test_a_port_that_is_taken_is_one_line(server):
-    """The command ends with it."""
+    """If the port is in use, the command ends with an error of one line."""
     with pytest.raises(ConfigError, match="the desk cannot listen at port"):
         DeskServer(port=urlsplit(server.url).port or 0)
 
@@ -181,13 +189,13 @@ ports = ["/dev/ttyACM9"]
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
-    """The folders of a lab server."""
+    """Write the folders of a lab server."""
     return tmp_path_factory.mktemp("lab")
 
 
 @pytest.fixture(scope="module")
 def lab(root):
-    """A desk for four people behind a proxy; the visitors, by name."""
+    """Start a desk for four people behind a proxy; return visitors by name."""
     for name in ("one", "two", "three", "four"):
         a_submission(root / name)
     write_class(root / "grades")
@@ -200,7 +208,7 @@ def lab(root):
 
 @pytest.mark.parametrize("name", ["José Müller", "学生七"])
 def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
-    """As the proxy writes it; a name that is not on the list is refused in both."""
+    """The proxy may send a user's name in UTF-8 or Latin-1; unknown names are refused."""
     a_submission(tmp_path / "one")
     users = f'[[users]]\nname = "{name}"\nrole = "student"\nfolders = ["one"]\n'
     with DeskServer(users=write_users(tmp_path, users)) as server:
@@ -213,7 +221,7 @@ def test_a_name_may_come_in_utf_8_or_in_latin_1(name, tmp_path):
 
 
 def test_everybody_sees_their_own(lab):
-    """The same address for another student is another folder; other folders have no address."""
+    """The same address shows each student their own folder; other folders have no address."""
     assert "one" in lab("s1").get("/student/0/").text
     assert "two" in lab("s2").get("/student/0/").text
     assert lab("s1").get("/student/1/").status == 404
@@ -227,7 +235,7 @@ def test_everybody_sees_their_own(lab):
 
 
 def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
-    """It shows only what was typed into it, however many states others have seen since."""
+    """A form saves only what was typed into it, even if many other states were saved since."""
     page = lab("s1").get("/student/0/")
     shown, seen = {name: page.value(name) for name in ("title", "section")}, page.value("seen")
     saved = lab("s1").post("/student/0/save", seen=seen, **shown | {"section": "07"})
@@ -243,9 +251,12 @@ def test_a_form_outlasts_what_a_class_saves_meanwhile(lab, root):
 
 
 def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
-    """Not on pages, in refusals or in news of work; an instructor sees folders."""
+    """Students and TAs see no folder of the server on pages, in refusals or in progress messages.
+
+    An instructor does see them.
+    """
     plain = (root / "three" / "submission.toml").read_bytes()
-    (root / "three" / "report").symlink_to(root)  # a report there is refused
+    (root / "three" / "report").symlink_to(root)  # a link as report folder is refused
     try:
         said = [lab(name).get(path).text
                 for name, paths in (("s1", ("", "report")), ("s2", ("", "report")))
@@ -267,12 +278,12 @@ def test_students_and_tas_are_told_no_folder_of_the_server(lab, root):
 
 
 def test_a_ta_sees_the_gradebooks_they_are_listed_for(lab):
-    """And no student's room."""
+    """A TA sees the gradebooks that the list gives them, and no student's page."""
     assert "team-07" in lab("t").get("/grades/0/").text
     assert lab("t").get("/grades/1/").status == 404
 
 
-# Of each room, by the first part of an address, who of a lab server is let in.
+# For each room, by the first part of its address, the users of a lab server who may enter.
 ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i w",
          "solution": "i w", "effects": "i w", "open": "", "exercises": "w", "rubric": "w",
          "bench": "w", "feedback": "s"}  # fmt: skip
@@ -280,7 +291,7 @@ ENTER = {"": "s t i w", "static": "s t i w", "student": "s i w", "grades": "t i 
 
 @pytest.mark.parametrize("path", PATHS)
 def test_each_role_has_its_rooms(lab, path):
-    """Every address of a room that is not theirs refuses them, whatever is sent."""
+    """Each role is refused at every address of other roles' rooms, whatever is sent."""
     for role, name in {"s": "s1", "t": "t", "i": "i", "w": "w"}.items():
         let_in = role in ENTER[path.split("/")[1]].split()
         if not let_in:
@@ -302,7 +313,7 @@ def test_people_come_from_the_page_of_a_login(lab):
 
 
 def test_a_page_that_is_asked_for_writes_nothing(lab, root):
-    """A request for any page, from anywhere, leaves every file as it was."""
+    """A GET request for any page changes no file."""
 
     def files() -> dict:
         return {
@@ -319,13 +330,16 @@ def test_a_page_that_is_asked_for_writes_nothing(lab, root):
 
 
 def test_nobody_names_a_folder_of_the_server(lab, tmp_path):
-    """Only the person at this computer opens folders by name."""
+    """On a lab server nobody can open a folder by typing its path."""
     for name in ("s1", "t", "w"):
         assert lab(name).post("/open", folder=str(tmp_path)).status == 403
 
 
 def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
-    """Exercises and rubrics stay in the workshop, whatever is typed; ports come from the list."""
+    """An instructor writes exercises and rubrics only in the workshop.
+
+    Ports come from the list of users.
+    """
     who = lab("w")
     bench = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     made = who.post("/exercises/make", out="first", **bench)
@@ -351,14 +365,14 @@ def test_an_instructor_makes_in_the_workshop_and_nowhere_else(lab, root):
 
 
 def test_forged_names_are_refused(lab):
-    """No name, an unknown one, two at once, or an address other than the proxy's."""
+    """A request that does not come from the proxy with one known name is refused."""
     assert lab("").get("/").status == 403
     assert lab("root").get("/").status == 403
     assert lab("s1", source="127.0.0.2").get("/student/0/").status == 403
     guessed = lab("s1")
     for secret in ("", "the-proxy-and-the-desk-know-i", "wrong"):
         assert guessed.get("/student/0/", X_Proxy_Secret=secret).status == 403
-    del guessed.headers["X-Proxy-Secret"]  # who is logged in beside the proxy
+    del guessed.headers["X-Proxy-Secret"]  # the user who logged in at the proxy
     assert guessed.get("/student/0/").status == 403
     double = "GET /student/0/ HTTP/1.1\r\nHost: lab.example.edu\r\n"
     double += "X-Proxy-Secret: the-proxy-and-the-desk-know-it\r\n"
@@ -403,7 +417,7 @@ def test_forged_names_are_refused(lab):
     ],
 )
 def test_a_wrong_list_is_one_line(text, why, tmp_path):
-    """The message names the mistake in the file of users, and nothing is served."""
+    """An error in the file of users is one line that names it, and nothing is served."""
     for name in ("one", "two", "three", "grades", "shop"):
         (tmp_path / name).mkdir()
     (tmp_path / "users.toml").write_text(text, encoding="utf-8")
@@ -414,7 +428,7 @@ def test_a_wrong_list_is_one_line(text, why, tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_secret_that_everybody_may_read_is_none(tmp_path):
-    """Only the desk may read the file of users; a file like that is accepted."""
+    """The file of users is refused if others can read it."""
     path = write_users(tmp_path, '[[users]]\nname = "s1"\nrole = "student"\n')
     assert read_users(path)[0].site == "https://lab.example.edu"
     path.chmod(0o644)
@@ -424,7 +438,7 @@ def test_a_secret_that_everybody_may_read_is_none(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_list_that_everybody_may_change_is_none(tmp_path):
-    """Neither the file nor its folder may be writable by others."""
+    """The file of users is refused if others can write it or its folder."""
     folder = tmp_path / "desk"
     folder.mkdir()
     path = write_users(folder, '[[users]]\nname = "s1"\nrole = "student"\n')
@@ -435,12 +449,12 @@ def test_a_list_that_everybody_may_change_is_none(tmp_path):
     folder.chmod(0o777)
     with pytest.raises(ConfigError, match=r"can replace users\.toml there"):
         read_users(path)
-    folder.chmod(0o1777)  # there, as in /tmp, a file is only its owner's to replace
+    folder.chmod(0o1777)  # as in /tmp, only its owner can replace a file there
     assert read_users(path)[0].header == "X-Remote-User"
 
 
 def test_a_stranger_s_clock_runs(server):
-    """A connection that sends no secret ends by itself."""
+    """A connection that sends no secret is closed after a time limit."""
     began = time.monotonic()
     with socket.create_connection(("127.0.0.1", urlsplit(server.url).port or 0)) as line:
         line.settimeout(PATIENCE)

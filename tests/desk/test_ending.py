@@ -1,4 +1,4 @@
-"""A desk reports what ended it, on stderr and in the log; leftovers are removed later."""
+"""A desk reports on stderr and in its log what ended it; its leftovers are removed later."""
 
 import os
 import signal
@@ -18,7 +18,7 @@ from tests.helpers.waiting import PATIENCE, started
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signals")
 
-# A desk whose threads are interrupted on request: by an exception at any moment.
+# A desk whose threads can be interrupted by an exception at any moment.
 DESK = """
 import ctypes, os, sys, threading
 from pipeline.cli import main
@@ -41,9 +41,9 @@ main()
 
 @contextmanager
 def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, str, Callable]]:
-    """Run a desk.
+    """Start a desk.
 
-    Yield it, its address, and a function that returns its other lines and the log.
+    Yield the desk, its address, and a function that returns its further lines and its log.
     """
     log = tmp_path / "state" / "cartlab" / "desk.log"
     environment = {**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")}
@@ -55,7 +55,7 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
 
         def ended() -> tuple[int, str, str]:
             assert desk.stderr is not None
-            said = desk.stderr.read()  # until the watching process has ended, too
+            said = desk.stderr.read()  # until the watching process has ended too
             kept = log.read_text(encoding="utf-8") if log.exists() else ""
             return desk.wait(PATIENCE), said, kept
 
@@ -64,7 +64,10 @@ def a_desk(tmp_path: Path, *options: str) -> Iterator[tuple[subprocess.Popen, st
 
 @pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
 def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
-    """On stderr and in the log, which also says when it began; neither holds the secret."""
+    """A signal that ends the desk is named on stderr and in the log; neither shows the secret.
+
+    The log also says when the desk started.
+    """
     with a_desk(tmp_path) as (desk, url, ended):
         desk.send_signal(getattr(signal, name))
         status, said, kept = ended()
@@ -83,9 +86,9 @@ def test_a_signal_that_ends_the_desk_is_named(name, tmp_path):
     ],
 )
 def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
-    """A watching process reports it.
+    """If a signal kills the desk at once, a watching process reports it.
 
-    After a crash in a library, with the lines that were running.
+    After a crash in a library, it also reports the lines of code that were running.
     """
     with a_desk(tmp_path) as (desk, _, ended):
         desk.send_signal(number)
@@ -107,7 +110,7 @@ def test_what_no_program_survives_is_told_all_the_same(number, told, tmp_path):
     ],
 )
 def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
-    """In the serving thread or the waiting one; the traceback is in the log."""
+    """If an exception or exit ends the desk, it is reported, with its traceback in the log."""
     with a_desk(tmp_path) as (desk, _, ended):
         assert desk.stdin is not None
         desk.stdin.write(f"{sent}\n")
@@ -122,8 +125,11 @@ def test_an_exception_or_an_exit_within_is_told(sent, status, told, tmp_path):
 
 
 def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_path):
-    """With nohup; the traceback is in the log, and pages are answered as before."""
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # which a child inherits
+    """A desk survives the end of its terminal and an exception in one of its other threads.
+
+    Its terminal is closed under nohup; the traceback is in the log.
+    """
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # the desk inherits this setting
     try:
         with a_desk(tmp_path) as (desk, url, ended):
             desk.send_signal(signal.SIGHUP)
@@ -144,7 +150,10 @@ def test_a_desk_outlives_its_terminal_and_an_exception_in_another_thread(tmp_pat
 
 
 def test_what_a_killed_desk_left_goes_with_the_next_start(tmp_path, monkeypatch):
-    """Folders of running desks stay, and so do folders that no desk made."""
+    """What a killed desk left is removed when the next one starts.
+
+    Folders of running desks, and folders that no desk made, stay.
+    """
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
         "import sys, tempfile; tempfile.tempdir = sys.argv[1]\n"

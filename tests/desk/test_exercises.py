@@ -1,4 +1,4 @@
-"""The instructor's pages through plain forms: exercises, their pictures, solutions, rubrics."""
+"""The instructor's pages work through plain forms: exercises, pictures, solutions, rubrics."""
 
 import json
 import re
@@ -23,7 +23,7 @@ FRICTION = {"effect": "coulomb_friction", "coulomb_friction.place": "2"}
 
 @pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
-    """A visitor at a desk that draws and makes everything in another process."""
+    """Return a visitor at a desk that draws and writes everything in another process."""
     with DeskServer() as server:
         yield Visitor.of(server.url)
 
@@ -36,7 +36,7 @@ def shown(visitor: Visitor, **sent: str) -> str:
 
 
 def wait_for(visitor: Visitor, address: str) -> str:
-    """Return the page once the long work is over."""
+    """Return the page after the long task has ended."""
     until(lambda: 'http-equiv="refresh"' not in visitor.get(address).text)
     return visitor.get(address).text
 
@@ -45,7 +45,7 @@ def wait_for(visitor: Visitor, address: str) -> str:
 
 
 def test_every_effect_has_its_sizes_and_slides_about_them():
-    """On each preset the form's values make a valid `--hide` for `simulate`."""
+    """On each preset, the form's values for every effect are valid for `simulate --hide`."""
     for preset, chain in PRESETS.items():
         for effect in CATALOGUE:
             if chain.n < effect.fewest_carts or (effect.between_carts and chain.n < 2):
@@ -60,7 +60,7 @@ def test_every_effect_has_its_sizes_and_slides_about_them():
 
 
 def test_a_slider_counts_when_moved_and_a_number_when_typed():
-    """The slider gives a tenth of the usual size; a typed number moves it; else the usual size."""
+    """A size typed as a number counts, else the slider counts if it was moved."""
 
     def force(preset: str, **size: str) -> dict[str, str]:
         chosen = [{"key": "coulomb_friction", "place": "1", "sizes": {"force": size}}]
@@ -80,9 +80,9 @@ def test_a_slider_counts_when_moved_and_a_number_when_typed():
 
 
 def test_a_class_is_what_simulate_writes(visitor, tmp_path):
-    """Two folders, with seeds counting up, have the bytes of the command.
+    """A class of two folders made by the form has the same bytes as with `cartlab simulate`.
 
-    The hidden effect is in none.
+    No folder names the hidden effect.
     """
     page = shown(visitor, preset="throne-1dof", effect="coulomb_friction")
     (told,) = re.findall(r"<li>(coulomb_friction on cart 1.*?)</li>", page)
@@ -117,11 +117,11 @@ def test_a_class_is_what_simulate_writes(visitor, tmp_path):
         assert b"friction" not in made
     assert force[1] in told
     again = visitor.post("/exercises/make", out=str(out), folders="1", seed="0")
-    assert again.status == 422  # it is not empty
+    assert again.status == 422  # the folder is not empty
 
 
 def test_an_own_chain_and_what_is_wrong_with_it(visitor):
-    """Its numbers make a bench; mistakes are named in the program's words, and nothing is drawn."""
+    """A custom chain makes a bench; an error in it is named, and nothing is drawn."""
     chain = {"preset": "", "m": "2e-4 3e-4", "c": "5e-4, 5e-4", "k": "0 0.1 0.05"}
     page = shown(visitor, **chain, effect="input_delay")
     assert "input_delay: delay" in page
@@ -145,7 +145,7 @@ def test_a_picture_is_inert(visitor):
 
 
 def test_a_solution_is_what_the_command_writes(tmp_path):
-    """Made in the folder, shown on its page, with the expected values as JSON."""
+    """The desk makes the same solution as the command, with the expected values as JSON."""
     folder = a_submission(tmp_path / "reference")
     with DeskServer(folder=folder) as server:
         visitor = Visitor.of(server.url)
@@ -159,7 +159,7 @@ def test_a_solution_is_what_the_command_writes(tmp_path):
 
 @pytest.mark.parametrize("folders", ["00000000000199999", "0" * 11 + "1" * 5000, "0", "-1", "²"])
 def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
-    """Not only its first digits; a number above the limit begins nothing."""
+    """A number of folders with other characters in it, or above the limit, is refused."""
     out = tmp_path / "class"
     sent = {"preset": "throne-1dof", "out": str(out), "seed": "0", "folders": folders}
     assert visitor.post("/exercises/make", **sent).status == 422
@@ -168,7 +168,7 @@ def test_a_number_of_folders_is_read_whole(visitor, tmp_path, folders):
 
 @pytest.mark.parametrize("typed", ["~nosuch/x", "", "a\x00b", "a" * 300, "a/" * 5000])
 def test_a_place_that_is_none_is_said(visitor, typed):
-    """In whichever form it is typed; `~` of an unknown user is not a fault of the desk."""
+    """A path that cannot be is refused in every form, for example `~` of an unknown user."""
     sent = {"preset": "throne-1dof", "folders": "1", "seed": "0"}
     assert visitor.post("/open", folder=typed).status == 422
     assert visitor.post("/exercises/make", out=typed, **sent).status == 422

@@ -1,4 +1,4 @@
-"""A student's own feedback through plain forms: who reads, who asks, and how TAs answer."""
+"""A student reads their own feedback through plain forms and asks; TAs answer."""
 
 import re
 from html import unescape
@@ -61,7 +61,7 @@ HOSTILE = (
 
 @pytest.fixture
 def lab(tmp_path, request):
-    """A graded class, not released; the visitors, by name."""
+    """Start a desk with a graded class that is not released; return visitors by name."""
     write_class(tmp_path / "grades", anonymous=getattr(request, "param", False))
     a_submission(tmp_path / "five")
     with DeskServer(users=write_users(tmp_path, USERS)) as server:
@@ -71,14 +71,14 @@ def lab(tmp_path, request):
 
 @pytest.fixture
 def released(lab):
-    """The same, released."""
+    """Return the same with the class released."""
     assert lab("prof").post(ROOM + "release", do="release").status == 303
     return lab
 
 
 @pytest.fixture
 def book(tmp_path, lab):
-    """Its gradebook."""
+    """Return the class's gradebook."""
     with RequestBook(tmp_path / "grades") as book:
         yield book
 
@@ -99,7 +99,7 @@ def fields(answer: Answer, at: int = 0) -> dict[str, str]:
 
 
 def test_students_see_nothing_before_the_release(lab):
-    """The instructor releases feedback, a TA cannot; the instructor can hide it again."""
+    """Students see no feedback before the release; only an instructor can release or hide it."""
     student = lab("s4")
     for path in (HERE, HERE + "whole"):
         assert "points" not in student.get(path).text
@@ -119,7 +119,7 @@ def test_students_see_nothing_before_the_release(lab):
 
 
 def test_of_another_s_feedback_there_is_no_address(released):
-    """Not by number, path or role; nor a form for it."""
+    """A student cannot reach another's feedback by number, path or role, nor ask about it."""
     student = released("s4")
     assert student.get("/").headers["location"] == HERE
     assert "team-04" in student.get(HERE).text
@@ -138,11 +138,11 @@ def test_of_another_s_feedback_there_is_no_address(released):
 
 
 def test_the_grade_is_the_one_that_the_list_names(released):
-    """By exact name in the class that the list names; nothing about the server is shown."""
+    """A student sees the grade that the list names, by exact name, and nothing about the server."""
     six = released("s6")
     assert "team-06" in six.get(HERE).text
     assert "Your feedback is not published yet." in six.get("/feedback/1/").text
-    wrong = six.get("/feedback/2/")  # an author's name is not the submission's
+    wrong = six.get("/feedback/2/")  # the name in the list is an author's, not the submission's
     assert (wrong.status, "your grade cannot be read at the moment" in wrong.text) == (422, True)
     assert [f'href="/feedback/{n}/"' in six.get("/").text for n in range(3)] == [True] * 3
     home = released("s5").get("/").text
@@ -167,7 +167,7 @@ def test_the_grade_is_the_one_that_the_list_names(released):
     ],
 )
 def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
-    """Before anything is served."""
+    """A wrong grade in the file of users is an error of one line before anything is served."""
     (tmp_path / "g").mkdir()
     path = write_users(tmp_path, f'[[users]]\nname = "s"\n{users}\n')
     with pytest.raises(ConfigError, match=why):
@@ -178,7 +178,10 @@ def test_a_wrong_grade_on_the_list_is_one_line(users, why, tmp_path):
 
 
 def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
-    """Queue, its count on every page, an answer with points; both sides see every step."""
+    """A student's request appears in the TA's queue; the answer and its points reach the student.
+
+    Both see every step, and each page of the TA shows the number of requests.
+    """
     student, ta = released("s4"), released("Ada")
     assert 'href="/grades/0/again">0' not in ta.get(ROOM).text
     assert ask(student).status == 303
@@ -188,7 +191,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
     queue = ta.get(QUEUE)
     assert "see page 3" in queue.text
     assert "s4 asked" in queue.text
-    assert "ω₁ is off." in queue.text  # what is asked about
+    assert "ω₁ is off." in queue.text  # the criterion that was asked about
     assert "0.85 of 1 point</h3>" in queue.text
     assert f"{ROOM}team?of=team-04&criterion=laws#chosen" in unescape(queue.text)
     sent = fields(queue)
@@ -211,7 +214,7 @@ def test_a_request_goes_from_the_student_to_the_ta_and_back(released, book):
 
 
 def test_what_cannot_be_is_said_beside_the_field(released, book):
-    """The typed text stays, and nothing is written."""
+    """A request or answer that is not allowed gets a message at its field; the typed text stays."""
     student, ta = released("s4"), released("Ada")
     long = "x" * (MOST_LETTERS + 1)
     refused = ask(student, why=long)
@@ -240,7 +243,7 @@ def test_what_cannot_be_is_said_beside_the_field(released, book):
 
 
 def test_few_requests_wait_at_once(released):
-    """The next one is refused beside its own field."""
+    """A request beyond the limit of open ones is refused at its own field."""
     criteria = [criterion.id for criterion in two_cart_rubric().criteria]
     for criterion in criteria[:MOST_OPEN]:
         assert ask(released("s4"), criterion).status == 303
@@ -250,7 +253,7 @@ def test_few_requests_wait_at_once(released):
 
 
 def test_the_second_of_two_answers_sees_both(released, book):
-    """Nothing of the second is written; the first answer is shown beside it."""
+    """If two TAs answer, the second is refused and sees the first answer beside their own."""
     ask(released("s4"))
     seen = {name: fields(released(name).get(QUEUE)) for name in ("Ada", "Bob")}
     first = {"points": "0.5", "text": "ada's words"}
@@ -265,7 +268,7 @@ def test_the_second_of_two_answers_sees_both(released, book):
 
 
 def test_hostile_words_are_words(released):
-    """Markup, templates and control characters, on every page that shows a reason or an answer."""
+    """Markup, templates and control characters in a request or answer appear as plain text."""
     student, ta = released("s4"), released("Ada")
     assert ask(student, why=HOSTILE).status == 303
     assert ask(student, "pieces", why="\u202e" * 40 + SECRET).status == 303
@@ -287,7 +290,7 @@ def test_hostile_words_are_words(released):
 
 @pytest.mark.parametrize("lab", [True], indirect=True)
 def test_an_anonymous_class_has_anonymous_requests(released, book):
-    """No page of a TA names the student; the student reads the answer all the same."""
+    """In an anonymous class no page of a TA names the student, who still gets the answer."""
     student, ta = released("s5"), released("Ada")
     assert "do not write your name" in student.get(HERE).text
     assert ask(student, why="I am S5 of team-05, see page 3").status == 303
@@ -310,7 +313,7 @@ def test_an_anonymous_class_has_anonymous_requests(released, book):
 
 
 def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path):
-    """Neither its place nor the reason is shown."""
+    """If the gradebook cannot be read, the student's page shows neither its path nor the cause."""
     (tmp_path / "grades").rename(tmp_path / "elsewhere")
     for answer in (released("s4").get(HERE), ask(released("s4"))):
         assert answer.status == 422
@@ -321,7 +324,10 @@ def test_a_gradebook_that_is_gone_says_nothing_of_the_server(released, tmp_path)
 
 @pytest.mark.parametrize("by_class", [False, True])
 def test_who_is_to_find_the_numbers_reads_none(tmp_path, by_class):
-    """Points, outcomes and names of flags; their own rubric decides, else the class's."""
+    """A student who must find the numbers sees points, outcomes and flags, but no numbers.
+
+    The student's own rubric decides this, else the class's.
+    """
     write_class(tmp_path / "grades")
     a_submission(tmp_path / "five")
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The form of `submission.toml`: typed values come back, and nothing else in the file changes."""
+"""The form of `submission.toml` writes what was typed and changes nothing else in the file."""
 
 import tomllib
 from decimal import Decimal
@@ -26,7 +26,7 @@ WHOLE = (EXAMPLES / "two-cart" / "submission.toml").read_text(encoding="utf-8")
 
 
 def fields(text: str) -> dict[str, Field]:
-    """Return every field of a file's form, by path."""
+    """Return all fields of a file's form by path."""
     document = read_document(text)
     loop = [i for i, e in enumerate(document.get("experiments", [])) if e["kind"] == "closed_loop"]
     of_loop = fill_experiment(document, loop[0]) if loop else ()
@@ -35,7 +35,7 @@ def fields(text: str) -> dict[str, Field]:
 
 
 def changed(text: str, **values: str) -> str:
-    """Return a file after these fields were typed."""
+    """Return the file after these fields were typed."""
     document = tomlkit.parse(text)
     write_fields(document, find_changes(fields(text).values(), values, lambda path: []))
     return tomlkit.dumps(document)
@@ -68,7 +68,7 @@ def test_what_was_typed_stands_in_the_file(initial, final, title):
 
 
 def test_every_kind_of_field_goes_there_and_back():
-    """People, springs, units, columns, matrices, a controller: typed, read again, still valid."""
+    """Each kind of field is written, read again and still valid."""
     given = {
         "authors": "s1, Ann\ns2", "system.position.per_count": "0.00227",
         "system.columns": "x1 = Encoder 1 Pos\ntime = 2", "design.method": "poles",
@@ -84,7 +84,7 @@ def test_every_kind_of_field_goes_there_and_back():
         assert fields(new)[path].value.replace(",", "").split() == (
             value.strip("[]").replace(",", "").split()
         ), path
-    with pytest.raises(SubmissionError, match="gains"):  # those of the state feedback are there
+    with pytest.raises(SubmissionError, match="gains"):  # the gains of the state feedback are there
         parse_submission(new, folder=EXAMPLES / "two-cart")
     gone = changed(new, **{loop.replace("type", key): "" for key in ("gains", "prefilter")})
     submission = parse_submission(gone, folder=EXAMPLES / "two-cart")
@@ -113,7 +113,7 @@ def test_every_kind_of_field_goes_there_and_back():
     ],
 )
 def test_a_row_has_the_fields_of_its_kind_only(table, keys):
-    """And of its controller; others only where the file states them."""
+    """A row has only the fields of its kind and controller, and those that the file states."""
     shown = fill_experiment(read_document(f"[[experiments]]\n{table}\n"), 0)
     found = {field.path.removeprefix("experiments.0.") for field in shown}
     always = {"kind", "carts", "window", "note", "columns", "sample_rate"}
@@ -121,7 +121,7 @@ def test_a_row_has_the_fields_of_its_kind_only(table, keys):
 
 
 def test_comments_outlive_every_change(tmp_path):
-    """The commented file that `cartlab new` writes keeps them all."""
+    """All comments of the file that `cartlab new` writes survive every change."""
     new_submission(tmp_path / "team", carts=2)
     text = (tmp_path / "team" / "submission.toml").read_text(encoding="utf-8")
     values = {"title": "x", "system.position.unit": "cm", "system.position.per_count": "0.1",
@@ -142,7 +142,7 @@ def test_comments_outlive_every_change(tmp_path):
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
-    """In the words of the file's own check, and nowhere else."""
+    """An error appears at its field, in the words of the file's own check, and nowhere else."""
     now = [Field(path=path, label="", kind=fields(WHOLE)[path].kind, value=value)]
     document = tomlkit.parse(WHOLE)
     write_fields(document, now)
@@ -154,7 +154,7 @@ def test_what_is_wrong_is_said_at_its_field(path, value, wrong):
 
 
 def test_numbers_are_asked_for_by_their_symbols():
-    """As in the tables of the lab, not as in a program."""
+    """A field for a number is labelled with its symbol as in the lab's tables."""
     (claims,) = [g for g in fill_form({"system": {"carts": 2}}) if g.title == "Your numbers"]
     labels = {field.path: field.label for field in claims.fields}
     assert labels["reported.initial.zeta_1"] == "ζ₁ initial"

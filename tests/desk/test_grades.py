@@ -1,4 +1,4 @@
-"""The TA's pages through plain forms: the class, a team, concurrent changes, import, export."""
+"""The TA's pages work through plain forms: class, team, concurrent changes, import, export."""
 
 import io
 import re
@@ -32,13 +32,13 @@ ROOM = "/grades/0/"
 
 @pytest.fixture
 def grades(tmp_path):
-    """The output of a grading."""
+    """Write the output of a grading."""
     return write_class(tmp_path / "grades")
 
 
 @pytest.fixture
 def ta(grades):
-    """A TA at this computer."""
+    """Return a TA at this computer."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert visitor.post("/open", folder=str(grades)).headers["location"] == ROOM
@@ -58,7 +58,7 @@ def at(team: str, **more: str) -> str:
 
 
 def version(answer: Answer, criterion: str) -> str:
-    """Return the version that a change of a criterion on this page rests on."""
+    """Return the version of a criterion that this page shows."""
     found = re.search(rf'value="{criterion}"><input type="hidden" name="seen" value="(.*?)"',
                       answer.text)  # fmt: skip
     assert found
@@ -84,7 +84,7 @@ def upload(who: Visitor, path: str, name: str, content: str, **fields: str) -> A
 
 
 def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
-    """Each filter agrees with the gradebook; several filters narrow the list."""
+    """Each filter lists the teams that the gradebook gives; several filters narrow the list."""
     with Gradebook(grades) as book:
         entries = {entry.submission: entry for entry in book.entries()}
     ta.post(at("team-03"), do="accept")
@@ -103,7 +103,7 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
         "state=hand": {"team-02"},
         "seen=yes": {"team-03"},
         "seen=no": set(entries) - {"team-03"},
-        "lost=laws": lost,  # of who was graded
+        "lost=laws": lost,  # of those who were graded
         "lost=laws&flag=shared_data&seen=no": {"team-02"} & lost,
         "q=S4": {"team-05"},
         "q=ünal": {"Ünal 学生 & co"},
@@ -117,7 +117,7 @@ def test_the_class_is_filtered_by_what_a_team_has(ta, grades):
 
 
 def test_the_class_says_who_shares_recordings(ta):
-    """The number of pairs at the top leads to them; each is described in words."""
+    """The class page counts the pairs that share recordings, links to them and describes each."""
     page = ta.get(ROOM).text
     line = re.search(r'href="[^"]*\?flag=shared_data#class">(.*?)</a>.*?count">(\d+)<', page)
     assert line
@@ -127,7 +127,7 @@ def test_the_class_says_who_shares_recordings(ta):
 
 
 def test_a_large_class_comes_a_page_at_a_time(tmp_path):
-    """Every team is on exactly one page."""
+    """In a class of several pages, every team is on exactly one page."""
     with Gradebook(tmp_path, assignment="lab", create=True) as book:
         outcomes = [make_outcome(make_grade(f"t{n:03d}")) for n in range(120)]
         for outcome in outcomes:
@@ -150,7 +150,7 @@ def _batch(outcomes):
 
 
 def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
-    """Histogram, class page and feedback come from the gradebook, not from the folder."""
+    """Histogram, class page and feedback are drawn from the gradebook as it is now."""
     before = ta.get(ROOM + "class.html").text
     picture = ta.get(ROOM + "distribution.svg")
     assert picture.headers["content-type"].startswith("image/svg+xml")
@@ -169,7 +169,10 @@ def test_what_is_drawn_is_of_the_class_as_it_is_now(ta, grades):
 
 
 def test_a_team_has_its_numbers_beside_ours(ta):
-    """Reported and recomputed, the flag's evidence, the figure; hostile text is only text."""
+    """A team's page shows reported and recomputed numbers, the flag's evidence and the figure.
+
+    Hostile text appears as plain text.
+    """
     page = ta.get(at("team-01")).text
     assert "3.12" in page
     assert "19.6" in page
@@ -189,7 +192,7 @@ def test_a_team_has_its_numbers_beside_ours(ta):
 
 
 def test_a_record_stands_beside_its_criterion(tmp_path):
-    """The figure shows the number on its record; other records are listed apart."""
+    """Each criterion shows the recording of its number; other recordings are listed apart."""
     names = ("record-K_1", "record-omega_2-zeta_2", "response-1", "other")
     drawn = tuple((f"{n}.svg", f"<svg><title>{n}</title></svg>") for n in names)
     grade = make_grade("team", share=0.5)
@@ -221,7 +224,10 @@ def test_a_record_stands_beside_its_criterion(tmp_path):
 
 
 def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
-    """Of two responses the one of its cart; the other is one click away, without scripts."""
+    """If a criterion has two figures, that of the number furthest off is shown first.
+
+    The other one is one click away, without scripts.
+    """
     drawn = tuple((f"response-{n}.svg", f"<svg><title>cart {n}</title></svg>") for n in (1, 2))
     grade = make_grade("team", share=0.5)
     pair = {"found": {"K_1": 25.0, "K_2": 8.0}, "expected": {"K_1": 24.0, "K_2": 16.0}}
@@ -244,7 +250,10 @@ def test_the_record_of_the_number_most_off_is_shown_first(tmp_path):
 
 
 def test_what_lost_points_comes_first_and_is_shown(ta):
-    """The largest loss first; criteria with all points take one line each; any can be chosen."""
+    """Criteria are listed by points lost; those with all points take one line each.
+
+    Any criterion can be chosen.
+    """
     with_all = ta.get(at("a-name-without-end-" * 5)).text
     titles = {asked.id: asked.title for asked in two_cart_rubric().criteria}
     assert "To look at" in with_all
@@ -256,7 +265,7 @@ def test_what_lost_points_comes_first_and_is_shown(ta):
 
     passed = listed_in("passed", ta.get(at("team-01")).text)
     doubts = listed_in("doubts", ta.get(at("team-01")).text)
-    assert doubts == ["data", "final-gains"]  # one has a remark, one was changed by hand
+    assert doubts == ["data", "final-gains"]  # one has a flag, one was changed by hand
     assert {*passed, *doubts} == set(titles)
     page = ta.get(at("team-06")).text
     order = listed_in("doubts", page)
@@ -284,19 +293,19 @@ def test_what_lost_points_comes_first_and_is_shown(ta):
     ],
 )
 def test_points_come_in_steps_of_the_rubric(out_of, step, steps):
-    """At most as many steps as there are keys; else quarters, rounded to the rubric's step."""
+    """The keys offer points in the rubric's steps, or in rounded quarters if there are too many."""
     assert point_steps(out_of, step=step) == steps
 
 
 def test_points_are_changed_as_the_command_does(ta, grades):
-    """With a reason and a name, and with undo; the history lists all of it."""
+    """Points can be changed with a reason and undone, and the history lists every change."""
     assert change(ta, "team-01", points="0,5", why="a clear plot").status == 303
     with Gradebook(grades) as book:
         given = book.entry("team-01").overrides["laws"]
         assert (given.points, given.why, given.by) == (0.5, "a clear plot", "Ada")
     page = ta.get(at("team-01"))
     assert "a clear plot" in page.text
-    for expected in ({}, {"laws": 0.5}):  # undone, and that undone
+    for expected in ({}, {"laws": 0.5}):  # the undone change, and the undo
         seen = version(ta.get(at("team-01", criterion="laws")), "laws")
         ta.post(at("team-01"), do="undo", criterion="laws", seen=seen)
         with Gradebook(grades) as book:
@@ -314,7 +323,7 @@ def test_points_are_changed_as_the_command_does(ta, grades):
      {"points": "nan", "why": "x"}, {"points": "many", "why": "x"}],
 )  # fmt: skip
 def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
-    """Nothing is written, and the typed text stays."""
+    """If points are not allowed, a message appears at their field and nothing is written."""
     answer = change(ta, "team-01", **fields)
     assert answer.status == 422
     assert f'value="{fields["points"]}"' in answer.text
@@ -324,7 +333,7 @@ def test_what_cannot_be_is_said_beside_the_field(ta, grades, fields):
 
 
 def test_forged_forms_change_nothing(ta, grades):
-    """Another button, another criterion, no version."""
+    """A form with an unknown button, another criterion or no version changes nothing."""
     seen = version(ta.get(at("team-01", criterion="laws")), "laws")
     for form in ({"do": "drop"}, {"do": "change", "criterion": "x", "seen": seen, "points": "1"},
                  {"do": "change", "criterion": "laws", "points": "1", "why": "x"},
@@ -335,7 +344,10 @@ def test_forged_forms_change_nothing(ta, grades):
 
 
 def test_accept_goes_on_to_the_next_of_the_filter(ta):
-    """Through all teams that are not reviewed, then back to the class; a mark can be taken back."""
+    """Accepting a team leads to the next unreviewed one of the filter, and at last to the class.
+
+    The mark can be removed.
+    """
     query = {"flag": "hz_for_rad_s", "seen": "no"}
     expected = names(ta.get(f"{ROOM}?{urlencode(query)}"))
     address, visited = at(expected[0], **query), []
@@ -352,7 +364,7 @@ def test_accept_goes_on_to_the_next_of_the_filter(ta):
 
 
 def test_reasons_are_there_to_be_used_again(ta):
-    """Those of the same criterion, the most common first."""
+    """Reasons given before for the same criterion are offered, the most common first."""
     for team, why in (("team-05", "b"), ("team-06", "a"), ("team-07", "b")):
         change(ta, team, points="1", why=why)
     page = ta.get(at("team-08", criterion="laws")).text
@@ -366,7 +378,7 @@ def test_reasons_are_there_to_be_used_again(ta):
 
 @pytest.fixture(scope="module")
 def database():
-    """A PostgreSQL server with a class in it."""
+    """Start a PostgreSQL server with a class in it."""
     from tests.helpers import postgres
 
     if why := postgres.missing():
@@ -378,7 +390,7 @@ def database():
 
 @pytest.fixture
 def two_desks(database, tmp_path):
-    """Two desks of a lab on one database, with a visitor at each."""
+    """Start two desks on one database; return a visitor at each."""
     users = "".join(
         f'[[users]]\nname = "{name}"\nrole = "{role}"\ngradebooks = ["{database}"]\n'
         for name, role in (("Ada", "ta"), ("Bob", "ta"))
@@ -393,7 +405,7 @@ def two_desks(database, tmp_path):
 
 
 def test_two_change_the_same_and_one_is_told(two_desks, database):
-    """The second sees both versions and a message; nothing of theirs was written."""
+    """If two TAs change the same points, the second sees both versions and changes nothing."""
     ada, bob, eve = two_desks
     seen = version(bob.get(at("team-04", criterion="laws")), "laws")
     since = re.search(r"since=(\d+)", bob.get(at("team-04")).text)
@@ -412,14 +424,14 @@ def test_two_change_the_same_and_one_is_told(two_desks, database):
     assert again.headers["hx-reswap"] == "none"
     with Gradebook(database) as book:
         given = book.entry("team-04").overrides["laws"]
-        assert (given.points, given.by) == (1.0, "Ada")  # whom the proxy named
-    assert eve.get(ROOM).status == 403  # a student has no class, whatever a list says
+        assert (given.points, given.by) == (1.0, "Ada")  # the user whom the proxy named
+    assert eve.get(ROOM).status == 403  # a student has no class, whatever the list gives them
     assert eve.post(at("team-04"), do="accept").status == 403
     assert database not in ada.get(ROOM).text
 
 
 def test_of_changes_at_one_moment_one_counts(two_desks, database):
-    """In twenty rounds of two changes from the same page, one is accepted and one refused."""
+    """If two changes are sent from the same page at one moment, one counts and one is refused."""
     ada, bob, _ = two_desks
     for number in range(20):
         seen = version(ada.get(at("team-06", criterion="pieces")), "pieces")
@@ -441,7 +453,10 @@ def test_of_changes_at_one_moment_one_counts(two_desks, database):
 
 
 def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
-    """A wrong line is named and nothing is written; the same table again adds nothing."""
+    """A table of points is imported only if every line is right; a wrong line is named.
+
+    Importing the same table again adds nothing.
+    """
     head = "submission,criterion,points,why\n"
     good = 'team-01,laws,1,"clear, at last"\nÜnal 学生 & co,pieces,0.5,late\n'
     for wrong in ("team-99,laws,1,x\n", "team-01,nothing,1,x\n", "team-01,laws,77,x\n",
@@ -463,7 +478,7 @@ def test_a_table_is_taken_over_whole_or_not_at_all(ta, grades):
 
 @pytest.mark.parametrize("platform", ["canvas", "moodle", "gradescope"])
 def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
-    """Byte by byte; several files and messages come as a zip."""
+    """The desk's export equals that of the command byte by byte; several files come as a zip."""
     with Gradebook(grades) as book:
         done = export(book, platform, tmp_path / "out", title="Lab 3")
     answer = ta.post(ROOM + "export", lms=platform, title="Lab 3")
@@ -482,13 +497,16 @@ def test_the_export_is_that_of_the_command(ta, grades, tmp_path, platform):
 
 
 def test_a_roster_that_is_none_is_refused(ta):
-    """As by the command."""
+    """A table that is not the platform's roster is refused, as by the command."""
     assert upload(ta, ROOM + "export", "roster", "a,b\n1,2\n", lms="canvas").status == 422
     assert ta.post(ROOM + "export", lms="blackboard").status == 400
 
 
 def test_a_class_is_graded_again_from_the_desk(tmp_path):
-    """Unchanged submissions are skipped; points by hand stay; only an owner may name a folder."""
+    """The desk can grade a class again: unchanged submissions are skipped, points by hand stay.
+
+    Only the owner of the computer may type a folder.
+    """
     team = a_submission(tmp_path / "class" / "team-05", "one-cart")
     grades = tmp_path / "grades"
     grades.mkdir()
@@ -512,7 +530,7 @@ def test_a_class_is_graded_again_from_the_desk(tmp_path):
 
 
 def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
-    """On every linked page, in every address and every refusal; a table uses the stand-in names."""
+    """In an anonymous class no page, address or refusal shows a name; exports use pseudonyms."""
     grades = write_class(tmp_path / "g", anonymous=True)
     with Gradebook(grades) as book:
         entries = list(book.entries())
@@ -538,7 +556,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
                 link = unescape(link).split("#")[0]
                 if "feedback/" in link and not link.startswith("/"):
                     link = ROOM + link
-                # One team is enough for each criterion; a way through a list shows the same pages.
+                # One team per criterion is enough; going through a list shows the same pages.
                 more = link.partition("team?")[2]
                 if re.search("(flag|lost|seen)=", more) or (
                     re.search("(criterion|remark)=", more) and shown[1] not in link
@@ -557,7 +575,7 @@ def test_an_anonymous_class_names_nobody_anywhere(tmp_path):
 
 
 def test_the_lines_of_a_class_are_those_of_its_grades(grades):
-    """Read in part and completed from the cache, they are the same."""
+    """The lines of the class page equal those of its grades, also when read from the cache."""
     from pipeline.grading.gradebook.class_lines import Line
 
     with OpenBook(grades) as book:
@@ -574,7 +592,10 @@ def test_the_lines_of_a_class_are_those_of_its_grades(grades):
 
 
 def test_an_older_gradebook_gets_what_it_lacks(grades):
-    """Once; its content stays, and a gradebook opened before goes on working."""
+    """An older gradebook gets the tables that it lacks once, and keeps its content.
+
+    A gradebook opened before goes on working.
+    """
     with Gradebook(grades) as book:
         before = [(e.submission, e.grade) for e in book.entries()]
         with closing(sqlite3.connect(grades / FILE)) as raw:
@@ -594,7 +615,7 @@ def test_an_older_gradebook_gets_what_it_lacks(grades):
 
 
 def listed(answer: Answer) -> dict[str, list[str]]:
-    """Return the rows of the list: points now, after, total now, after."""
+    """Return the rows of the list: points now and after, total now and after."""
     assert answer.status in (200, 409), answer.text
     row = r'(?s)name="team" value="(.*?)".*?((?:<td class="r">.*?</td>\s*){4})'
     rows = re.findall(row, answer.text)
@@ -603,13 +624,13 @@ def listed(answer: Answer) -> dict[str, list[str]]:
 
 
 def together(**more: str) -> str:
-    """Return the address of the list of those with Hz who lost points of the laws."""
+    """Return the address of the list of teams with Hz that lost points for the laws."""
     about = {"criterion": "laws", "flag": "hz_for_rad_s", "lost": "laws"}
     return f"{ROOM}together?{urlencode(about | more)}"
 
 
 def sent(answer: Answer, *teams: str, **fields: str) -> str:
-    """Return the form of such a list with some teams ticked."""
+    """Return the form of the list with some teams ticked."""
     seen = {
         f"seen.{name}": unescape(version)
         for name, version in re.findall(r'name="seen\.(.*?)" value="(.*?)"', answer.text)
@@ -619,12 +640,15 @@ def sent(answer: Answer, *teams: str, **fields: str) -> str:
 
 
 def apply(who: Visitor, address: str, form: str) -> Answer:
-    """Send it."""
+    """Send the form."""
     return who.send(address, form.encode(), kind="application/x-www-form-urlencoded")
 
 
 def test_one_decision_for_several_is_looked_through_first(ta, grades):
-    """Points before and after; teams that are not ticked stay; signed, and undone at once."""
+    """One decision for several teams shows points before and after, and changes only ticked teams.
+
+    It is signed and can be undone as a whole.
+    """
     with Gradebook(grades) as book:
         before = {entry.submission: entry.grade for entry in book.entries()}
     page = ta.get(together(points="0.5"))
@@ -653,7 +677,7 @@ def test_one_decision_for_several_is_looked_through_first(ta, grades):
 
 
 def test_a_comment_changes_no_points(ta, grades):
-    """Points and outcome stay; the team reads the comment."""
+    """A comment for several teams changes no points, and the teams read it."""
     page = ta.get(together())
     names = list(listed(page))
     with Gradebook(grades) as book:
@@ -673,7 +697,7 @@ def test_a_comment_changes_no_points(ta, grades):
 
 
 def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
-    """No comment, invalid points, no team ticked, a team that changed meanwhile."""
+    """If a decision is not possible for one of the ticked teams, it changes no team."""
     page = ta.get(together())
     names = list(listed(page))
     for wrong, fields in (
@@ -689,12 +713,12 @@ def test_what_cannot_be_done_for_all_is_done_for_none(ta, grades):
     answer = apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))
     assert answer.status == 409
     assert answer.text.count("changed meanwhile") == 1
-    assert listed(answer)[names[1]][0] == "0"  # as it is now
+    assert listed(answer)[names[1]][0] == "0"  # the version as it is now
     with Gradebook(grades) as book:
         given = {name: book.entry(name).overrides for name in names}
         assert {name: own["laws"].why for name, own in given.items() if own} == {names[1]: "mine"}
     again = apply(ta, together(), sent(answer, *names, do="apply", points="0.5", why="one unit"))
-    assert again.status == 303  # looked through once more
+    assert again.status == 303  # looked at once more
 
 
 def test_what_was_decided_keeps_its_place_in_the_list(ta):
@@ -713,7 +737,7 @@ def test_what_was_decided_keeps_its_place_in_the_list(ta):
 
 
 def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
-    """Those that were graded; if a file has changed since, no link is offered."""
+    """A team's page links to the recordings that were graded, unless a file has changed since."""
     team = a_submission(tmp_path / "lab" / "team-1")
     rubric, out = RUBRICS / "throne-1dof.toml", tmp_path / "grades"
     cartlab_here("grade", tmp_path / "lab", "--rubric", rubric, "--out", out, "--jobs", 1,
@@ -733,7 +757,7 @@ def test_the_recordings_of_a_team_are_one_click_away(tmp_path):
 
 
 def test_only_a_decision_of_this_class_is_undone(ta, grades):
-    """Undo checks the stated moment, and refuses one of another class."""
+    """Undo needs the moment of a decision of this class."""
     change(ta, "team-01", points="0.5", why="alone")
     for moment in ("", "2026-01-01", "%"):
         assert ta.post(ROOM + "together", do="undo", set=moment).status == 404
@@ -742,7 +766,7 @@ def test_only_a_decision_of_this_class_is_undone(ta, grades):
 
 
 def test_to_undo_a_decision_leaves_what_came_after_it(ta, grades):
-    """Teams changed since then stay and are named; the class page lists each decision."""
+    """Undoing a decision keeps the points of teams that were changed after it, and names them."""
     page = ta.get(together())
     names = list(listed(page))
     apply(ta, together(), sent(page, *names, do="apply", points="0.5", why="one unit"))

@@ -1,4 +1,4 @@
-"""The first page, the line of rooms, and the list of folders to choose from."""
+"""The first page, the line of links to rooms, and the list of folders to choose from."""
 
 import re
 from html import unescape
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 @pytest.fixture
 def root(tmp_path, monkeypatch) -> Path:
-    """A desk's root folder: one folder of every kind, hidden ones, links."""
+    """Write a desk's root folder with one folder of each kind, hidden folders and links."""
     root, outside = tmp_path / "course", tmp_path / "outside"
     a_submission(root / "team")
     write_class(root / "grades")
@@ -36,13 +36,13 @@ def root(tmp_path, monkeypatch) -> Path:
 
 
 def links(page: str) -> list[str]:
-    """Return the names in the line of rooms."""
+    """Return the names in the line of links."""
     line = re.findall(r'<nav aria-label="Rooms">.*?</nav>', page, re.DOTALL)[0]
     return [unescape(name) for name in re.findall(r">([^<>]+)</a>", line)]
 
 
 def test_a_long_list_is_cut_after_it_is_sorted(root, monkeypatch):
-    """What is left off is at its end, in whatever order the disk has the folders."""
+    """A long list of folders is sorted before it is cut, whatever the disk's order."""
     monkeypatch.setattr("pipeline.desk.browse._LOOKED_AT", 5)
     (root / "long").mkdir()
     for n in (7, 2, 9, 4, 1, 8, 3, 6, 5):
@@ -54,7 +54,7 @@ def test_a_long_list_is_cut_after_it_is_sorted(root, monkeypatch):
 
 @pytest.mark.parametrize("instead", ["nothing", "a file", "a link to itself"])
 def test_a_lost_folder_is_named_on_its_page_and_breaks_no_other(tmp_path, instead):
-    """Deleted, moved or on a lost disk: one sentence says so, and what to do."""
+    """If an opened folder is gone, its page says so, and no other page fails."""
     team, graded = a_submission(tmp_path / "team"), tmp_path / "graded"
     write_class(graded)
     with DeskServer(folder=team) as server:
@@ -82,7 +82,10 @@ def test_a_lost_folder_is_named_on_its_page_and_breaks_no_other(tmp_path, instea
 
 
 def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
-    """Each folder once, with its kind; links that lead out or to hidden folders are left out."""
+    """Folders that can be opened are listed first, each once, with their kind.
+
+    Hidden folders, and links that lead out, are left out.
+    """
     found = {one.inside: one.kind for one in list_folders(root, "").found}
     assert found == {"grades": "grading", "team": "submission", "empty": "empty", "years": "folder"}
     assert list(found)[:2] == ["grades", "team"]
@@ -97,7 +100,7 @@ def test_what_can_be_opened_comes_first_and_nothing_hidden_is_listed(root):
      "nowhere", "years/../..", "a\x00b", "loop"],
 )  # fmt: skip
 def test_no_folder_outside_of_the_root_is_listed(root, inside):
-    """Neither a hidden folder nor a file; the desk answers with one sentence."""
+    """A folder outside the root, a hidden folder or a file is not listed; one sentence says so."""
     with pytest.raises(ConfigError):
         list_folders(root, inside)
     with DeskServer() as server:
@@ -106,7 +109,7 @@ def test_no_folder_outside_of_the_root_is_listed(root, inside):
 
 
 def test_a_large_folder_is_cut_and_says_so(root):
-    """The first ones are listed; the page says how to open another."""
+    """If a folder has too many entries, only the first are listed, and the page says so."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
     listed = list_folders(root, "years")
@@ -117,7 +120,7 @@ def test_a_large_folder_is_cut_and_says_so(root):
 
 
 def test_what_can_be_opened_is_never_cut_off(root):
-    """A submission whose name comes last is first in a long list."""
+    """A submission is listed first, even if its name would put it after the cut."""
     for number in range(MOST + 5):
         (root / "years" / f"team-{number:03d}").mkdir()
     (root / "years" / "zoe").mkdir()
@@ -126,13 +129,13 @@ def test_what_can_be_opened_is_never_cut_off(root):
 
 
 def test_the_whole_disk_is_no_root(monkeypatch):
-    """A desk started from an icon lists the home folder."""
+    """If the desk starts at the root of the disk, it lists the home folder instead."""
     monkeypatch.chdir(Path(Path.cwd().anchor))
     assert find_root() == Path.home()
 
 
 def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
-    """From the card to the page: report, bench, solution; a graded class opens as a class."""
+    """From a task on the first page, one choice of a folder leads to the page for that task."""
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         assert "Nothing is open yet." in visitor.get("/").text
@@ -155,7 +158,10 @@ def test_a_folder_is_chosen_for_what_one_wants_to_do(root):
 
 
 def test_the_line_of_rooms_stays_short(root):
-    """The folders opened last and the current one; its bench only while it is shown."""
+    """The line of links has only the current folder and those opened last.
+
+    A folder's bench is linked only while it is shown.
+    """
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
         for number in range(9):
@@ -164,11 +170,11 @@ def test_the_line_of_rooms_stays_short(root):
         assert links(visitor.get("/student/2/").text) == ["Desk", "t2", "Bench", "t6", "t7", "t8"]
         assert links(visitor.get("/solution/8/").text)[-3:] == ["t8", "Bench", "Solution"]
         assert links(visitor.get("/effects/").text)[-1] == "Effects"
-        assert unescape(visitor.get("/").text).count(">t0</a>") == 3  # each card lists all
+        assert unescape(visitor.get("/").text).count(">t0</a>") == 3  # the page lists them all
 
 
 def test_a_student_sees_nothing_of_the_instructor_s(root):
-    """No card, no link, no list of folders; the same holds for a TA."""
+    """Students and TAs see no task, link or list of folders that is for instructors."""
     users = """
     [[users]]
     name = "s"

@@ -1,4 +1,4 @@
-"""Hostile uploads reach nothing outside their folder and run nothing."""
+"""A hostile upload changes nothing outside its folder, and nothing in it is run."""
 
 import os
 import re
@@ -14,7 +14,7 @@ _OURS = re.compile(r"\.turn|data/[^/]+|submission\.toml|notes\.md|\.lock")
 
 
 def visit(tmp_path, *, every: int, drawn: int, seed: int) -> int:
-    """Upload every hostile submission into a folder of its own, open it; return how many."""
+    """Upload each hostile submission into a folder of its own and open it; return their number."""
     school, rooms = tmp_path / "school", tmp_path / "rooms"
     school.mkdir()
     good = {
@@ -57,17 +57,17 @@ def _is_plain(path) -> bool:
 
 
 def _quoted(name: str) -> str:
-    """Return a name as browsers send it in a form."""
+    """Return a name as a browser sends it in a form."""
     plain = name.encode("utf-8", "replace").decode()
     return plain.replace('"', "%22").replace("\r", "%0D").replace("\n", "%0A")
 
 
 def test_hostile_uploads_reach_nothing(tmp_path):
-    """All archives and folders of the hostile class, and some spoilt submissions."""
+    """A sample of hostile uploads, with some spoilt submissions, reaches nothing."""
     assert visit(tmp_path, every=12, drawn=6, seed=1) >= 50
 
 
 @pytest.mark.slow
 def test_two_hundred_hostile_uploads_reach_nothing(tmp_path):
-    """All of them, and as many random ones."""
+    """All hostile uploads, and a hundred spoilt submissions, reach nothing."""
     assert visit(tmp_path, every=1, drawn=100, seed=2) >= 200

@@ -1,4 +1,4 @@
-"""Work in separate processes: nobody waits for another's work, and results are reported."""
+"""Long work runs in separate processes, so that nobody waits for another's work."""
 
 import re
 import sys
@@ -20,14 +20,14 @@ HERE = "/student/0/"
 
 @pytest.fixture
 def jobs():
-    """The long tasks of a desk, ended after the test."""
+    """Return the long tasks of a desk, ended after the test."""
     jobs = Jobs()
     yield jobs
     jobs.close()
 
 
 def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
-    """Another task is done meanwhile, and requests for that folder do not use up all threads."""
+    """A slow task of one folder does not delay another, however many requests wait for it."""
     slow, workers = a_submission(tmp_path / "slow"), WorkerPool()
 
     def ask(task: str) -> threading.Thread:
@@ -54,7 +54,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_a_stop_waits_for_no_thread(tmp_path):
-    """If all threads are busy, a page waits but a Stop does not."""
+    """If all threads are busy, a Stop is still served at once."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         visitor, workers = Visitor.of(server.url), server._desk.workers
@@ -74,7 +74,7 @@ def test_a_stop_waits_for_no_thread(tmp_path):
 
 
 def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch):
-    """The desk says so, and can be closed without waiting for it."""
+    """If a job's process cannot be started, the desk says so and can be closed."""
     monkeypatch.setattr(sys, "executable", str(tmp_path / "nothing"))
     job = jobs.start("make_report", title="The report", place=tmp_path, folder=str(tmp_path))
     until(lambda: job.over)
@@ -82,7 +82,7 @@ def test_a_process_that_does_not_start_ends_its_job(tmp_path, jobs, monkeypatch)
 
 
 def test_a_fault_of_our_own_is_told(tmp_path, jobs):
-    """The message ends with the process's last lines, which help to report the fault."""
+    """If a task itself fails, the message ends with the process's last lines."""
     job = jobs.start("nonsense", title="Nonsense", place=tmp_path)
     until(lambda: job.over)
     assert job.state == "failed"
@@ -90,7 +90,7 @@ def test_a_fault_of_our_own_is_told(tmp_path, jobs):
 
 
 def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
-    """The same task again is the same job; another is refused, naming the one that runs."""
+    """In one folder only one task runs: the same one again is the same job, another is refused."""
     given = {"place": tmp_path, "folder": str(a_submission(tmp_path / "team"))}
     job = jobs.start("make_report", title="The report", **given)
     assert jobs.start("make_report", title="The report", **given) is job
@@ -102,10 +102,9 @@ def test_one_thing_at_a_time_in_a_folder(tmp_path, jobs):
 
 
 def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_path):
-    """Every later page shows it.
+    """Every later page shows a running job and its stage.
 
-    Stopped or killed, it leaves no half-written file, and the desk makes the report when asked
-    again.
+    A job that is stopped or killed leaves no half-written file and can be started again.
     """
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
@@ -117,7 +116,7 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
             return [p for p in psutil.Process().children() if p.pid not in before]
 
         assert visitor.post(HERE + "make-report").status == 303
-        assert visitor.post(HERE + "make-report").status == 303  # the same one
+        assert visitor.post(HERE + "make-report").status == 303  # this is the same job
         assert "data-events" in visitor.get(HERE).text
         until(workers)
         assert visitor.post(HERE + "stop").status == 303
@@ -128,7 +127,7 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
 
         visitor.post(HERE + "make-report")
         until(workers)
-        until(lambda: "starting" not in visitor.get(HERE).text)  # it has begun
+        until(lambda: "starting" not in visitor.get(HERE).text)  # until it has begun
         workers()[0].kill()
         until(lambda: "the process ended" in " ".join(wrongs(visitor.get(HERE).text)))
         assert not (folder / "report" / "report.html").exists()
@@ -142,9 +141,9 @@ def test_a_job_survives_a_reload_is_stopped_or_dies_and_tells_its_stages(tmp_pat
 
 
 def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
-    """The process that reads it dies.
+    """If a file makes the process that reads it die, only this file's row fails.
 
-    The other files are shown, and the next task has a new process.
+    The other files are shown, and the next task gets a new process.
     """
     with DeskServer(folder=tmp_path) as server:
         visitor = Visitor.of(server.url)
@@ -173,7 +172,7 @@ def test_a_file_that_ends_the_process_costs_its_own_row(tmp_path):
 
 
 def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
-    """The error is named with its kind; the same process does the next task."""
+    """If a task fails, the error's kind is named, and the same process does the next task."""
     workers = WorkerPool()
     with pytest.raises(Failed, match=r"cartlab itself failed \(TypeError: .*please report it"):
         workers.do("propose_recordings", folder=str(tmp_path), stock=True, nonsense=1)
@@ -188,7 +187,7 @@ def test_a_fault_costs_its_task_and_not_the_process(tmp_path):
 
 
 def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, monkeypatch):
-    """No page waits until another has started."""
+    """A process that has done its number of tasks is replaced before the next task arrives."""
     monkeypatch.setattr("pipeline.processes._TASKS_EACH", 1)
     workers = WorkerPool()
     assert workers.do("list_files", folder=str(tmp_path)) == []
@@ -197,7 +196,7 @@ def test_a_process_that_was_used_up_is_replaced_before_the_next_task(tmp_path, m
 
 
 def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
-    """All of them are started in the background."""
+    """A lab server starts all its processes before students ask."""
     workers = WorkerPool()
     workers.start()
     until(lambda: [hand.runs for hand in list(workers._free.queue)] == [True] * _HANDS)
@@ -213,7 +212,7 @@ def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
     ],
 )
 def test_who_dies_of_an_exception_got_no_signal(module, line):
-    """The exception is reported, although Python ends while a thread waits."""
+    """If a process ends by an exception, the exception is reported, even while a thread waits."""
     process = LineProcess(module)
     try:
         process.send(line)
@@ -226,7 +225,7 @@ def test_who_dies_of_an_exception_got_no_signal(module, line):
 
 
 def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
-    """A job that could not be started is over, whatever the cause."""
+    """If a job cannot be started, for whatever cause, it counts as over."""
 
     def no_more(module: str) -> LineProcess:
         raise MemoryError("no more")
@@ -240,7 +239,7 @@ def test_a_job_whose_thread_fails_is_over(jobs, monkeypatch, tmp_path):
 
 
 def test_who_serves_is_gone_and_so_is_the_work(tmp_path):
-    """A worker whose desk was killed ends by itself."""
+    """A worker process ends by itself if its desk was killed."""
     workers = WorkerPool()
     workers.do("list_files", folder=str(tmp_path))
     worker = workers._free.get()

@@ -6,7 +6,7 @@ from pipeline.desk.users import User
 
 
 def test_a_gradebook_that_cannot_be_reached_breaks_no_page(tmp_path, monkeypatch):
-    """If its network drive is gone, the link stays, without a count."""
+    """If a gradebook's network drive is gone, its link stays, without the number of requests."""
     books = Books()
 
     def gone(place):

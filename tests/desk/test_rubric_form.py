@@ -1,4 +1,4 @@
-"""The rubric through plain forms: the list, its numbers and text, the preview on a class."""
+"""A rubric is edited through plain forms: list, numbers, text, and preview on a class."""
 
 import json
 import re
@@ -23,21 +23,21 @@ ONE_CART = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="module")
 def visitor() -> Iterator[Visitor]:
-    """A visitor at a desk."""
+    """Return a visitor at a desk."""
     with DeskServer() as server:
         yield Visitor.of(server.url)
 
 
 @pytest.fixture
 def lab(tmp_path) -> Path:
-    """A rubric of an instructor."""
+    """Write a rubric of an instructor."""
     path = tmp_path / "lab.toml"
     path.write_text(ONE_CART, encoding="utf-8")
     return path
 
 
 def editor(visitor: Visitor, path: Path) -> Answer:
-    """Return the page of a rubric."""
+    """Return the page of the rubric."""
     page = visitor.get(f"/rubric/?{urlencode({'file': path})}")
     assert page.status == 200, page.text
     return page
@@ -57,7 +57,10 @@ def sent(page: Answer, path: Path, **changed: str) -> dict[str, str]:
 
 
 def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
-    """A new rubric starts from a shipped one; a mistake is shown at its line and not written."""
+    """A rubric is saved only if it is valid; otherwise the mistake is shown at its line.
+
+    A new rubric starts from a shipped one.
+    """
     path = tmp_path / "rubric.toml"
     page = visitor.get(f"/rubric/?{urlencode({'file': path, 'start': 'throne-2dof'})}")
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
@@ -78,7 +81,7 @@ def test_a_rubric_is_saved_only_when_valid(visitor, tmp_path):
 
 
 def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
-    """Both versions are shown; what is on disk stays."""
+    """If a rubric was changed on disk meanwhile, both versions are shown and nothing is written."""
     seen = editor(visitor, lab).value("seen")
     lab.write_text(f"# by another\n{ONE_CART}", encoding="utf-8")
     mine = f"# mine\n{ONE_CART}"
@@ -88,7 +91,7 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
     assert "# mine" in answer.text
     assert lab.read_text(encoding="utf-8").startswith("# by another")
     new = visitor.post("/rubric/save", file=str(lab), text=mine, seen="new")
-    assert new.status == 409  # started as a new file, which exists by now
+    assert new.status == 409  # it began as a new file, which now exists
 
 
 @pytest.mark.parametrize(
@@ -97,12 +100,12 @@ def test_a_rubric_that_was_changed_meanwhile_is_not_written_over(visitor, lab):
      "a" * 300 + ".toml"],
 )  # fmt: skip
 def test_a_rubric_lies_where_it_can(visitor, file):
-    """A bad name gives one clear sentence."""
+    """A bad file name for a rubric gets one clear sentence."""
     assert visitor.post("/rubric/save", file=file, text="x", seen="new").status == 422
 
 
 def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path):
-    """Even if the name has special characters of addresses."""
+    """A rubric is found even if its folder's name has special characters of addresses."""
     folder = tmp_path / "R+D & co #2 100%"
     folder.mkdir()
     path = folder / "rubric.toml"
@@ -112,7 +115,10 @@ def test_a_rubric_is_found_again_whatever_its_folder_is_called(visitor, tmp_path
 
 
 def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypatch):
-    """With title, carts and points; those of the folder can be opened; a free name is chosen."""
+    """The page lists every shipped rubric and those of the folder, each one click away.
+
+    A new rubric gets a free name.
+    """
     monkeypatch.chdir(tmp_path)
     (tmp_path / "rubric.toml").write_text(ONE_CART.replace("points", "pionts"), encoding="utf-8")
     (tmp_path / "other.toml").write_text("a = 1\n", encoding="utf-8")
@@ -129,7 +135,7 @@ def test_every_shipped_rubric_is_one_click_away(visitor, lab, tmp_path, monkeypa
 
 
 def test_a_workshop_shows_its_own_files_alone(tmp_path):
-    """Neither the files beside it nor those behind a link in it."""
+    """An instructor sees the workshop's own rubrics, but none that a link points to."""
     shop = tmp_path / "shop"
     for path in (shop / "deep" / "a.toml", shop / ".hidden" / "b.toml", tmp_path / "c.toml"):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -143,13 +149,13 @@ def test_a_workshop_shows_its_own_files_alone(tmp_path):
 
 
 def test_a_page_begins_with_what_the_rubric_is(visitor, lab):
-    """Its points, criteria and carts."""
+    """A rubric's page begins with its points, criteria and carts."""
     page = editor(visitor, lab).text
     assert '<p class="result">20 points in 13 criteria; fits submissions with 1 cart</p>' in page
 
 
 def test_late_work_at_half_is_one_number(visitor, lab):
-    """One line of the file changes; its neighbours and comments do not."""
+    """Changing one number in the form changes one line of the file."""
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"late.percent_per_day": "50"}))
     assert answer.status == 303
@@ -158,7 +164,7 @@ def test_late_work_at_half_is_one_number(visitor, lab):
 
 
 def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
-    """The typed text stays; a number from the form is inserted into it."""
+    """If both the form and the text are changed, the number is inserted into the typed text."""
     page = editor(visitor, lab)
     text = ONE_CART.replace("points are rounded to it", "quarters")
     fields = sent(page, lab, **{"criteria.pieces.points": "1,5", "text": text})
@@ -168,7 +174,7 @@ def test_the_form_and_the_text_may_both_be_changed(visitor, lab):
 
 
 def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
-    """Nothing is written, and the typed text is still there."""
+    """A wrong number is reported at its field and line; nothing is written, and the text stays."""
     page = editor(visitor, lab)
     answer = visitor.post("/rubric/save", **sent(page, lab, **{"criteria.pieces.points": "1.1"}))
     line = ONE_CART.split("\n").index("points = 1") + 1
@@ -182,7 +188,7 @@ def test_a_number_that_cannot_be_is_told_at_its_field_and_line(visitor, lab):
 
 
 def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
-    """While the text is wrong the form is hidden; its number is inserted once the text is right."""
+    """If the text is wrong, the form's changed number waits until the text is right."""
     page = editor(visitor, lab)
     wrong = ONE_CART.replace("version = 1", "version = one")
     fields = sent(page, lab, **{"late.percent_per_day": "50", "text": wrong})
@@ -195,7 +201,7 @@ def test_a_number_outlives_a_mistake_in_the_text(visitor, lab):
 
 @pytest.mark.parametrize("shown", ["", "no JSON", "[]", '{"criteria.none.points": "1"}', "7"])
 def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
-    """Fields that the page never showed change nothing."""
+    """A field that the page never showed changes nothing and is no fault of the desk."""
     seen = editor(visitor, lab).value("seen")
     fields = {"file": str(lab), "text": ONE_CART, "seen": seen, "shown": shown}
     answer = visitor.post("/rubric/check", **fields, **{"criteria.none.points": "2"})
@@ -207,7 +213,10 @@ def test_a_form_of_nobody_s_page_is_no_fault(visitor, lab, shown):
 
 
 def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
-    """Changed teams, the largest change first; then the rubric is saved and applied."""
+    """The preview shows each team's change, the largest first, before anything is written.
+
+    Then the rubric is saved and applied.
+    """
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -238,7 +247,7 @@ def test_a_preview_shows_each_team_before_anything_is_written(tmp_path, lab):
 
 
 def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
-    """Tolerances of the laws and required parts are not guessed from stored findings."""
+    """A change of the rubric that needs the recordings is named in the preview, not guessed."""
     write_class_of_two(tmp_path / "graded")
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -251,7 +260,7 @@ def test_a_preview_tells_what_needs_the_recordings(tmp_path, lab):
 
 
 def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
-    """The order of the teams reveals nothing either."""
+    """The preview of an anonymous class shows no name, and its order reveals none."""
     write_class_of_two(tmp_path / "graded", anonymous=True)
     with DeskServer() as server:
         visitor = Visitor.of(server.url)
@@ -264,7 +273,7 @@ def test_a_preview_of_a_class_without_names_shows_none(tmp_path, lab):
 
 
 def test_a_preview_is_of_a_class_that_is_open_and_a_rubric_that_is_valid(visitor, lab):
-    """Bad addresses get a message; a mistake in the rubric leads back to the editor."""
+    """A preview of a class that is not open is refused; a wrong rubric leads back to the editor."""
     page = editor(visitor, lab)
     for number in ("", "0", "-1", "²", "9" * 30):
         assert visitor.post("/rubric/preview", **sent(page, lab), **{"class": number}).status == 404

@@ -1,4 +1,4 @@
-"""The student's pages through plain forms: files, table, form, report, answers, zip, safety."""
+"""The student's pages work through plain forms: files, form, report, answers, zip, safety."""
 
 import io
 import json
@@ -59,7 +59,7 @@ def filled(tmp_path):
 
 @pytest.fixture(scope="module")
 def workers():
-    """The processes for short tasks, without a desk."""
+    """Return the processes for short tasks, without a desk."""
     workers = WorkerPool()
     yield workers
     workers.close()
@@ -84,7 +84,7 @@ def ask_for(folder: Path, *ids: str) -> tuple[str, ...]:
 
 
 def handed_in(visitor: Visitor) -> str:
-    """Press "Hand in", wait for the report; return the page that lists what will be submitted."""
+    """Press "Hand in", wait for the report; return the page that lists the zip's content."""
     answer = visitor.post(HERE + "hand-in")
     assert (answer.status, answer.headers["location"]) == (303, HERE + "hand-in")
     until(lambda: "data-events" not in visitor.get(HERE + "hand-in").text)
@@ -92,12 +92,12 @@ def handed_in(visitor: Visitor) -> str:
 
 
 def zipped(visitor: Visitor) -> zipfile.ZipFile:
-    """Return the zip."""
+    """Return the zip file's content."""
     return zipfile.ZipFile(io.BytesIO(visitor.get(HERE + "hand-in.zip").body))
 
 
 def test_from_an_empty_folder_to_the_zip(room):
-    """Without scripts: files become a submission, then a report, answers, and a zip."""
+    """Without scripts, uploaded files become a submission, then a report, answers and a zip."""
     visitor, folder = room
     assert "Begin with your files" in visitor.get(HERE).text
     assert visitor.upload(HERE + "files", some_files()).headers["location"] == HERE + "#files"
@@ -113,7 +113,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     submission = load_submission(folder)
     assert (submission.title, submission.system.springs) == ("One <cart>", (True, False))
     assert submission.reported is not None
-    assert str(submission.reported.final["K"]) == "28.90"  # digits as typed
+    assert str(submission.reported.final["K"]) == "28.90"  # digits are kept as typed
     assert "# Leave out anything you do not have." in (folder / NAME).read_text(encoding="utf-8")
 
     assert visitor.post(HERE + "make-report").status == 303
@@ -122,7 +122,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     report = visitor.get(HERE + "report/report.html")
     assert report.headers["content-security-policy"].startswith("sandbox allow-scripts;")
     assert "One &lt;cart&gt;" in report.text
-    assert "28.90" in report.text  # as typed, beside what the data say
+    assert "28.90" in report.text  # as typed, beside the recomputed value
     assert visitor.get(HERE + "report/report.pdf").body.startswith(b"%PDF")
 
     told = folder / "report" / "questions.json"
@@ -139,7 +139,7 @@ def test_from_an_empty_folder_to_the_zip(room):
     seen = visitor.get(HERE).value("seen")
     assert visitor.post(HERE + "save", seen=seen, **{"reported.final.K": "29.13"}).status == 303
     assert "The report is out of date" in visitor.get(HERE).text
-    assert "report/report.pdf" not in zipped(visitor).namelist()  # nobody submits a stale report
+    assert "report/report.pdf" not in zipped(visitor).namelist()  # no stale report is submitted
     assert "The report in the zip matches your current files and answers" in handed_in(visitor)
     assert "29.13" in visitor.get(HERE + "report/report.html").text
     packed = visitor.get(HERE + "hand-in.zip")
@@ -155,9 +155,9 @@ def test_from_an_empty_folder_to_the_zip(room):
 
 
 def test_what_is_wrong_stands_beside_its_field(filled):
-    """In the words of the file's own check.
+    """An error in the form appears beside its field, in the words of the file's own check.
 
-    The form keeps what was typed, the file is unchanged.
+    The form keeps what was typed, and the file is unchanged.
     """
     visitor, folder = filled
     before = (folder / NAME).read_bytes()
@@ -177,7 +177,7 @@ def test_what_is_wrong_stands_beside_its_field(filled):
 
 
 def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
-    """Fractional positions are not counts; once the unit is stated, the question is gone."""
+    """If a unit is in doubt, the form asks at its field until the unit is stated."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)
@@ -193,7 +193,10 @@ def test_a_unit_in_doubt_is_asked_about_beside_its_field(room):
 
 
 def test_a_row_is_corrected_in_place(filled):
-    """Kind, carts and window of one file; its table can be removed, and the file stays."""
+    """Kind, carts and window of a recording can be corrected in its row.
+
+    Its table can be removed while the file stays.
+    """
     visitor, folder = filled
     page = visitor.get(HERE)
     index = next(i for i, e in enumerate(load_submission(folder).experiments) if e.kind == "step")
@@ -211,7 +214,7 @@ def test_a_row_is_corrected_in_place(filled):
 
 
 def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
-    """Both versions show the fields touched in this tab, and no others."""
+    """If another tab saved first, both versions of the fields touched in this tab are shown."""
     visitor, _ = filled
     page = visitor.get(HERE)
     shown = {"title": page.value("title"), "section": page.value("section")}
@@ -224,7 +227,10 @@ def test_what_another_tab_saved_is_not_what_was_typed_here(filled):
 
 
 def test_a_recording_is_moved_aside_and_comes_back(filled):
-    """Never over another file; not if a table names it, nor if it is not a recording."""
+    """A recording that no table names can be moved aside and back, never over another file.
+
+    A file that is not a recording cannot be moved.
+    """
     visitor, folder = filled
     (folder / "data" / "bad.csv").write_bytes(b"nothing in it")
     for round_ in ("bad.csv", "bad-2.csv"):
@@ -244,7 +250,7 @@ def test_a_recording_is_moved_aside_and_comes_back(filled):
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
-    """Spaces and invisible marks are replaced, with a message, and the file is used."""
+    """Spaces and invisible characters in a file's name are replaced, with a message."""
     visitor, folder = room
     raw, marks = some_files()[0][1], "\u00a0\u200b\u202f\ufeff"
     sent = [(f"a{mark}b.csv", raw + b"\n" * i) for i, mark in enumerate(marks)]
@@ -266,7 +272,10 @@ def test_a_name_that_does_not_show_is_stored_under_one_that_does(room, packed):
 
 @pytest.mark.parametrize("named", [True, False])
 def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
-    """If a table names it by then, or it is gone: one clear sentence, and nothing moves."""
+    """Moving a recording aside waits for other changes of the folder.
+
+    If a table names the file by then, or it is gone, nothing moves.
+    """
     visitor, folder = filled
     recording = folder / "data" / "late.csv"
     recording.write_bytes(b"nothing in it")
@@ -288,7 +297,7 @@ def test_moving_aside_waits_its_turn_before_it_looks(filled, named):
 
 
 def test_handing_in_warns_of_open_questions(filled):
-    """Until each question has an answer; the zip is offered all the same."""
+    """Before handing in, the page counts the open questions, but offers the zip all the same."""
     visitor, folder = filled
     ask_for(folder, "zeta", "level")
     for answered, open_ in ((None, "2 questions"), ("zeta", "1 question "), ("level", "")):
@@ -303,7 +312,7 @@ def test_handing_in_warns_of_open_questions(filled):
 
 @pytest.mark.parametrize("change", ["number", "answer", "older", "gone", "gap", "nothing"])
 def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
-    """Any later change by anybody counts; the zip then lacks that report."""
+    """If anything has changed since the report, the page says so and the zip lacks the report."""
     visitor, folder = filled
     ask_for(folder, "zeta")
     file = folder / load_submission(folder).experiments[0].file
@@ -330,7 +339,7 @@ def test_handing_in_says_when_the_report_is_out_of_date(change, filled):
 
 
 def test_what_is_handed_in_is_shown_before(filled):
-    """The content of the zip, open questions, assumptions; then the zip."""
+    """Before handing in, the page shows the zip's content, open questions and assumptions."""
     visitor, folder = filled
     text = (folder / NAME).read_text(encoding="utf-8")
     bare = re.sub(r"(?m)^(springs|input|position) = .*\n", "", text)
@@ -351,7 +360,7 @@ def test_what_is_handed_in_is_shown_before(filled):
 
 
 def test_only_a_report_of_these_files_says_what_was_assumed(filled):
-    """Each with its reason; if a file has changed, the page no longer quotes the report."""
+    """The page lists a report's assumptions with reasons only if the report is up to date."""
     visitor, folder = filled
     ask_for(folder)
     asked = folder / "report" / "questions.json"
@@ -375,7 +384,7 @@ def test_only_a_report_of_these_files_says_what_was_assumed(filled):
 
 
 def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
-    """The error is named, and the zip has no report."""
+    """If the report cannot be made, the error is named, and the zip is offered without a report."""
     visitor, folder = filled
     (folder / "report").symlink_to(folder.parent)
     page = handed_in(visitor)
@@ -386,7 +395,10 @@ def test_a_report_that_cannot_be_made_keeps_nobody_from_handing_in(filled):
 
 
 def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
-    """The message names the original; only the first file gets a table."""
+    """If a file is uploaded under two names, the message names the original.
+
+    Only the first file gets a table.
+    """
     visitor, folder = room
     (name, raw), *_ = some_files(most=1)
     visitor.upload(HERE + "files", [(name, raw), ("theirs.csv", raw)])
@@ -397,7 +409,7 @@ def test_a_recording_dropped_under_two_names_is_said_to_be_a_copy(room):
 
 
 def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
-    """A file that cannot be read shows none; one whose columns are unclear asks for them."""
+    """Columns are asked for only if a file can be read and its columns are unclear."""
     visitor, folder = filled
     (folder / "data" / "new.csv").write_bytes(b"")
     page = visitor.get(HERE).text
@@ -407,7 +419,7 @@ def test_of_a_file_that_cannot_be_read_no_columns_are_asked(filled):
 
 
 def test_an_essay_and_an_empty_file_are_no_recordings(filled):
-    """They need a person, and are not counted."""
+    """A text file and an empty file are not counted as recordings; they need the student."""
     visitor, folder = filled
     before = re.search(r"(\d+) recordings, all understood", visitor.get(HERE).text)
     assert before
@@ -417,7 +429,7 @@ def test_an_essay_and_an_empty_file_are_no_recordings(filled):
 
 
 def test_a_recording_that_was_cut_short_is_not_green(filled):
-    """A report does not use it, so its row says so and its group stays open."""
+    """A truncated recording keeps its group open, and its row says that the report skips it."""
     visitor, folder = filled
     assert 'id="kind-decay" open' not in visitor.get(HERE).text
     file = folder / "data" / "decay-1b.csv"
@@ -428,7 +440,7 @@ def test_a_recording_that_was_cut_short_is_not_green(filled):
 
 
 def test_edits_from_outside_show_and_are_not_written_over(filled):
-    """A form of an older state is refused with both versions; an answer too."""
+    """A change from outside the desk is shown; a form or answer of an older state is refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     text = (folder / NAME).read_text(encoding="utf-8")
@@ -451,7 +463,7 @@ def test_edits_from_outside_show_and_are_not_written_over(filled):
 
 
 def test_what_a_page_showed_is_known_a_hundred_states_later():
-    """A window stays open while others save; the memory for each person is limited."""
+    """A page can still save after a hundred others have saved; memory per person is limited."""
     desk, seen = Desk(), "seen"
     desk.keep_shown("title = ''", digest=seen, to="")
     for i in range(100):
@@ -464,7 +476,7 @@ def test_what_a_page_showed_is_known_a_hundred_states_later():
 
 
 def test_of_two_at_once_one_is_told_of_the_other(filled):
-    """Eight windows save what they were shown: one succeeds, and the file has its title."""
+    """If eight windows save the same state at once, one succeeds and the others are refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     answers: dict[str, int] = {}
@@ -495,7 +507,7 @@ edit_submission(folder, change, seen=text_digest(submission_text(folder)))
 
 
 def test_another_process_waits_its_turn(filled):
-    """If the command in a terminal and the desk collide, the second gets a message."""
+    """If a command in a terminal changes the file at the same time, the later change is refused."""
     visitor, folder = filled
     seen = visitor.get(HERE).value("seen")
     command = [sys.executable, "-c", _SAVES, str(folder), "terminal"]
@@ -515,7 +527,7 @@ def test_another_process_waits_its_turn(filled):
 
 
 def test_of_two_answers_at_once_none_is_lost(filled):
-    """Either both are in the notes, or one gets a conflict message."""
+    """If several answers are sent at once, each is in the notes or gets a conflict message."""
     visitor, folder = filled
     asked = ask_for(folder, *(f"zeta_{i}" for i in range(6)))
     seen = visitor.get(HERE + "questions").value("seen")
@@ -531,7 +543,7 @@ def test_of_two_answers_at_once_none_is_lost(filled):
 
 
 def test_an_answer_that_is_refused_stays_on_the_page(filled):
-    """With the reason; the notes stay as they were, whatever is open or too long."""
+    """A refused answer stays on the page with the reason, and the notes do not change."""
     visitor, folder = filled
     ask_for(folder, "zeta")
     (folder / "notes.md").write_text("## level\n\nMine.\n", encoding="utf-8")
@@ -539,7 +551,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
     for words in ("Because.\n```", "# Aha", "x" * 1_000_001):
         page = visitor.post(HERE + "answer", id="zeta", answer=words, seen=seen)
         assert page.status == 422
-        assert len(wrongs(page.text)) == 2  # above all, and at the answer
+        assert len(wrongs(page.text)) == 2  # at the top and at the answer
         assert f"{words}</textarea>" in page.text
     assert words[:99] in visitor.post(HERE + "answer", id="gone", answer=words, seen=seen).text
     assert (folder / "notes.md").read_text(encoding="utf-8") == "## level\n\nMine.\n"
@@ -549,7 +561,7 @@ def test_an_answer_that_is_refused_stays_on_the_page(filled):
 
 
 def test_lines_of_a_note_stay_lines(filled):
-    """Also when something else in its row changes; blanks around it do not count."""
+    """Line breaks in a note survive every change in its row; blank lines around it are dropped."""
     visitor, folder = filled
     note = "one\n\ntwo\n"
     edit_submission(folder, lambda d: d["experiments"][0].update(note=note))
@@ -565,7 +577,7 @@ def test_lines_of_a_note_stay_lines(filled):
 
 @pytest.mark.parametrize("text", ["version = \n", "\xff", "version = 1\n[system]\ncarts = 9\n"])
 def test_a_broken_file_is_shown_as_such(filled, text):
-    """The page opens all the same, says what is wrong, and makes no report."""
+    """If the file is broken, the page opens, says what is wrong, and offers no report."""
     visitor, folder = filled
     (folder / NAME).write_bytes(text.encode("latin-1"))
     page = visitor.get(HERE)
@@ -576,7 +588,10 @@ def test_a_broken_file_is_shown_as_such(filled, text):
 
 @pytest.mark.parametrize("broken", [b"version = \n", b"\xff", b"#" * 1_000_001])
 def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
-    """An upload is checked before it is stored; a sound file replaces an unreadable one on disk."""
+    """A `submission.toml` that cannot be read is not accepted as an upload.
+
+    A valid one replaces an unreadable one on disk.
+    """
     visitor, folder = filled
     sound = (folder / NAME).read_bytes()
     (folder / NAME).unlink()
@@ -592,7 +607,7 @@ def test_a_text_that_cannot_be_read_is_not_taken_and_gives_way(broken, filled):
 
 @pytest.mark.parametrize("broken", [b"\xff", b"x" * 1_000_001])
 def test_notes_that_cannot_be_read_are_not_taken_and_give_way(broken, tmp_path, workers):
-    """By the limit on what is read."""
+    """Notes that are too long or not UTF-8 are refused; readable ones replace such notes."""
     for name in ("notes.md", "there/notes.md"):
         (said,) = take_upload(name, io.BytesIO(broken), tmp_path, workers=workers)
         assert "not uploaded" in said
@@ -614,7 +629,7 @@ NAMES = {
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
-    """Under any name."""
+    """An uploaded recording is stored in `data`, whatever its name."""
     (tmp_path / "team").mkdir()
     take_upload(name, io.BytesIO(b"time,x1\n0,1\n"), tmp_path / "team", workers=workers)
     found = [path.relative_to(tmp_path / "team") for path in tmp_path.rglob("*.csv")]
@@ -625,7 +640,7 @@ def test_a_file_goes_nowhere_but_into_data(name, tmp_path, workers):
 
 
 def test_nothing_is_written_over(tmp_path, workers):
-    """The same file again is ignored; another of its name gets a new name; links stay links."""
+    """An upload never replaces a file: an equal one is ignored, a different one gets a new name."""
     for raw in (b"one", b"one", b"two", b"two"):
         take_upload("a.csv", io.BytesIO(raw), tmp_path, workers=workers)
     assert {p.name: p.read_bytes() for p in (tmp_path / "data").iterdir()} == {
@@ -640,7 +655,7 @@ def test_nothing_is_written_over(tmp_path, workers):
 
 
 def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
-    """Each under its own name."""
+    """If several files of one name are uploaded at once, each is kept under its own name."""
     raws = [str(i).encode() * 200_000 for i in range(8)]
 
     def take(raw: bytes) -> list[str]:
@@ -652,7 +667,7 @@ def test_files_of_one_name_at_once_are_all_kept(tmp_path, workers):
 
 
 def test_a_linked_data_folder_is_refused(tmp_path, workers):
-    """A link may point at anybody's files."""
+    """If the `data` folder is a link, uploads are refused."""
     (tmp_path / "theirs").mkdir()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "data").symlink_to(tmp_path / "theirs")
@@ -665,7 +680,7 @@ def test_a_linked_data_folder_is_refused(tmp_path, workers):
 
 
 def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
-    """Recordings of a zip are taken; a bomb, a link and a path outside are refused with reasons."""
+    """Recordings in an uploaded zip are taken; a bomb, a link and a path outside are refused."""
 
     def zipped(*members: tuple[str, bytes]) -> io.BytesIO:
         buffer = io.BytesIO()
@@ -687,7 +702,7 @@ def test_an_archive_is_taken_by_the_limits_of_a_hand_in(tmp_path, workers):
 
 
 def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
-    """Beyond that nothing is accepted."""
+    """A folder accepts files up to a submission's limits in size and number."""
     monkeypatch.setattr(uploads, "MAX_DATA_BYTES", 10)
     (tmp_path / "whole").mkdir()
     (said,) = take_upload("a.csv", io.BytesIO(b"x" * 11), tmp_path, workers=workers)
@@ -703,7 +718,7 @@ def test_a_folder_has_room_for_a_hand_in(tmp_path, workers, monkeypatch):
 
 
 def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypatch):
-    """Files set aside, reports and raw files do not count; the content of the zip does."""
+    """Files that are not in the zip do not count towards the limits."""
     for name in ("set-aside/old.csv", "report/report.html", "gap/gap.json", "raw/session-1/a.bin"):
         (tmp_path / name).parent.mkdir(parents=True)
         (tmp_path / name).write_bytes(bytes(100))
@@ -715,7 +730,7 @@ def test_what_is_no_part_of_a_hand_in_takes_no_room(tmp_path, workers, monkeypat
 
 
 def test_names_and_texts_of_files_are_never_markup(room):
-    """Names of files and headings are shown as text."""
+    """Names of files and headings appear as plain text, never as markup."""
     visitor, folder = room
     evil = "<img src=x onerror=alert(1)>"
     (folder / "data").mkdir()
@@ -727,7 +742,7 @@ def test_names_and_texts_of_files_are_never_markup(room):
 
 
 def test_other_files_of_the_folder_are_not_served(filled):
-    """The report's files are, unless a link leads out; and the zip, under a safe name."""
+    """The desk serves the report's files and the zip, but no other file of the folder."""
     visitor, folder = filled
     zipped = visitor.get(HERE + "hand-in.zip").headers["content-disposition"]
     plain, _, whole = zipped.partition("; filename*=UTF-8''")
@@ -743,7 +758,7 @@ def test_other_files_of_the_folder_are_not_served(filled):
 
 
 def test_a_report_page_that_is_not_ours_runs_nothing(filled):
-    """Its scripts are not the report's own, which are the only ones the policy allows."""
+    """If a report page is not the program's own, its scripts do not run."""
     visitor, folder = filled
     (folder / "report").mkdir(exist_ok=True)
     (folder / "report" / "report.html").write_text("<script>alert(1)</script>", encoding="utf-8")
@@ -756,7 +771,7 @@ def test_a_report_page_that_is_not_ours_runs_nothing(filled):
 
 
 def test_the_gap_is_looked_for_as_a_job(filled):
-    """The page is that of `cartlab gap`, in the folder, and is shown."""
+    """The desk finds the gap as a job and shows the same page as `cartlab gap`."""
     visitor, folder = filled
     assert visitor.get(HERE + "gap/gap.html").status == 404
     assert visitor.post(HERE + "make-gap").status == 303
@@ -767,7 +782,7 @@ def test_the_gap_is_looked_for_as_a_job(filled):
 
 
 def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
-    """In the words of the command; the process goes on."""
+    """If a task cannot be done, its message is that of the command, and the process goes on."""
     with pytest.raises(Failed, match="contains no recordings"):
         workers.do("fill_tables", folder=str(tmp_path))
     with pytest.raises(Failed, match="outside"):
@@ -776,7 +791,7 @@ def test_a_task_says_why_it_came_to_nothing(tmp_path, workers):
 
 
 def test_saving_what_is_not_valid_changes_nothing(tmp_path):
-    """By every way to save."""
+    """A change that makes the file invalid is not saved, in whichever way it is made."""
     folder = a_submission(tmp_path / "team")
     before = (folder / NAME).read_bytes()
     with pytest.raises(SubmissionError):
@@ -786,7 +801,7 @@ def test_saving_what_is_not_valid_changes_nothing(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names, and links need rights")
 def test_files_that_are_not_read_are_named_with_what_to_do(filled):
-    """A spreadsheet and a link out of the folder are listed below the table, each with advice."""
+    """Files that are not read are listed with advice, for example a spreadsheet or a link."""
     visitor, folder = filled
     assert "Not read" not in visitor.get(HERE).text
     (folder / "data" / "book.ods").write_bytes(b"PK")
@@ -798,7 +813,7 @@ def test_files_that_are_not_read_are_named_with_what_to_do(filled):
     assert "&lt;b&gt;.docx" in visitor.get(HERE).text
 
 
-# ------------------------------------------------------------- what one click answers
+# ------------------------------------------------------------- doubts answered by one click
 
 
 def answers(page: str) -> dict[str, str]:
@@ -808,7 +823,7 @@ def answers(page: str) -> dict[str, str]:
 
 
 def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
-    """The button saves the whole form; the doubt disappears from the page and from the file."""
+    """One click sets a unit and saves the rest of the form; the doubt is gone."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files())
     page = visitor.get(HERE)
@@ -822,7 +837,7 @@ def test_a_unit_is_set_by_one_click_with_what_was_typed_beside_it(room):
 
 @pytest.mark.parametrize(("label", "there"), [("No spring here", False), ("Spring present", True)])
 def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room):
-    """Either way the doubt disappears, even if the answer confirms the file."""
+    """One click answers whether a spring exists; the doubt is gone, even if nothing changes."""
     visitor, folder = room
     visitor.upload(HERE + "files", some_files("two-cart"))
     page = visitor.get(HERE)
@@ -834,7 +849,7 @@ def test_a_spring_that_nothing_tells_is_answered_by_one_click(label, there, room
 
 
 def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
-    """A sign is turned, as long as the report is up to date."""
+    """If an up-to-date report contradicts the stated sign, one click reverses it."""
     visitor, folder = filled
     ask_for(folder)
     asked = folder / "report" / "questions.json"
@@ -851,7 +866,7 @@ def test_what_a_report_contradicts_is_taken_back_by_one_click(filled):
 
 
 def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
-    """Beside the question of a real report; only in those runs, and also once it is answered."""
+    """If some runs have the opposite sign, one click states the sign in these runs only."""
     folder = a_submission(tmp_path / "team")
 
     def bare(document):
@@ -882,7 +897,7 @@ def test_the_sign_of_turned_runs_is_stated_by_one_click(tmp_path):
 
 
 def test_remarks_that_differ_in_a_number_are_said_once(room):
-    """Of several logs with rounded time stamps, with the least and the most."""
+    """Warnings that differ only in a number appear once, with the smallest and largest number."""
     visitor, _ = room
     for name, interval in (("a", 0.0103), ("b", 0.0104), ("c", 0.0105)):
         rows = [f"{round(i * interval, 3)},{i // 50},{i % 99 * 7}" for i in range(400)]
@@ -895,7 +910,10 @@ def test_remarks_that_differ_in_a_number_are_said_once(room):
 
 
 def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
-    """One line asks; frequency is asked of dwells only."""
+    """A closed loop asks for its controller in one folded line until it is filled in.
+
+    Only dwells are asked for a frequency.
+    """
     visitor, folder = filled
     runs = load_submission(folder).experiments
     kinds = [run.kind for run in runs]
@@ -908,7 +926,7 @@ def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
     assert f'id="loop-{place}"><summary>What controller ran?' in page.text
     path = f"experiments.{place}.controller.type"
     assert f"experiments.{place}.controller.kp" not in page.text
-    assert f'id="more-{place}"><summary>' in page.text  # nothing else of it is asked
+    assert f'id="more-{place}"><summary>' in page.text  # no other field of the loop is asked for
     visitor.post(HERE + f"experiments/{place}", seen=page.value("seen"), **{path: "pid"})
     page = visitor.get(HERE).text
     assert f'id="loop-{place}" open><summary>What controller ran?' in page
@@ -919,7 +937,10 @@ def test_a_closed_loop_folds_what_controller_ran_until_it_is_filled(filled):
 
 
 def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
-    """With a report of the files as they are, that is to hand in; the doubt stays in sight."""
+    """If the report is up to date, the next step is to hand in, even if a file is in doubt.
+
+    The doubt stays in sight.
+    """
     visitor, folder = filled
     (folder / "data" / "bad.csv").write_bytes(b"time,input,x1\n0,0,0\n")
     assert "Look at it</a>" in visitor.get(HERE).text
@@ -931,7 +952,7 @@ def test_a_file_in_doubt_leaves_the_next_action_where_the_way_is(filled):
 
 
 def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
-    """By one click in its row, which removes the mark from the file too."""
+    """If a cart hardly moves, one click states whether it was held or free."""
     visitor, folder = room
     rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(400)]
     visitor.upload(HERE + "files", [("a.csv", "\n".join(["time,input,x1,x2", *rows]).encode())])
@@ -947,7 +968,10 @@ def test_a_cart_that_hardly_moves_is_said_to_be_held_or_free(room):
 
 
 def test_one_click_answers_what_several_recordings_ask(room):
-    """All of them are written, and the marks removed; wrong numbers are refused."""
+    """If several recordings ask the same question, one click answers it for all of them.
+
+    Wrong numbers of recordings are refused.
+    """
     visitor, folder = room
     for name, n in (("a", 400), ("b", 420), ("c", 440)):
         rows = [f"{i / 100},0,{i % 200},{i % 6}" for i in range(n)]
@@ -974,7 +998,7 @@ def test_one_click_answers_what_several_recordings_ask(room):
 
 
 def test_what_needs_a_person_comes_first_and_the_rest_is_folded(filled):
-    """In a group of which some are understood; without a doubt there is one table."""
+    """In a group, recordings that need the student come first and the others are folded."""
     visitor, folder = filled
     assert "rest-decay" not in visitor.get(HERE).text
     file = folder / "data" / "decay-1b.csv"
@@ -1000,7 +1024,7 @@ def test_what_was_not_taken_does_not_look_like_what_was(room):
 
 
 def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
-    """A dwell shows its frequency; a group with a problem is open."""
+    """Rows are grouped by kind; a group is folded unless one of its recordings has a problem."""
     visitor, folder = filled
     page = visitor.get(HERE).text
     kinds = {e.kind for e in load_submission(folder).experiments}
@@ -1012,7 +1036,7 @@ def test_rows_are_grouped_by_kind_and_folded_when_all_is_well(filled):
 
 
 def test_an_excel_file_is_dropped_like_any_other(room):
-    """Its recording is drawn and gets its table; a broken workbook says what is wrong."""
+    """An Excel file is uploaded like any other; if it is broken, a message says so."""
     visitor, folder = room
     (name, raw), *_ = [one for one in some_files() if one[0].startswith("step")]
     table = parse_table(raw, source=name)

@@ -1,4 +1,4 @@
-"""The steps of a student's way, computed from plain facts."""
+"""The steps from files to handing in follow from plain facts."""
 
 import pytest
 
@@ -60,14 +60,17 @@ READY = Facts(recordings=33, sound=True, report="current", questions=3)
     ],
 )
 def test_each_step_follows_from_the_facts(facts, states, following):
-    """The first step not done is next; a file in doubt holds up no report that is there."""
+    """The next step is the first one that is not done.
+
+    A file in doubt does not hold up a report that exists.
+    """
     steps = find_steps(facts)
     assert " ".join(step.state for step in steps) == states
     assert next_step(steps).key == following
 
 
 def test_a_zip_that_was_downloaded_as_it_is_now_ends_the_way():
-    """Then there is nothing left to do, and the last step is the current one."""
+    """After the current zip was downloaded, all steps are done and the last one is shown."""
     facts = Facts(recordings=1, sound=True, report="current", handed=True)
     assert {step.state for step in find_steps(facts)} == {"done"}
     assert next_step(find_steps(facts)).key == "hand-in"
