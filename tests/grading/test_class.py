@@ -43,7 +43,10 @@ def test_little_damping_accuses_nobody(seed):
 
 
 def test_a_damping_that_the_fit_puts_at_zero_is_told_by_the_decay():
-    """A fit at its bound has measured nothing; a damping ten times too large is found by decays."""
+    """If the fit puts a damping at zero, the decays still show a reported one that is too large.
+
+    A fit at its bound has measured nothing.
+    """
     team = make_team(30)
     assert team.analysis.chain is not None
     wrong = team.reporting(final={"zeta": Decimal("0.031")}).grade()

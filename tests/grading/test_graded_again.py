@@ -26,7 +26,7 @@ RUBRIC = load_rubric(Path("throne-1dof"))
 
 @pytest.fixture(scope="module")
 def school(tmp_path_factory):
-    """Two teams, one of them with the other's step."""
+    """Write two teams, one of which copied a step of the other."""
     folder = tmp_path_factory.mktemp("class")
     for number in (0, 2):
         write_submission(
@@ -48,8 +48,8 @@ def task(school):
 
 
 def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
-    """A corrected grader or library gets another try; the traceback is kept for the developer."""
-    broken = RUBRIC.model_copy(update={"system": None})  # as no rubric can be
+    """If the grader itself fails, the next run tries again, and the traceback is kept."""
+    broken = RUBRIC.model_copy(update={"system": None})  # as in no valid rubric
     outcome = grade_task(task, rubric=broken, scratch=tmp_path)
     assert (outcome.status, outcome.settled) == ("failed", False)
     assert outcome.reason.startswith("the grader failed: AttributeError")
@@ -62,7 +62,7 @@ def test_an_error_of_the_grader_is_tried_again(task, tmp_path):
      ("version = 1", "version = 1,0"), ('id = "s0"', "id = s0  # me"), ('"s0"', "“s0”")],
 )  # fmt: skip
 def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
-    """Points given by hand still reach the authors."""
+    """A submission that cannot be read still names its authors, so points by hand reach them."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
     file = own / "submission.toml"
     text = file.read_text(encoding="utf-8")
@@ -74,9 +74,9 @@ def test_what_cannot_be_read_is_still_somebodys(school, tmp_path, slip, typed):
 
 
 def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, school):
-    """A file written between the hash and the copy leads to a retry, not to a grade."""
+    """A file written between the hash and the copy causes a retry, not a grade."""
     own = shutil.copytree(school / "team-0", tmp_path / "team-0")
-    if sys.platform == "linux":  # elsewhere no file is called so
+    if sys.platform == "linux":  # only Linux allows this file name
         (own / "n\udcff").write_text("no name in any encoding", encoding="utf-8")
     known = replace(task, sources=(str(own),), digest=digest([own]))
     assert grade_task(known, rubric=RUBRIC, scratch=tmp_path).status == "graded"
@@ -90,7 +90,7 @@ def test_what_changed_meanwhile_is_not_graded_under_the_old_key(task, tmp_path, 
 
 
 def test_the_version_covers_what_it_computes_with(monkeypatch):
-    """With another numpy or scipy the version differs, so everything is graded again."""
+    """With another version of numpy or scipy, everything is graded again."""
     before = code_version()
     assert code_version() == before
     for name in ("numpy", "scipy"):
@@ -103,7 +103,7 @@ def test_the_version_covers_what_it_computes_with(monkeypatch):
 
 
 def test_what_was_handed_out_is_no_copy(school, tmp_path):
-    """A recording that everybody was given may be in two submissions."""
+    """A recording that was handed out to everybody is not flagged in two submissions."""
     given = fingerprint(read_data(load_submission(school / "team-0")).records)
     shared = []
     for examples in ((), (given,)):

@@ -1,4 +1,4 @@
-"""Answers are found in and written to `notes.md` by their question's id; the rest stays."""
+"""An answer is found in `notes.md` under its question's id, and writing it changes nothing else."""
 
 import pytest
 from hypothesis import given
@@ -34,14 +34,14 @@ More.
 
 
 def test_an_answer_is_what_stands_under_its_heading():
-    """Deeper headings and code are part of it; comments hold no answers."""
+    """An answer includes deeper headings and code, but no comment."""
     assert written_answer(NOTES, "friction-2").startswith("Because.\n\n### In detail")
     assert written_answer(NOTES, "friction-2").endswith("# no heading\n```")
     assert written_answer(NOTES, "zeta_b") == ""
 
 
 def test_an_answer_is_replaced_added_and_taken_away():
-    """All other lines stay as they are."""
+    """An answer can be replaced, added and removed; all other lines stay as they are."""
     new = with_answer(NOTES, "friction-2", "Dry bearings.\r\n")
     assert written_answer(new, "friction-2") == "Dry bearings."
     assert new.splitlines()[:9] == NOTES.splitlines()[:9]
@@ -52,7 +52,7 @@ def test_an_answer_is_replaced_added_and_taken_away():
 
 
 def test_a_heading_that_would_end_the_answer_is_refused():
-    """Text that the report would not show as the answer is refused."""
+    """An answer with a heading that would end it is refused."""
     with pytest.raises(SubmissionError, match="must start with ###"):
         with_answer(NOTES, "level", "So.\n\n# Aha\n\nMore.")
     assert "### Aha" in with_answer(NOTES, "level", "So.\n\n### Aha\n\nMore.")
@@ -63,14 +63,14 @@ OPEN = ["```\ncode", "~~~", "So <!-- why", "```\n<!-- x\n```", "So.\n\n### outlo
 
 @pytest.mark.parametrize("text", OPEN)
 def test_an_answer_that_would_swallow_another_is_refused(text):
-    """Unclosed code and comments would run on; closed ones are part of the answer."""
+    """An answer with unclosed code or an unclosed comment is refused, as it would hide the next."""
     with pytest.raises(SubmissionError, match="close every"):
         with_answer(NOTES, "friction-2", text)
     for closed in ("```\n# code\n```", "So <!-- why --> it is.", "### In detail\n\nMore."):
         assert written_answer(with_answer(NOTES, "friction-2", closed), "friction-2") == closed
-    with pytest.raises(SubmissionError, match="close every"):  # it would be inside the open code
+    with pytest.raises(SubmissionError, match="close every"):  # it would be in the open code
         with_answer("## zeta_b\n\n```\ncode", "level", "So.")
-    with pytest.raises(SubmissionError, match="close every"):  # the next one would
+    with pytest.raises(SubmissionError, match="close every"):  # the next answer would be inside it
         with_answer(NOTES, "level", "So.\n```")
 
 

@@ -1,4 +1,4 @@
-"""A cart looks the same in figures, on the live page, and in the thumbnails of the desk."""
+"""Each cart looks the same in figures, on the live page, and in the desk's thumbnails."""
 
 import re
 
@@ -14,7 +14,7 @@ def sheet(name: str) -> str:
 
 
 def test_pages_have_the_colours_of_the_figures():
-    """The style sheet has one row for each cart, with its colour in figures."""
+    """The report's style sheet gives each cart the colour that it has in figures."""
     rows = re.findall(r"--cart-(\d): var\(--f-(\w+)\);", sheet("report.css"))
     assert rows == [(str(n), ROLES[colour]) for n, (colour, *_) in enumerate(CARTS, start=1)]
     dashes = re.findall(r"--cart-(\d)-dash: ([\d ]+);", sheet("report.css"))
@@ -23,7 +23,7 @@ def test_pages_have_the_colours_of_the_figures():
 
 
 def test_other_pages_take_the_colours_from_there():
-    """No page defines its own colours for carts."""
+    """Other pages use the style sheet's colours for carts and define none."""
     desk = re.findall(r"\.thumb [^{]*\{[^}]*stroke: var\((--[\w-]+)\)", sheet("desk/desk.css"))
     assert desk == [f"--cart-{n}" for n in range(1, len(CARTS) + 1)]
     live = sheet("live.js")

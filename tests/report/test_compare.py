@@ -1,4 +1,4 @@
-"""Two drafts side by side: the numbers that moved, and the checks that fail now."""
+"""Two drafts are compared by the numbers that changed and the checks that fail now."""
 
 import json
 from dataclasses import replace
@@ -29,7 +29,7 @@ def draft_of(analysis: Analysis) -> Draft:
 
 
 def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
-    """Return the analysis with one final estimate multiplied."""
+    """Return the analysis with one final estimate multiplied by a factor."""
     rows = tuple(
         replace(row, final=replace(row.final, value=row.final.value * factor))
         if row.name == name and row.final
@@ -40,7 +40,7 @@ def with_final(analysis: Analysis, name: str, factor: float) -> Analysis:
 
 
 def test_a_draft_does_not_differ_from_itself():
-    """The same analysis, written and read back, has no changes."""
+    """An analysis compared with its own `results.json` shows no changes."""
     analysis = make_analysis(3)
     changes = compare_drafts(draft_of(analysis), analysis)
     assert not changes.numbers
@@ -49,7 +49,7 @@ def test_a_draft_does_not_differ_from_itself():
 
 
 def test_a_number_that_moved_is_told_in_combined_standard_errors():
-    """A gain two percent up, with a standard error of one percent in both drafts, moved 1.4 σ."""
+    """A change is given in combined standard errors: 2 % with 1 % in each draft is 1.4 σ."""
     analysis = make_analysis(2)
     row = next(row for row in analysis.rows if row.name == "K_1")
     assert row.final is not None
@@ -75,7 +75,7 @@ def test_a_number_that_moved_is_told_in_combined_standard_errors():
 
 
 def test_checks_that_fail_now_are_named():
-    """A check that failed before, or passes now, is not listed; one that fails now is."""
+    """Only checks that fail now and did not fail before are listed."""
     analysis = make_analysis(2)
     passing = tuple(replace(check, outcome="pass") for check in analysis.checks)
     first, *others = passing
@@ -89,7 +89,7 @@ def test_checks_that_fail_now_are_named():
 
 
 def test_the_report_has_a_section_on_the_changes():
-    """It has both values; without an earlier draft there is no such section."""
+    """The report has a section with both values of each changed number, if drafts are compared."""
     before, after = make_analysis(2), with_final(make_analysis(2), "omega_b", 1.1)
     changes = compare_drafts(draft_of(before), after)
     blocks = change_blocks(Page(after), changes)
@@ -110,7 +110,7 @@ def test_the_report_has_a_section_on_the_changes():
     ],
 )
 def test_what_is_no_results_json_is_refused_in_one_line(tmp_path, text, expected):
-    """Anything but a results file of cartlab is named, with its fault."""
+    """A file that is not a `results.json` is refused by one line that names its fault."""
     path = tmp_path / "results.json"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=r"results\.json: ") as error:
@@ -120,13 +120,13 @@ def test_what_is_no_results_json_is_refused_in_one_line(tmp_path, text, expected
 
 
 def test_a_missing_file_is_refused(tmp_path):
-    """The path that is not there is named."""
+    """If the earlier draft's file is missing, the error names its path."""
     with pytest.raises(ConfigError, match=r"none\.json: cannot be read"):
         read_results(tmp_path / "none.json")
 
 
 def test_other_benches_are_not_compared():
-    """Drafts of two and of three carts have no number in common."""
+    """Drafts for different numbers of carts cannot be compared."""
     with pytest.raises(ConfigError, match=r"2 carts in cm and V, this one of 3 in cm and V"):
         compare_drafts(draft_of(make_analysis(2)), make_analysis(3))
 
@@ -136,7 +136,7 @@ def test_other_benches_are_not_compared():
     [("carts", 3), ("units", {"position": "mm", "input": "V"})],
 )
 def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkeypatch, key, other):
-    """Units and carts are in submission.toml, so the refusal needs no analysis."""
+    """Drafts with other units or carts are refused before the analysis starts."""
 
     def analysed_after_all(*_, **__):
         pytest.fail("the analysis ran")
@@ -154,7 +154,7 @@ def test_what_cannot_be_compared_is_refused_before_the_analysis(tmp_path, monkey
 
 
 def test_the_command_tells_the_change_in_one_line_of_stderr(tmp_path):
-    """`--compare` with an edited gain reports it on the page and on stderr."""
+    """With `--compare` a changed gain is reported on the page and in one line on stderr."""
     earlier = json.loads(json_text(analysed("one-cart")))
     earlier["parameters"][0]["final"] *= 0.9
     path = tmp_path / "earlier.json"

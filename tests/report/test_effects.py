@@ -1,4 +1,4 @@
-"""The catalogue of effects on the screen, as JSON and as a page with pictures."""
+"""The catalogue of effects is printed as text and JSON, and shown as a page with pictures."""
 
 import json
 import re
@@ -24,7 +24,7 @@ def test_the_list_has_every_effect_with_its_parameters():
 
 
 def test_json_is_for_programs():
-    """`cartlab effects --json` prints the catalogue as data, NAME picks one entry."""
+    """`cartlab effects NAME --json` prints one entry as data."""
     done = cartlab_here("effects", "stiction", "--json")
 
     (entry,) = json.loads(done.stdout)
@@ -36,7 +36,7 @@ def test_json_is_for_programs():
 
 
 def test_a_wrong_name_is_one_line_with_the_nearest():
-    """A misspelt effect ends with status 2 and the nearest name."""
+    """If an effect's name is misspelt, the exit status is 2 and the error gives the nearest."""
     done = cartlab_here("effects", "back_lash")
 
     assert (done.returncode, done.stdout) == (2, "")
@@ -44,7 +44,7 @@ def test_a_wrong_name_is_one_line_with_the_nearest():
 
 
 def test_wrong_options_of_simulate_are_one_line(tmp_path):
-    """A wrong effect and a missing model end with status 2, one line, and nothing written."""
+    """A wrong option of `simulate` ends with status 2 and one line, and nothing is written."""
     for arguments, expected in (
         (("--preset", "throne-1dof", "--hide", "friction:force=1"), "no effect 'friction'"),
         (("--model", tmp_path / "no.json"), "no.json: cannot be read (No such file or directory)"),
@@ -58,14 +58,14 @@ def test_wrong_options_of_simulate_are_one_line(tmp_path):
         assert not (tmp_path / "out").exists()
 
 
-# One for each kind of picture, and the one whose readings are scaled.
+# One effect for each kind of picture, and the one that scales the readings.
 FIRST = {effect.axis: effect for effect in reversed(CATALOGUE)}
 PICTURED = [*FIRST.values(), find_effect("sensor_gain")]
 
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """A page with a few effects."""
+    """Write a page with a few effects."""
     out = tmp_path_factory.mktemp("gallery")
     render_effects(PICTURED, out)
     return out
@@ -75,13 +75,13 @@ def page(tmp_path_factory):
 @pytest.mark.sample
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_a_picture(effect, tmp_path):
-    """Whatever its law, on the usual bench at its usual size."""
+    """Every effect of the catalogue has a picture at its usual size."""
     render_effects([effect], tmp_path)
     assert (tmp_path / "figures" / f"{effect.key}.svg").is_file()
 
 
 def test_the_page_stands_alone(page):
-    """One file that loads nothing, with a picture of each effect."""
+    """The page is one file that loads nothing and has a picture of each effect."""
     html = (page / "effects.html").read_text(encoding="utf-8")
 
     assert html.count("<svg ") == len(PICTURED)
@@ -93,7 +93,7 @@ def test_the_page_stands_alone(page):
 
 
 def test_the_page_is_the_same_every_time(page, tmp_path):
-    """Same catalogue, same bytes."""
+    """The same catalogue gives the same bytes."""
     chosen = PICTURED[:2]
 
     render_effects(chosen, tmp_path / "again")
@@ -105,7 +105,7 @@ def test_the_page_is_the_same_every_time(page, tmp_path):
 
 @pytest.mark.parametrize("key", ["coulomb_friction", "sensor_gain", "input_delay"])
 def test_every_entry_shows_how_to_hide_it(key):
-    """The command under a picture is one that `cartlab simulate` takes."""
+    """The command under each picture is valid for `cartlab simulate`."""
     from pipeline.simulated.hidden import prepare_bench
 
     document = build_gallery([find_effect(key)])

@@ -1,4 +1,4 @@
-"""The diary of an exploration: its turns, and how it marks their explanations."""
+"""The diary of an exploration shows its turns and marks the explanation in the model."""
 
 import json
 import re
@@ -18,7 +18,7 @@ from tests.report.test_gap import make_gap, two_cart_analysis
 
 
 def make_turn(*weights: float) -> Turn:
-    """Return a turn with explanations of these weights, that of the model first."""
+    """Return a turn with explanations of these weights; the first one is in the model."""
     return Turn(
         seconds=30.0,
         recorded=("step-1",),
@@ -36,7 +36,10 @@ def make_turn(*weights: float) -> Turn:
 
 
 def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tmp_path):
-    """One far behind by the criterion has under 1 %; a single one has no weight."""
+    """The diary marks which explanation is in the model, and gives the weight of each.
+
+    A weight far below the best is under 1 %; a single explanation has no weight.
+    """
     turns = [make_turn(1e-7, 1.0), make_turn(1.0)]
     page = write_diary(turns, make_analysis(1), tmp_path, wanted=0.01).read_text(encoding="utf-8")
     page = page.replace("\u00a0", " ")
@@ -45,7 +48,7 @@ def test_the_explanation_in_the_model_is_told_from_what_the_criterion_prefers(tm
 
 
 def test_effects_are_called_what_they_are_called_elsewhere():
-    """Names of people keep their capitals, and the cart is named once."""
+    """Effects have their usual names in the diary, and each cart is named once."""
     chain = PRESETS["throne-1dof"]
     mass, friction = (
         EffectTerm(effect=effect, place=1, values=tuple(1.0 for _ in effect.names))
@@ -56,7 +59,7 @@ def test_effects_are_called_what_they_are_called_elsewhere():
 
 
 def test_the_answer_comes_first_and_each_turn_has_the_run_that_decided(tmp_path):
-    """Parameters with errors and effects with sizes, then the turns; axes begin at zero."""
+    """The diary gives parameters and effects first, then each turn with its deciding run."""
     gap = make_gap()
     runs = {trace.experiment for trace in gap.traces}
     turns = [

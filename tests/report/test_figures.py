@@ -1,4 +1,4 @@
-"""Figures: their content and ticks, and the same bytes from the same data."""
+"""Figures have the right content and ticks, and the same data give the same bytes."""
 
 import subprocess
 import sys
@@ -63,7 +63,7 @@ def bode_svg(carts: int = 2) -> str:
 
 
 def test_a_figure_is_well_formed_and_says_what_it_shows():
-    """The SVG parses, has its alternative text, and its labels are text."""
+    """The SVG of a figure is valid, has a text alternative, and its labels are text."""
     root = ElementTree.fromstring(bode_svg())
     assert root.attrib["role"] == "img"
     assert root.findtext(f"{SVG}title") == "Bode <plot>"
@@ -74,19 +74,19 @@ def test_a_figure_is_well_formed_and_says_what_it_shows():
 
 
 def test_the_same_data_give_the_same_bytes():
-    """No date, random id or order of drawing changes a byte."""
+    """A figure drawn twice has the same bytes, without date or random ids."""
     assert bode_svg() == bode_svg()
 
 
 def test_every_dwell_is_drawn_as_a_diamond():
-    """Three panels of 24 measured points each, and one in the legend."""
+    """Each of the 24 dwells is a diamond in three panels, and the legend has one more."""
     root = ElementTree.fromstring(bode_svg())
     marks = [use for use in root.iter(f"{SVG}use")]
     assert len(marks) == 3 * 24 + 1
 
 
 def test_measured_phase_lies_on_the_branch_of_the_fit():
-    """A measured phase wrapped into (-π, π] is drawn beside the unwrapped model."""
+    """A measured phase is drawn near the model's phase, even if it differs by full turns."""
     analysis = make_analysis(3)
     response = analysis.frequency_responses[2]  # cart 3 goes down to -540°
     with drawing():
@@ -102,7 +102,7 @@ def test_measured_phase_lies_on_the_branch_of_the_fit():
 
 
 def test_a_peak_without_end_does_not_hide_the_measurement():
-    """The curve of undamped carts is cut above the measured points."""
+    """If undamped carts have infinite peaks, the curve is cut above the measured points."""
     chain = Chain(m=np.array([1.0]), c=np.zeros(1), k=np.array([4.0, 0.0]))
     omega = np.array([0.5, 1.0, 3.0, 4.0])
     magnitude = np.abs(chain.frequency_response(omega)[0])
@@ -122,7 +122,7 @@ def test_a_peak_without_end_does_not_hide_the_measurement():
 
 
 def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
-    """The axis of an input without a model's line covers its samples."""
+    """The axis of an input covers all samples, even if no model is drawn."""
     with drawing():
         _, (ax,) = panels(1.0)
         plot_points(ax, np.linspace(0, 1, 5), np.array([-4.0, 0, 3, 0, 0]))
@@ -132,7 +132,7 @@ def test_what_was_measured_is_seen_where_nothing_else_is_drawn():
 
 
 def test_a_student_s_dollar_signs_are_no_formula():
-    """An id with dollar signs draws as it is."""
+    """Dollar signs in an id are drawn as they are, not as a formula."""
     with drawing():
         figure, (ax,) = panels(1.0)
         plot_measured(ax, np.linspace(0, 1, 5), np.zeros(5))
@@ -143,7 +143,7 @@ def test_a_student_s_dollar_signs_are_no_formula():
 
 
 def test_an_unstable_model_does_not_hide_the_measurement():
-    """A model that runs away is cut one span beyond what was measured."""
+    """If a simulation grows without bound, it is cut at one span beyond the measurement."""
     check = make_analysis(1).hardware[0]
     growth = np.append(np.exp(np.linspace(0, 700, check.t.size - 1)), np.inf)
     for model in (1e12 * check.model, growth):
@@ -157,7 +157,7 @@ def test_an_unstable_model_does_not_hide_the_measurement():
 
 
 def test_a_zero_in_a_table_of_ratios_is_left_out():
-    """A logarithmic axis cannot show zero; the other points are drawn."""
+    """A zero in a table of ratios is left out of the logarithmic plot; other points are drawn."""
     (response,) = make_analysis(1).frequency_responses
     magnitude = response.magnitude.copy()
     magnitude[3] = 0.0
@@ -168,11 +168,11 @@ def test_a_zero_in_a_table_of_ratios_is_left_out():
             units=PAPER_UNITS,
         )
         root = ElementTree.fromstring(to_svg(figure, name="x", alt=""))
-    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and the one in the legend
+    assert len(list(root.iter(f"{SVG}use"))) == 23 + 1  # and one in the legend
 
 
 def test_a_dwell_shades_the_transient():
-    """The shaded span ends where the steady part begins."""
+    """The figure of a dwell shades the transient up to the start of the steady part."""
     analysis = make_analysis(2)
     points = [p for p in analysis.sine_points if p.experiment == "sine-10"]
     record = next(r for r in analysis.records if r.id == "sine-10")
@@ -213,7 +213,7 @@ def test_ticks_are_round_numbers_inside_the_axis(low, span, most):
 
 
 def test_tick_labels_share_their_decimals():
-    """Labels of one axis have one form, and a true minus sign."""
+    """All labels of an axis have the same number of decimals and a true minus sign."""
     assert tick_labels(np.array([-0.5, 0.0, 0.5])) == ["−0.5", "0.0", "0.5"]
     assert tick_labels(np.array([-200.0, 0.0])) == ["−200", "0"]
     assert tick_labels(log_ticks(0.4, 7.0)) == ["0.5", "1", "2", "5"]
@@ -223,7 +223,7 @@ def test_tick_labels_share_their_decimals():
 
 
 def test_the_user_s_own_settings_do_not_matter(monkeypatch):
-    """A matplotlibrc with other fonts and colours changes nothing."""
+    """The user's own matplotlib settings change no figure."""
     import matplotlib
 
     before = bode_svg()
@@ -232,7 +232,7 @@ def test_the_user_s_own_settings_do_not_matter(monkeypatch):
 
 
 def test_the_report_imports_only_what_it_needs():
-    """No pyplot, pandas or control: they would cost a second before the first number."""
+    """The report does not import pyplot, pandas or control, which would take a second."""
     code = (
         "import sys, pipeline.report.render.write; "
         "print([m for m in ('matplotlib.pyplot', 'pandas', 'control', 'numba', 'scipy.signal') "
@@ -243,7 +243,7 @@ def test_the_report_imports_only_what_it_needs():
 
 
 def test_panels_leave_room_for_their_labels():
-    """Every panel lies inside the figure, below the one before."""
+    """Every panel lies inside the figure, below the panel before it."""
     figure, axes = panels(1.0, 0.5, 0.7)
     assert isinstance(figure, Figure)
     boxes = [ax.get_position() for ax in axes]
@@ -251,11 +251,11 @@ def test_panels_leave_room_for_their_labels():
     assert all(lower.y1 < upper.y0 for upper, lower in pairwise(boxes))
 
 
-_TOUCH = 2.0  # points of the canvas: boxes hold room above and below the letters
+_TOUCH = 2.0  # points of the canvas: a text's box includes room above and below its letters
 
 
 def figures_of(carts: int) -> dict[str, Figure]:
-    """Return every kind of figure of a report, with long and odd names of records."""
+    """Return a figure of each kind in a report, with long and odd names of records."""
     analysis = make_analysis(carts)
     records = {r.id: replace(r, id=f"{r.id} the second try of Tuesday") for r in analysis.records}
     long = {id_: record.id for id_, record in records.items()}
@@ -296,10 +296,10 @@ def figures_of(carts: int) -> dict[str, Figure]:
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_no_text_of_a_figure_is_cut_or_covered(carts):
-    """Every text lies on the canvas, and no two overlap, as matplotlib measures them."""
+    """All text in a figure lies on the canvas, and no two texts overlap."""
     with drawing():
         for name, figure in figures_of(carts).items():
-            to_svg(figure, name=name, alt="")  # draws the ticks
+            to_svg(figure, name=name, alt="")  # this draws the ticks
             canvas = FigureCanvasAgg(figure)
             renderer = canvas.get_renderer()
             canvas.draw()
@@ -318,7 +318,7 @@ def test_no_text_of_a_figure_is_cut_or_covered(carts):
 
 
 def test_every_series_carries_all_its_data():
-    """A page gets all measured points, however few are drawn; files and print do not."""
+    """On the page a figure carries all measured points, in files and print only those drawn."""
     rng = np.random.default_rng(3)
     t = np.linspace(0.0, 9.0, 5001)
     y = rng.normal(size=t.size)
@@ -333,7 +333,7 @@ def test_every_series_carries_all_its_data():
     model, measured = sorted(series, key=lambda attributes: attributes["data-name"])
     assert measured["data-name"] == "measured"
     assert measured["data-x"] == "0 9"
-    # Numbers travel as float32.
+    # Numbers are stored as float32.
     np.testing.assert_allclose(unpacked(measured["data-y"]), y, rtol=1e-6)
     assert model["data-name"] == "\"quoted\" <b> 'model'"
     np.testing.assert_allclose(unpacked(model["data-x"]), uneven, rtol=1e-6)
@@ -346,7 +346,7 @@ def unpacked(text: str) -> np.ndarray:
 
 
 def test_repeats_stand_on_one_time_axis():
-    """Small multiples share time; each panel has one title, each column one axis."""
+    """Panels of repeated runs share one time axis; each has one title."""
     with drawing():
         figure, axes = small_multiples(list("abcde"), height=1.0, share_y=True)
         axes[0].set_xlim(0, 3)
@@ -358,7 +358,7 @@ def test_repeats_stand_on_one_time_axis():
 
 
 def test_phases_are_read_against_right_angles():
-    """A phase that turns by more than a right angle has ticks at multiples of 90 degrees."""
+    """A phase that turns by more than 90° has ticks at multiples of 90°."""
     response = make_analysis(2).frequency_responses[1]
     figure, (ax,) = panels(1.0)
     with drawing():
@@ -370,7 +370,7 @@ def test_phases_are_read_against_right_angles():
 
 
 def test_labels_of_a_phase_that_turns_far_do_not_touch():
-    """With six right angles or more every second one is labelled, with four all are."""
+    """If a phase turns by 540° or more, only every second multiple of 90° is labelled."""
     for least, step in ((-360.0, 90.0), (-540.0, 180.0)):
         response = make_analysis(2).frequency_responses[1]
         phase = np.radians(np.linspace(0.0, least, response.omega.size))
@@ -384,7 +384,7 @@ def test_labels_of_a_phase_that_turns_far_do_not_touch():
 
 
 def test_carts_of_a_step_are_told_apart_without_colour():
-    """Each has its own mark, in the panel, in the legend and in the caption."""
+    """In the figure of a step each cart has its own mark, also in legend and caption."""
     analysis = make_analysis(3)
     run = analysis.step_gains[0].experiment
     gains = [gain for gain in analysis.step_gains if gain.experiment == run]
@@ -400,7 +400,7 @@ def test_carts_of_a_step_are_told_apart_without_colour():
 
 @pytest.mark.parametrize("points", [[10.0], [1.0, 9.0, 9.5, 4.0], [3.0] * 40])
 def test_submissions_are_counted_in_whole_numbers(points):
-    """No axis of a histogram has half a submission."""
+    """The count axis of a histogram has only whole numbers."""
     with drawing():
         figure = distribution_figure(points, out_of=10.0)
         to_svg(figure, name="x", alt="")
@@ -411,7 +411,7 @@ def test_submissions_are_counted_in_whole_numbers(points):
 
 
 def test_long_titles_lose_what_they_share():
-    """Long names with a common beginning are shortened to their differing end."""
+    """Long names of runs with a common beginning are shortened to the part that differs."""
     names = [f"DOF1_en1_input1_trial_of_monday_{i}" for i in range(6)]
     with drawing():
         _, axes = small_multiples(names, height=1.0, share_y=True)

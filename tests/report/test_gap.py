@@ -1,4 +1,4 @@
-"""The gap report: all verdicts, every effect, the file read back, the verdict in the report."""
+"""The gap report covers all verdicts and effects, its file, and the quote in the report."""
 
 import json
 import re
@@ -65,7 +65,7 @@ U = np.where((T > 0.1) & (T < 2.0), 0.05, 0.0)
 
 
 def usual_values(effect, place):
-    """Return parameter values of a usual size."""
+    """Return parameter values of usual size."""
     scales = chain_scales(CHAIN, place=effect.place, at=place, input=0.05)
     return {p.name: p.size(scales) * p.typical for p in effect.parameters}
 
@@ -90,7 +90,7 @@ RESIDUAL = Residual(
 
 
 def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
-    """Return a possible gap of the two-cart bench, with the first cart's runs drawn."""
+    """Return a possible gap of the two-cart bench, with the runs of the first cart drawn."""
     terms: list[EffectTerm] = []
     for key in keys:
         effect = find_effect(key)
@@ -188,7 +188,7 @@ def make_gap(verdict: Verdict = "named", keys=("coulomb_friction",)) -> Gap:
 
 
 def two_cart_analysis():
-    """Return an analysis whose records belong to those gaps."""
+    """Return an analysis whose records belong to the gaps made here."""
     analysis = make_analysis(2)
     step = next(record for record in analysis.records if record.id == "step-a")
     return replace(analysis, records=(step, replace(step, id="step-b")))
@@ -200,7 +200,7 @@ def page_of(gap: Gap) -> Page:
 
 
 def test_a_name_stands_on_top_with_its_numbers():
-    """The first paragraph names effect, place, size, error before and after, and the noise."""
+    """The first paragraph names the effect with place and size, the errors and the noise."""
     text = page_of(make_gap()).text
 
     assert "Dry (Coulomb) friction on cart 2 explains what the linear model leaves out" in text
@@ -209,18 +209,18 @@ def test_a_name_stands_on_top_with_its_numbers():
 
 
 def test_each_size_has_its_cart_and_each_sentence_is_said_once():
-    """Dry friction on both carts: which force belongs to which, and what dry friction is."""
+    """If both carts have dry friction, each force has its cart, and the law is explained once."""
     gap = make_gap()
     (one,) = gap.effects
     said = terminal_verdict(replace(gap, effects=(replace(one, where={"cart": 1}), one)))
 
     assert re.search(r"force [^;]+ V on cart 1; force [^;]+ V on cart 2\. ", said)
     assert said.count(one.effect.sentence) == 1
-    assert " V on cart" not in terminal_verdict(gap)  # one effect: its name says where
+    assert " V on cart" not in terminal_verdict(gap)  # the name of a single effect says where
 
 
 def test_a_stretch_without_a_phase_is_told_in_words():
-    """If no phase of the motion stands out, the sentence and the table say so."""
+    """If the error is spread evenly over a stretch, sentence and table say so."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     (window,) = gap.left
     text = page_of(replace(gap, left=(replace(window, what="throughout"),))).text
@@ -230,7 +230,7 @@ def test_a_stretch_without_a_phase_is_told_in_words():
 
 
 def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
-    """A model need not be closer to a run than the next repeat of it."""
+    """If repeats differ by more than the noise, the page compares the model's error with them."""
     gap = replace(make_gap(), repeatability=0.035)
     text = page_of(gap).text
 
@@ -238,7 +238,7 @@ def test_repeats_are_the_measure_where_they_differ_by_more_than_noise():
 
 
 def test_suspects_are_listed_as_such():
-    """Verdict unexplained: no name, but the suspects, with the error that each would leave."""
+    """If the verdict is unexplained, suspects are listed with the error that each would leave."""
     suspect = Rival(effect=find_effect("backlash"), where={}, nrmse_after=0.12, confidence=0.9)
     gap = replace(make_gap("unexplained", ()), final=0.153, suspects=(suspect,))
     text = page_of(gap).text
@@ -248,7 +248,7 @@ def test_suspects_are_listed_as_such():
 
 
 def test_nothing_to_name_is_said():
-    """Verdict none: no effects, no equations, and a sentence that no effect is needed."""
+    """If the verdict is none, a sentence says that no effect is needed."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031)
     text = page_of(gap).text
 
@@ -258,7 +258,7 @@ def test_nothing_to_name_is_said():
 
 
 def test_the_page_of_none_speaks_of_no_effects():
-    """Verdict none: one model is drawn; the result, what it covers, what comes next."""
+    """If the verdict is none, the page mentions no effects and draws one model."""
     gap = replace(make_gap("none", ()), final=0.031, baseline=0.031, where=())
     page = page_of(gap)
 
@@ -275,16 +275,16 @@ def test_the_page_of_none_speaks_of_no_effects():
     assert "Error and noise of every run" in page.text
     assert "cart 1 up to" in page.text
     assert "the input up to 0.0500 V" in page.text
-    # Of the noise's 3 %: the root of 1.15 - 1, where a search begins.
+    # Beyond noise of 3 %: the square root of 1.15 - 1, where a search begins.
     assert "by more than about 1.2 % of their motion" in page.text
     assert page.text.index("What to do next") < page.text.rindex("Error and noise of every run")
     assert "What to do next." in terminal_verdict(gap)
 
 
 def test_what_no_effect_explains_is_drawn_without_effects():
-    """Verdict unexplained.
+    """If the verdict is unexplained, no figure shows a model with effects.
 
-    One model without suspects; else that of the suspects, marked as such.
+    If there are suspects, figures show the model with the suspects, marked as such.
     """
     alone = make_gap("unexplained", ())
     assert "with the effects" not in html_of(alone)
@@ -297,7 +297,7 @@ def test_what_no_effect_explains_is_drawn_without_effects():
 
 
 def test_two_explanations_are_neither_right_nor_wrong():
-    """Verdict ambiguous: the remaining error is marked neither as good nor as bad."""
+    """If the verdict is ambiguous, the remaining error is marked neither good nor bad."""
     assert tones(make_gap("ambiguous")) == ["", "", ""]
     assert (
         "One explanation: dry (Coulomb) friction on cart 2" in page_of(make_gap("ambiguous")).text
@@ -312,12 +312,12 @@ def html_of(gap: Gap) -> str:
 
 
 def tones(gap: Gap) -> list[str]:
-    """Return how the tiles at the top are marked."""
+    """Return the marks of the tiles at the top, such as good or bad."""
     return re.findall(r'<div class="tile (\w*)"', html_of(gap))
 
 
 def test_two_explanations_are_both_told():
-    """Verdict ambiguous: both are described, and the experiment that would decide."""
+    """If the verdict is ambiguous, both explanations and the deciding experiment are described."""
     text = page_of(make_gap("ambiguous")).text
 
     assert "Dry (Coulomb) friction on cart 2, or quadratic drag on cart 2" in text
@@ -329,7 +329,7 @@ def test_two_explanations_are_both_told():
 
 @pytest.mark.parametrize("keys", [(), ("coulomb_friction",)])
 def test_what_stays_unexplained_has_suspects_only(keys):
-    """Verdict unexplained: the suspects, if any, are marked as such and explain nothing."""
+    """If the verdict is unexplained, suspects are named, but not as an explanation."""
     text = page_of(make_gap("unexplained", keys)).text
 
     assert "nothing in the catalogue explains" in text
@@ -338,7 +338,7 @@ def test_what_stays_unexplained_has_suspects_only(keys):
 
 
 def test_a_part_of_the_gap_says_what_is_left_and_where():
-    """Verdict partial: the effects, how much is left, in which run, cart and phase."""
+    """If the verdict is partial, the page says how much error is left, and where."""
     gap = replace(make_gap("partial"), noise_floor=0.01)
     text = page_of(gap).text
 
@@ -351,7 +351,7 @@ def test_a_part_of_the_gap_says_what_is_left_and_where():
 
 @pytest.mark.parametrize("verdict", ["partial", "unexplained"])
 def test_the_force_left_has_a_picture_and_its_formula(verdict):
-    """The unexplained force is drawn for each cart, with a formula that is not an effect."""
+    """The unexplained force has a figure for each cart and a formula that is not an effect."""
     page = page_of(make_gap(verdict))
 
     assert "The unexplained force" in page.text
@@ -366,7 +366,7 @@ def test_the_force_left_has_a_picture_and_its_formula(verdict):
 
 
 def test_an_answer_so_far_is_said_to_be_one():
-    """A search cut short by its budget says so at the top, and no page promises it again."""
+    """If the time budget ended the search, the page calls its result the best answer so far."""
     text = page_of(replace(make_gap("unexplained", ()), complete=False)).text
 
     assert "best answer so far" in text
@@ -376,7 +376,7 @@ def test_an_answer_so_far_is_said_to_be_one():
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda effect: effect.key)
 def test_every_effect_has_its_page(effect):
-    """Any effect of the catalogue has a figure, a typeset law and its entry's texts."""
+    """The page of every effect has its figure, its law as a formula, and its entry's texts."""
     page = page_of(make_gap("named", (effect.key,)))
 
     assert effect.fingerprint in page.text
@@ -390,7 +390,10 @@ def test_every_effect_has_its_page(effect):
 
 
 def test_two_effects_share_the_equations():
-    """Each effect has a letter: friction on cart 2 the second, the drive's change the first."""
+    """If two effects act, each has its own letter in the equations.
+
+    Here friction on cart 2 is the second and the drive's change the first.
+    """
     terms = make_gap("named", ("saturation", "coulomb_friction")).model.terms
 
     motion = to_text(augmented_equations((True, True, True), terms).math)
@@ -413,7 +416,7 @@ def test_a_spring_pulls_both_its_carts():
 
 
 def test_pdf_and_files_are_the_same_each_time(tmp_path):
-    """Two renderings are equal byte for byte; the PDF's first page has the verdict."""
+    """PDF and other files are the same each time; the PDF's first page has the verdict."""
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         render_gap(make_gap(), two_cart_analysis(), tmp_path / name)
@@ -430,7 +433,7 @@ def test_pdf_and_files_are_the_same_each_time(tmp_path):
 
 
 def test_residual_force_of_a_constant_force_is_that_force():
-    """A constant push on cart 2 is found, whatever the carts do."""
+    """If a constant force pushes cart 2, the residual force found is this force."""
     pushed = make_term(find_effect("force_offset"), place=2, values={"force": 0.004}, chain=CHAIN)
     model = AugmentedChain(chain=CHAIN, terms=(pushed,))
     x = simulate_augmented(model, T, U)
@@ -443,8 +446,8 @@ def test_residual_force_of_a_constant_force_is_that_force():
         replace(make_gap(), model=model, traces=traces), free={"a": (1, 2)}
     )
 
-    # Windows of 9 samples: the weight is exact for parabolas. The fourth-order rest is
-    # m x'''' T²/50, and (18 rad/s · 0.07 s)²/50 is 3 % of the forces, here 0.05 V at the edges.
+    # Windows of 9 samples: the weight is exact for parabolas. The fourth-order rest is m x''''
+    # T²/50, and (18 rad/s · 0.07 s)²/50 is 3 % of the forces, here 0.05 V at the edges.
     assert_allclose(second.measured, 0.004, atol=0.03 * 0.05)
     assert_allclose(np.median(second.measured), 0.004, rtol=1e-3)
     assert_allclose(np.median(first.measured), 0.0, atol=1e-5)
@@ -452,7 +455,7 @@ def test_residual_force_of_a_constant_force_is_that_force():
 
 
 def test_a_cart_beside_one_that_was_not_measured_has_no_residual_force():
-    """The neighbour's spring force is unknown, so there is no estimate."""
+    """If a cart's neighbour was not measured, its residual force is not estimated."""
     gap = make_gap()
     alone = replace(gap, traces=tuple(t for t in gap.traces if t.cart == 1))
 
@@ -491,7 +494,7 @@ def test_the_file_is_read_back_as_it_was(verdict):
     ],
 )
 def test_what_is_no_gap_file_is_refused_in_one_line(text):
-    """Broken or foreign JSON gives one error, never a traceback."""
+    """A file that is not a `gap.json` is refused by one error without a traceback."""
     with pytest.raises(ConfigError, match=r"cartlab gap|cartlab-gap/1"):
         read_gap(text)
 
@@ -501,7 +504,7 @@ def test_what_is_no_gap_file_is_refused_in_one_line(text):
 
 @pytest.fixture(scope="module")
 def bench(tmp_path_factory):
-    """A submission of one cart with dry friction, and `cartlab gap` run on it."""
+    """Write a submission of one cart with dry friction and run `cartlab gap` on it."""
     folder = tmp_path_factory.mktemp("bench")
     (folder / "data").mkdir()
     case = make_case(seed=41, n=1, effects=["coulomb_friction"], rate=113.1)
@@ -512,7 +515,7 @@ def bench(tmp_path_factory):
     for record in case.records:
         if record.id == "sweep":
             continue
-        # The last step plays the run under feedback: its input was measured.
+        # The last step is taken as the run under feedback, since its input was measured.
         kind = "closed_loop" if record.id == "step-d" else record.kind
         reference = np.zeros(record.t.size)
         columns = [record.t, record.u, reference, record.y[0]]
@@ -528,7 +531,7 @@ def bench(tmp_path_factory):
 
 
 def test_command_writes_everything_and_names_the_friction(bench):
-    """Exit status 0, the files, JSON on stdout, and the friction that was hidden."""
+    """`cartlab gap` ends with status 0, writes all files and names the hidden friction."""
     assert bench.done.returncode == 0, bench.done.stderr
     out = bench.folder / "gap"
     text = (out / "gap.json").read_text(encoding="utf-8")
@@ -557,7 +560,7 @@ def test_command_writes_everything_and_names_the_friction(bench):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_report_shows_the_verdict_and_the_better_simulation(bench):
-    """With a gap analysis of its data, the report quotes it and simulates with the effects."""
+    """The report quotes a gap analysis of its own data and simulates with its effects."""
     analysis, gap = with_gap(analyse(load_submission(bench.folder)), bench.folder)
     assert gap is not None
     assert analysis.warnings == analyse(load_submission(bench.folder)).warnings
@@ -569,7 +572,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
     linear, augmented = map(
         float, re.findall(r"step-d1(\d+(?:\.\d+)?) %(\d+(?:\.\d+)?) %", page.text)[-1]
     )
-    # The run was never fitted; what is left is the encoder's step.
+    # The run was never fitted, so only the encoder's rounding is left.
     assert augmented < 0.2 * linear
     assert {href[1:] for href in page.values("href") if href.startswith("#")} <= set(
         page.values("id")
@@ -577,7 +580,7 @@ def test_report_shows_the_verdict_and_the_better_simulation(bench):
 
 
 def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
-    """After one changed byte in the data the verdict is not shown, and the report says why."""
+    """If the data have changed since the gap analysis, the report only warns."""
     analysis = analyse(load_submission(bench.folder))
     changed = replace(analysis, files=analysis.files | {"data/step-a.csv": "0" * 64})
 
@@ -592,7 +595,7 @@ def test_gap_analysis_of_other_data_is_only_a_warning(bench, tmp_path):
 
 
 def test_hostile_words_in_a_gap_file_stay_words(bench):
-    """Texts of a foreign `gap.json` are shown as text."""
+    """Hostile text in a `gap.json` appears as plain text."""
     analysis = analyse(load_submission(bench.folder))
     text = (bench.folder / "gap" / "gap.json").read_text(encoding="utf-8")
     document = json.loads(text) | {"next_experiment": HOSTILE}
@@ -606,7 +609,7 @@ def test_hostile_words_in_a_gap_file_stay_words(bench):
 
 
 def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
-    """A folder that is no submission ends in one line and status 2."""
+    """If a folder is not a submission, `cartlab gap` ends with one line and status 2."""
     done = cartlab_here("gap", tmp_path / "nowhere")
 
     assert done.returncode == 2
@@ -614,7 +617,7 @@ def test_without_usable_runs_the_command_says_so_in_one_line(tmp_path):
 
 
 def test_every_law_in_a_report_has_a_reading():
-    """Formulas have a text alternative for readers who cannot see them."""
+    """Every formula has a text alternative for readers who cannot see it."""
     document = build_gap_document(make_gap("named", ("extra_mode",)), two_cart_analysis())
     formulas = [b for s in document.sections for b in s.blocks if isinstance(b, Formula)]
 

@@ -1,4 +1,4 @@
-"""The model's formulas are evaluated and compared with their chain."""
+"""The formulas printed for a model give the same values as its chain."""
 
 from math import prod
 from xml.etree import ElementTree
@@ -26,7 +26,7 @@ FOUR = Chain(
 
 
 def evaluate(term: Term, values: dict[str, complex]) -> complex:
-    """Return the value of a formula: side by side is a product, a missing name is an error."""
+    """Return a formula's value; adjacent parts are multiplied, an unknown name is an error."""
     if isinstance(term, str):
         return complex(values[term] if term in values else float(term))
     parts = term.parts
@@ -58,7 +58,7 @@ def kinds(term: Term, kind: str) -> list[Math]:
 
 
 def physical_values(chain: Chain) -> dict[str, complex]:
-    """Return m_1, c_1, k_1 … as the formulas name them; those of a single cart have no index."""
+    """Return m_1, c_1, k_1 … as in the formulas; the names for a single cart have no index."""
     if chain.n == 1:
         return {"m": chain.m[0], "c": chain.c[0], "k": chain.k.sum()}
     named = {"m": chain.m, "c": chain.c, "k": chain.k}
@@ -74,7 +74,7 @@ CHAINS = [*PRESETS.values(), FOUR]
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: f"{chain.n}-carts")
 def test_symbolic_matrices_are_those_of_the_chain(chain):
-    """Every entry of the printed A and B, evaluated, is that of the state space."""
+    """The printed A and B have the values of the chain's state space."""
     formula = symbolic_state_space(springs_of(chain)).math
     _, A, _, B = kinds(formula, "matrix")
     values = physical_values(chain)
@@ -83,13 +83,13 @@ def test_symbolic_matrices_are_those_of_the_chain(chain):
     got_B = np.array([evaluate(t, values).real for t in B.parts]).reshape(-1, B.columns)
 
     expected_A, expected_B, _, _ = chain.state_space()
-    assert_allclose(got_A, expected_A, rtol=1e-12)  # the same few operations in another order
+    assert_allclose(got_A, expected_A, rtol=1e-12)  # the same operations in another order
     assert_allclose(got_B, expected_B, rtol=1e-12)
 
 
 @pytest.mark.parametrize("chain", CHAINS[:3], ids=lambda chain: f"{chain.n}-carts")
 def test_symbolic_transfer_functions_are_those_of_the_chain(chain):
-    """With the named parameters inserted, each line gives that cart's response at any s."""
+    """The printed transfer functions have the values of the chain's response at any s."""
     formula = symbolic_transfer_functions(springs_of(chain))
     assert formula is not None
     names = {"zeta": "ζ", "omega": "ω", "K": "K"}
@@ -104,7 +104,7 @@ def test_symbolic_transfer_functions_are_those_of_the_chain(chain):
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: f"{chain.n}-carts")
 def test_numeric_transfer_functions_are_those_of_the_chain(chain):
-    """The printed numbers, four digits each, give each cart's response."""
+    """The printed numbers, with four digits each, give each cart's response."""
     formula = numeric_transfer_functions(chain)
 
     # Four digits: 5e-4 at most in each number, up to 17 of them, at a frequency off resonance.
@@ -112,7 +112,7 @@ def test_numeric_transfer_functions_are_those_of_the_chain(chain):
 
 
 def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
-    """Evaluate each printed line, gain over D(s) times the zeros, against the chain."""
+    """Compare each printed line, gain over D(s) times the zeros, with the chain."""
     omega = 11.0  # rad/s, between the resonances
     values = {**values, "s": 1j * omega}
     *lines, (_, _, *denominator) = [line.parts for line in math.parts if isinstance(line, Math)]
@@ -130,7 +130,10 @@ def assert_responses(math: Math, values, *, chain: Chain, rtol: float) -> None:
 
 
 def test_a_missing_spring_is_not_in_the_equations():
-    """No k_1 without a spring from cart 1 to the wall; one sum for a single cart's springs."""
+    """A wall spring that is missing does not appear in the equations.
+
+    The two springs of a single cart appear as one sum.
+    """
     assert "k_1" not in to_text(equations_of_motion((False, True, True)).math)
     assert "k_1" in to_text(equations_of_motion((True, True, True)).math)
     assert to_text(equations_of_motion((True, True)).math) == "mx″_1 + cx′_1 + kx_1 = u"
@@ -138,7 +141,10 @@ def test_a_missing_spring_is_not_in_the_equations():
 
 
 def test_a_chain_without_walls_is_shown_as_polynomials():
-    """Without a static gain there are no factors as in the paper, but a ratio of polynomials."""
+    """If a chain has no walls, its transfer function is printed as a ratio of polynomials.
+
+    Without a static gain the paper's factors do not exist.
+    """
     rigid = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     text = to_text(numeric_transfer_functions(rigid).math)
     assert text == "(X_1(s))/(U(s)) = (5000)/(s^2 + 2.500s)"
@@ -149,7 +155,7 @@ def test_a_chain_without_walls_is_shown_as_polynomials():
 
 @pytest.mark.parametrize("chain", CHAINS, ids=lambda chain: f"{chain.n}-carts")
 def test_every_formula_is_well_formed_mathml(chain):
-    """All formulas of the model parse as XML."""
+    """All formulas of a model are valid XML."""
     springs = springs_of(chain)
     formulas = [
         equations_of_motion(springs),
@@ -164,11 +170,11 @@ def test_every_formula_is_well_formed_mathml(chain):
 
 
 def test_leaves_are_escaped():
-    """A name from outside cannot bring a tag into the page."""
+    """A name with markup brings no tag into the page."""
     assert "<script>" not in to_mathml(row("<script>", symbol("<b>_<i>")))
 
 
 def test_numbers_with_a_power_of_ten_keep_it():
-    """−1.5 × 10⁻⁷ is read as one number."""
+    """A number with a power of ten, such as −1.5 × 10⁻⁷, is read as one number."""
     assert to_text(number("−1.500 × 10⁻⁷")) == "−1.500·10^−7"
     assert to_text(number("24.02")) == "24.02"

@@ -1,4 +1,4 @@
-"""Students' notes: Markdown in, inert blocks out."""
+"""Students' notes in Markdown become blocks in which nothing can run."""
 
 import re
 
@@ -40,7 +40,7 @@ def page(blocks: tuple[Block, ...]) -> str:
 
 
 def test_markdown_becomes_blocks():
-    """Headings, emphasis, code, lists, quotes and tables keep their structure."""
+    """Headings, emphasis, code, lists, quotes and tables of Markdown keep their structure."""
     blocks = note_blocks(
         "# Result\n\nIt is **very** *soft*, `k = 3`.\n\n1. one\n   - inner\n2. two\n\n> quoted\n\n"
         "```\ncode <b>\n```\n\n| a | b |\n|---|--:|\n| 1 | 2 |\n"
@@ -48,7 +48,7 @@ def test_markdown_becomes_blocks():
 
     heading, text, items, quote, code, table = blocks
     assert isinstance(heading, Heading)
-    assert heading.level == 3  # the report's own headings are above
+    assert heading.level == 3  # the report's own headings have the levels above
     assert isinstance(text, Paragraph)
     assert text.text[1:] == (
         Span("very", "strong"),
@@ -84,7 +84,7 @@ def test_markdown_becomes_blocks():
     ],
 )
 def test_hostile_markdown_stays_text(markdown):
-    """Nothing a student writes becomes a tag, an attribute, a script or a remote image."""
+    """No tag, attribute, script or remote image in a student's notes takes effect on the page."""
     html = page(note_blocks(markdown)).split("<main>")[1].split("<script>")[0]
 
     tags = re.findall(r"<[^>]*>", html)
@@ -97,7 +97,7 @@ def test_hostile_markdown_stays_text(markdown):
 
 
 def test_web_and_mail_links_stay():
-    """A plain link keeps its address, marked so that it passes no information on."""
+    """Links to web pages and mail addresses keep their address and send no referrer."""
     (block,) = note_blocks("[paper](https://example.org/a?b=1&c=2) <mailto:a@example.org>")
     assert isinstance(block, Paragraph)
     assert [span.url for span in block.text if span.url] == [
@@ -107,7 +107,7 @@ def test_web_and_mail_links_stay():
 
 
 def test_control_characters_are_replaced():
-    """Characters that no page can hold do not reach it."""
+    """Characters that no page may contain are replaced."""
     (block,) = note_blocks("a\x07b\ud800c\ufffe")
     assert isinstance(block, Paragraph)
     assert plain(block.text) == "a�b�c�"
@@ -132,7 +132,7 @@ def test_any_notes_give_an_accessible_pdf(markdown):
 
 
 def test_headings_go_down_one_level_at_a_time():
-    """A heading that skips levels is raised; headings of one level stay together."""
+    """A heading that skips a level is raised; headings of one level stay equal."""
     blocks = even_headings(note_blocks("### a\n\n###### b\n\n###### c\n\n# d\n\n## e"))
 
     levels = [block.level for block in blocks if isinstance(block, Heading)]
@@ -141,7 +141,7 @@ def test_headings_go_down_one_level_at_a_time():
 
 @pytest.mark.parametrize("nest", ["> " * 20, "> " * 90, "- " * 40, "1. " * 30])
 def test_deep_nesting_is_set_flat(nest):
-    """However deep a quotation or list is nested, page and PDF can be made."""
+    """Notes with deeply nested quotes or lists still give a page and a PDF."""
     blocks = note_blocks(f"{nest}deep")
     assert "deep" in str(blocks)
     assert str(blocks).count("kind='quote'") <= 6
@@ -149,5 +149,5 @@ def test_deep_nesting_is_set_flat(nest):
 
 @pytest.mark.parametrize("nest", ["> " * 3000, "*" * 5000 + "x" + "*" * 5000, "[" * 3000])
 def test_nesting_beyond_sense_is_survived(nest):
-    """Notes that only a machine would write do not cause a crash."""
+    """Notes with absurdly deep nesting cause no crash."""
     assert isinstance(note_blocks(nest), tuple)

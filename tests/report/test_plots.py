@@ -1,4 +1,4 @@
-"""The page of plots holds what was measured and simulated, in few bytes."""
+"""The page of plots has all that was measured and simulated, in few bytes."""
 
 import json
 import re
@@ -22,7 +22,7 @@ from pipeline.words.progress import silent
 from tests.helpers.analysis_factory import make_analysis
 from tests.helpers.examples import analysed
 
-MOST_BYTES = 1_500_000  # of three carts and their 36 recordings
+MOST_BYTES = 1_500_000  # limit for three carts and their 36 recordings
 
 
 def unpacked(packed: list[Any]) -> Array:
@@ -46,12 +46,12 @@ def page_of(analysis: Analysis) -> str:
 
 @pytest.fixture(scope="module")
 def runs() -> tuple[ComparedRun, ...]:
-    """All runs of the shipped two-cart submission."""
+    """Return all runs of the shipped two-cart submission."""
     return compare_runs(analysed("two-cart"), gap=None, progress=silent)
 
 
 def test_every_recording_is_there_with_its_model(runs):
-    """Decays, steps, dwells, the sweep and the loop, whose model has its own line."""
+    """Every recording is on the page with the model's line; the closed loop has one more line."""
     records = analysed("two-cart").records
 
     assert [run.id for run in runs] == [record.id for record in records]
@@ -66,7 +66,7 @@ def test_every_recording_is_there_with_its_model(runs):
 
 
 def test_the_loop_is_as_the_report_has_it(runs):
-    """Errors and lines are those of `results.json` and the report's figures."""
+    """The closed loop's errors and lines equal those of `results.json` and the figures."""
     checks = {(c.cart, c.loop): c for c in analysed("two-cart").hardware}
     (control,) = [run for run in runs if run.kind == "closed_loop"]
 
@@ -79,12 +79,12 @@ def test_the_loop_is_as_the_report_has_it(runs):
 
 
 def test_a_page_holds_what_was_measured_and_simulated(runs):
-    """Each number to half a level of sixteen bits; a model by its residual."""
+    """Each number on the page is right to half a step of 16 bits."""
     for run in runs:
         packed = pack_run(run)
         for cart, held in zip(run.carts, packed["carts"], strict=True):
             y = unpacked(held["y"])
-            # Half a level, and the rounding of the float that the level is made from.
+            # Half a step, and the rounding of the float from which the step is computed.
             assert_allclose(y, cart.measured, atol=0.51 * held["y"][1], rtol=1e-12)
             for one, model in zip(cart.models, held["models"], strict=True):
                 residual = unpacked(model["residual"])
@@ -97,7 +97,7 @@ def test_a_page_holds_what_was_measured_and_simulated(runs):
 
 
 def test_a_decay_is_simulated_from_its_release(runs):
-    """Before the release there is no model; after it the error is noise."""
+    """A decay is simulated only from its release on; then the error is noise."""
     for run in runs:
         if run.kind == "decay":
             (cart,) = run.carts
@@ -109,12 +109,12 @@ def test_a_decay_is_simulated_from_its_release(runs):
             measured, y = cart.measured[first:], linear.y[first:]
             motion = np.sum((measured - measured[-50:].mean()) ** 2)
             error = np.sqrt(np.sum((measured - y) ** 2) / motion)
-            # About the mean of the end instead of the fitted rest: the same to a hundredth.
+            # Taken about the mean of the end instead of the fitted rest position: equal to 1 %.
             assert error == pytest.approx(linear.nrmse, rel=0.01)
 
 
 def test_thinning_keeps_every_peak():
-    """A single outlying sample stays, and each line has two thousand points or more."""
+    """Thinning a line keeps single outlying samples and at least two thousand points."""
     t = np.linspace(0.0, 60.0, 36_000)
     y, residual = np.sin(t), np.full(t.size, np.nan)
     y[17_321], residual[20_000:] = 5.0, 0.0
@@ -130,7 +130,7 @@ def test_thinning_keeps_every_peak():
 
 
 def test_numbers_that_are_none_or_all_the_same_survive():
-    """NaN stays NaN, a constant keeps its value, and an empty array stays empty."""
+    """Packing keeps NaN, constants and empty arrays."""
     values = np.array([np.nan, 1.0, 2.0, np.nan])
     assert_allclose(unpacked(pack(values)), values, atol=1e-4)
     assert_allclose(unpacked(pack(np.full(3, 4.2))), 4.2, rtol=1e-12)
@@ -138,7 +138,7 @@ def test_numbers_that_are_none_or_all_the_same_survive():
 
 
 def test_a_sine_has_its_amplitude_in_the_spectrum():
-    """At its frequency, also on a jittered grid, and after thinning."""
+    """A sine has its amplitude at its frequency in the spectrum, even if sampled with jitter."""
     rng = np.random.default_rng(4)
     t = 0.002 * np.arange(8_000, dtype=np.float64)
     t[1:-1] += rng.uniform(-2e-5, 2e-5, t.size - 2)
@@ -157,7 +157,7 @@ def test_a_sine_has_its_amplitude_in_the_spectrum():
 
 
 def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
-    """Three carts and their recordings stay below a megabyte and a half."""
+    """The page for three carts has under 1.5 MB, is valid, and is the same each time."""
     analysis = analysed("three-cart")
     for _ in range(2):
         write_plots(analysis, tmp_path, gap=None, progress=silent)
@@ -175,7 +175,7 @@ def test_the_page_is_small_valid_and_the_same_every_time(tmp_path):
 
 
 def test_what_a_stranger_wrote_is_text():
-    """Titles, ids and units close no element and run no script."""
+    """Titles, ids and units with markup close no element and run no script."""
     analysis = make_analysis(2)
     hostile = '</script><script>alert(1)</script><!--"&\x00\u2028'
     records = tuple(replace(r, id=f"{r.id}{hostile}") for r in analysis.records)
@@ -191,7 +191,7 @@ def test_what_a_stranger_wrote_is_text():
 
 
 def test_without_carts_the_measured_motion_is_there():
-    """An unidentified bench has no model, and every run says so."""
+    """If no carts were identified, the page shows the measured motion and says why no model."""
     page = page_of(replace(make_analysis(1), fit=None, hardware=()))
 
     runs = data_of(page)["runs"]

@@ -1,4 +1,4 @@
-"""The report asks questions that this data raises, and shows each answer beside its question."""
+"""The report asks questions that its data raise, and shows each answer beside its question."""
 
 import re
 from dataclasses import replace
@@ -29,7 +29,7 @@ SECTIONS = (
 
 
 def well(carts: int = 2) -> Analysis:
-    """Return an analysis in which everything agrees."""
+    """Return an analysis in which all parts agree."""
     analysis = make_analysis(carts)
     rows = tuple(replace(row, consistent=True, change_percent=1.0) for row in analysis.rows)
     decays = tuple(replace(decay, friction=None) for decay in analysis.log_decrements)
@@ -46,7 +46,7 @@ def well(carts: int = 2) -> Analysis:
 
 
 def off(name: str, percent: float, **initial) -> Analysis:
-    """Return an analysis in which one parameter changed."""
+    """Return an analysis in which one parameter changed from initial to final estimate."""
     analysis = well()
     rows = []
     for row in analysis.rows:
@@ -64,7 +64,7 @@ def off(name: str, percent: float, **initial) -> Analysis:
 
 
 def test_nothing_is_asked_where_all_is_well():
-    """Consistent data raise no question, and the report has no section for them."""
+    """If all results agree, the report asks no question."""
     analysis = well()
     assert ask(analysis) == ()
     assert questions_of(analysis) == []
@@ -72,7 +72,7 @@ def test_nothing_is_asked_where_all_is_well():
 
 
 def test_a_damping_that_changed_asks_for_the_amplitudes():
-    """The change and both methods have the names of the table."""
+    """If a damping changed between two methods, a question asks about the amplitudes."""
     (question,) = ask(off("zeta_b", 65.0))
     assert (question.id, question.section) == ("zeta_b", "parameters")
     assert question.text.startswith(
@@ -86,14 +86,17 @@ def test_a_damping_that_changed_asks_for_the_amplitudes():
     [("K_1", "short of its spring equilibrium"), ("omega_1", "Which masses and which springs")],
 )
 def test_other_parameters_ask_for_what_may_have_moved_them(name, expected):
-    """A gain asks about sticking, a frequency about the carts that were free."""
+    """A changed gain raises a question about sticking, a changed frequency one about free carts."""
     (question,) = ask(off(name, 40.0))
     assert question.id == name
     assert expected in question.text
 
 
 def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
-    """A damping assumed three times too large: its peak is sharper; too small: flatter."""
+    """If an assumed damping was far off, a question asks where the data show it.
+
+    If it was too large, the peak is sharper than assumed; if too small, flatter.
+    """
     (question,) = ask(off("zeta_b", -67.0, source="assumed"))
     assert question.section == "frequency-response"
     assert "is sharper than assumed" in question.text
@@ -104,7 +107,7 @@ def test_a_guess_that_was_far_off_asks_where_the_data_show_it():
 
 
 def test_points_are_not_asked_for_where_the_fit_had_none():
-    """After a fit in time no point of a Bode plot shows it."""
+    """After a fit to time records, no question asks for points of a Bode plot."""
     analysis = off("zeta_a", 148.0, source="assumed")
     rows = tuple(
         replace(row, final=row.final and replace(row.final, source="time_fit"))
@@ -114,7 +117,7 @@ def test_points_are_not_asked_for_where_the_fit_had_none():
 
 
 def test_bench_against_model_asks_level_overshoot_and_shape_apart():
-    """Each difference raises its own question, with both numbers in it."""
+    """Differences in level, overshoot and shape each raise their own question with both numbers."""
     analysis = well()
     first, *others = analysis.hardware
     assert first.steady_state_model is not None
@@ -134,7 +137,7 @@ def test_bench_against_model_asks_level_overshoot_and_shape_apart():
 
 
 def test_a_cart_that_sticks_is_asked_about_with_its_interval():
-    """The question has both ends of the gain's interval."""
+    """If a cart sticks, the question gives both ends of the gain's interval."""
     analysis = well()
     stuck = replace(analysis.step_gains[0], interval=(23.1, 26.4))
     assert isinstance(stuck, StepGain)
@@ -144,7 +147,7 @@ def test_a_cart_that_sticks_is_asked_about_with_its_interval():
 
 
 def test_a_fit_that_leaves_more_than_noise_asks_at_its_worst_point():
-    """The cart and the frequency of the largest standardised residual are named."""
+    """If a fit leaves more than noise, the question names its worst cart and frequency."""
     analysis = well()
     assert analysis.fit is not None
     response = analysis.frequency_responses[1]
@@ -194,21 +197,21 @@ Oil it.
 
 
 def test_an_answer_stands_beside_its_question():
-    """It is in the question's section; other notes stay in the discussion."""
+    """An answer is shown beside its question; other notes stay in the discussion."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading="zeta_b"))
     ((section, question),) = questions_of(analysis)
     assert section == "parameters"
     first = question.answer[0]
     assert isinstance(first, Paragraph)
     assert plain(first.text) == "The decay saw more."
-    assert len(question.answer) == 4  # the smaller heading and what is under it are still answer
+    assert len(question.answer) == 4  # the smaller heading and its text belong to it
 
 
 @pytest.mark.parametrize(
     "heading", ["zeta_b", "Question zeta_b", "Q: zeta_b: amplitudes", "`zeta_b`", "ζ_b", "ZETA_B."]
 )
 def test_any_spelling_of_an_id_will_do(heading):
-    """The answer leaves the discussion, and no question stays open."""
+    """An answer is found under any spelling of its question's id."""
     analysis = replace(off("zeta_b", 65.0), discussion=NOTES.format(heading=heading))
     answers, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
     assert {name: len(blocks) for name, blocks in answers.items()} == {"zeta_b": 4}
@@ -218,14 +221,14 @@ def test_any_spelling_of_an_id_will_do(heading):
 
 
 def test_an_answer_to_nothing_that_is_asked_stays_in_the_discussion():
-    """No note is lost when new data no longer raise its question."""
+    """An answer to a question that the data no longer raise stays in the discussion."""
     analysis = replace(well(), discussion=NOTES.format(heading="zeta_b"))
     _, rest = split_notes(discussion_blocks(analysis.discussion or ""), ask(analysis))
     assert len(rest) == len(discussion_blocks(analysis.discussion or ""))
 
 
 def test_an_empty_heading_is_no_answer():
-    """A heading with nothing below it keeps the placeholder."""
+    """A heading without text below it counts as no answer."""
     analysis = replace(off("zeta_b", 65.0), discussion="## zeta_b\n\n## Rest\n\nText.\n")
     ((_, question),) = questions_of(analysis)
     assert question.answer == ()
@@ -233,7 +236,7 @@ def test_an_empty_heading_is_no_answer():
 
 
 def test_page_and_print_mark_the_place_and_show_the_answer():
-    """Unanswered, both name the heading to write under; answered, both show the text, inert."""
+    """Page and print name an open question's heading, and show the answer of an answered one."""
     analysis = off("zeta_b", 65.0)
     pages, prints = {}, {}
     for name, discussion in (("open", None), ("done", "## zeta_b\n\n<b>Ours</b> & *more*\n")):
@@ -250,13 +253,13 @@ def test_page_and_print_mark_the_place_and_show_the_answer():
     assert "&lt;b&gt;Ours&lt;/b&gt; &amp; <em>more</em>" in pages["done"]
     assert "<b>Ours</b> & more" in prints["done"]
     assert "To be answered" not in pages["done"] + prints["done"]
-    for page in pages.values():  # the discussion's list leads to every question
+    for page in pages.values():  # the list in the discussion links to every question
         assert page.count('href="#question-zeta_b"') == page.count('id="question-zeta_b"') == 1
 
 
 @pytest.mark.parametrize("answered", [False, True])
 def test_a_question_is_printed_with_what_answers_it(answered):
-    """Wherever the page breaks."""
+    """In print a question stays on one page with its answer, wherever pages break."""
     answer = (paragraph("Our answer. " + "It sticks. " * 40),) if answered else ()
     question = Question(id="q", text=spans("Why so? " * 30), answer=answer)
     line = paragraph("A line.")
@@ -271,7 +274,7 @@ def test_a_question_is_printed_with_what_answers_it(answered):
 
 
 def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
-    """The template's example is a comment: it answers nothing and is in no report."""
+    """A new submission explains how to answer in a comment, which is in no report."""
     new_submission(tmp_path / "team", carts=2)
     notes = tmp_path / "team" / "notes.md"
     assert "## zeta_b" in notes.read_text(encoding="utf-8")
@@ -285,7 +288,7 @@ def test_a_new_submission_says_how_to_answer_without_answering(tmp_path):
 
 
 def test_the_three_cart_example_answers_what_it_is_asked():
-    """The one question of the shipped example is answered in its notes."""
+    """The one question raised by the shipped three-cart example is answered in its notes."""
     analysis = analysed("three-cart")
     ((section, question),) = questions_of(analysis)
     assert (section, question.id) == ("frequency-response", "zeta_a")
@@ -293,7 +296,7 @@ def test_the_three_cart_example_answers_what_it_is_asked():
 
 
 def test_real_carts_raise_friction_and_damping(tmp_path, real_data):
-    """The real two-cart data raise at most six, on dampings, dry friction and the bench."""
+    """Real two-cart data raise at most six questions, on sign, damping, friction and the bench."""
     folder = write_two_cart_submission(tmp_path / "real", real_data, steps=(2, 3, 4, 5))
     ids = [question.id for question in ask(analyse(load_submission(folder)))]
     assert ids[:4] == ["sign", "zeta_2", "friction-1", "friction-2"]

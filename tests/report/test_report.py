@@ -1,4 +1,4 @@
-"""The whole report: both files complete, inert, self-contained, with the same bytes each time."""
+"""A report's two files are complete, safe and self-contained, with the same bytes each time."""
 
 import base64
 import hashlib
@@ -33,7 +33,7 @@ VOID = {"meta", "link", "br", "img", "hr", "input"}
 
 
 class Page(HTMLParser):
-    """A parser that collects what the tests need, and checks that tags are closed in order."""
+    """A parser that collects what the tests need and checks that tags are closed in order."""
 
     def __init__(self, html: str) -> None:
         super().__init__()
@@ -54,7 +54,7 @@ class Page(HTMLParser):
         self.tags.append((tag, dict(attrs)))
 
     def handle_endtag(self, tag):
-        """Insist that the tag closed is the last one opened."""
+        """Check that the tag closed is the one opened last."""
         assert self._open.pop() == tag
 
     def handle_data(self, data):
@@ -68,14 +68,14 @@ class Page(HTMLParser):
 
 
 def render(analysis: Analysis, out: Path, *, pdf: bool = True) -> tuple[Page, str]:
-    """Render; return the parsed page and the PDF's text."""
+    """Render a report; return the parsed page and the PDF's text."""
     render_report(analysis, out, files=Files(pdf=pdf))
     return read(out)
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory) -> dict[int, Path]:
-    """Reports of 1, 2 and 3 carts, made once."""
+    """Write reports for 1, 2 and 3 carts once."""
     made = {}
     for carts in (1, 2, 3):
         made[carts] = tmp_path_factory.mktemp(f"report-{carts}")
@@ -84,7 +84,7 @@ def folders(tmp_path_factory) -> dict[int, Path]:
 
 
 def read(folder: Path) -> tuple[Page, str]:
-    """Return the parsed page and the PDF's text, "" without a PDF."""
+    """Return the parsed page and the PDF's text, which is "" without a PDF."""
     page = Page((folder / "report.html").read_text(encoding="utf-8"))
     if not (folder / "report.pdf").exists():
         return page, ""
@@ -94,7 +94,7 @@ def read(folder: Path) -> tuple[Page, str]:
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_every_part_is_there(carts, folders):
-    """Summary, model, tables, figures in the paper's order, checks, notes, what was skipped."""
+    """Page and PDF have every part: summary, model, tables, figures, checks and notes."""
     page, pdf = read(folders[carts])
 
     headings = [
@@ -112,13 +112,13 @@ def test_every_part_is_there(carts, folders):
     expected += ["damping", "feedback", "hardware-1", "overview", "sine", "steps"]
     assert names == sorted(expected)
     bode = re.findall(r"Bode plot of cart (\d)", " ".join(page.values("aria-label")))
-    assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as the paper
+    assert bode == [str(i) for i in range(carts, 0, -1)]  # last cart first, as in the paper
     assert "Émilie du Châtelet (s1025)" in page.text
     assert "Émilie du Châtelet (s1025)" in pdf
 
 
 def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
-    """Every figure lies between the heading it belongs to and the next one."""
+    """In print, every figure and question is in the same section as on the page."""
     html = (folders[3] / "report.html").read_text(encoding="utf-8")
     _, pdf = read(folders[3])
     marks = re.findall(r"<h2[^>]*>([^<]+)</h2>|<b>(Figure \d+)\.|<b>(Question\.)", html)
@@ -132,7 +132,7 @@ def test_print_keeps_figures_and_questions_where_the_page_has_them(folders):
 
 
 def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
-    """A long list of files is split into similar parts, each on one page."""
+    """A long list of files is split so that no page ends with a single row."""
     # One more than a page has room for:
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(97)}
     analysis = replace(make_analysis(1), files=files)
@@ -148,7 +148,7 @@ def test_no_page_ends_the_print_with_one_row_of_hashes(folders):
 
 @pytest.mark.parametrize(("number", "tall", "pages"), [(6, 1.02, 4), (7, 0.66, 3), (2, 0.66, 1)])
 def test_figures_in_a_row_fill_pages(number, tall, pages):
-    """Of 58 or 40 % of a page's height: a little smaller, one more fits; a few stay as drawn."""
+    """If one more figure fits a page when drawn slightly smaller, figures are made smaller."""
     svg = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 100 {100 * tall}"/>'
     row = tuple(
         Picture(number=n, name=f"p{n}", caption=spans("Two words"), alt="nothing", draw=lambda: svg)
@@ -158,13 +158,13 @@ def test_figures_in_a_row_fill_pages(number, tall, pages):
 
 
 def test_pages_are_laid_out_before_the_figures_are_drawn():
-    """Blank figures have the size of the drawn ones, so the pages come out the same."""
+    """Pages are laid out with blank figures of the final size before any figure is drawn."""
     document = build_document(make_analysis(2))
     pictures = document.pictures()
 
     layout = lay_out(document)
 
-    assert not any("svg" in vars(picture) for picture in pictures)  # nothing is drawn
+    assert not any("svg" in vars(picture) for picture in pictures)  # no figure is drawn yet
     for picture in pictures:
         blank, drawn = map(ElementTree.fromstring, (picture.blank, picture.svg))
         for size in ("width", "height", "viewBox"):
@@ -179,7 +179,7 @@ def numbers(text: str) -> list[float]:
 
 
 def without_blanks(document: Document) -> Document:
-    """Return the document with figures that must be drawn to be laid out."""
+    """Return the document with figures that are still undrawn, so that pages can be laid out."""
 
     def drawn(block: Block) -> Block:
         return replace(block, blank="") if isinstance(block, Picture) else block
@@ -198,7 +198,7 @@ def printed(*sections: Section) -> list[str]:
 
 @pytest.mark.parametrize("rows", [12, 20, 30])
 def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
-    """Even with few rows: their height fills the page."""
+    """A table longer than a page breaks, and its heading stays with its first rows."""
     text = "Dry friction holds the cart. " * 20
     body = tuple((cell(f"row-{i:02d}"), cell(text)) for i in range(rows))
     table = Table(1, spans("All checks."), (cell("Check"), cell("Found")), body, "ll")
@@ -212,7 +212,7 @@ def test_a_table_longer_than_a_page_breaks_and_stays_with_its_heading(rows):
 
 
 def test_the_list_of_files_does_not_stand_alone_on_a_page():
-    """Wherever a page ends, its heading and sentence move with it."""
+    """The heading and sentence of the list of files stay with it, wherever a page ends."""
     files = {f"data/run-{i:03d}.csv": f"{i:064x}" for i in range(40)}
     shown = Shown(replace(make_analysis(1), files=files))
     blocks = tuple(provenance_blocks(shown, "Made by the program."))
@@ -225,7 +225,7 @@ def test_the_list_of_files_does_not_stand_alone_on_a_page():
 
 
 def test_the_page_stands_alone(folders):
-    """Nothing is loaded, and the policy lets only the page's own script run."""
+    """The page loads nothing, and its policy lets only its own script run."""
     page, _ = read(folders[2])
 
     (policy,) = (
@@ -246,7 +246,7 @@ def test_the_page_stands_alone(folders):
 
 
 def test_the_page_can_be_found_and_heard(folders):
-    """Every section is linked, every figure described, every formula is mathematics."""
+    """Every section is linked, every figure described, and every formula is MathML."""
     page, _ = read(folders[3])
 
     ids = set(page.values("id"))
@@ -260,13 +260,13 @@ def test_the_page_can_be_found_and_heard(folders):
     assert len(figures) == len(drawings) > 5
     assert all(attrs.get("role") == "img" for attrs in drawings)
     assert all(attrs.get("aria-label") for attrs in drawings)
-    assert sum(tag == "title" for tag, _ in page.tags) == 1  # one in a drawing would pop up
+    assert sum(tag == "title" for tag, _ in page.tags) == 1  # a drawing's title would pop up
     assert sum(attrs.get("display") == "block" for tag, attrs in page.tags if tag == "math") >= 6
     assert ("html", {"lang": "en"}) in page.tags
 
 
 def test_a_report_without_a_title_says_what_it_is_once():
-    """Its subject is then its title, and is not repeated above it."""
+    """A report without a title uses its subject as title and does not repeat it."""
     analysis = make_analysis(2)
     named = build_document(analysis)
     bare = build_document(replace(analysis, title=" "))
@@ -280,7 +280,7 @@ def test_a_report_without_a_title_says_what_it_is_once():
 
 
 def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
-    """HTML, PDF and every figure are reproducible."""
+    """The same analysis gives the same bytes of HTML, PDF and every figure."""
     render_report(make_analysis(2), tmp_path)
     first = sorted(folders[2].rglob("*.*"))
     assert len(first) > 8
@@ -290,7 +290,7 @@ def test_the_same_analysis_gives_the_same_bytes(folders, tmp_path):
 
 
 def test_the_pdf_is_archival_and_navigable(folders):
-    """PDF/A-2a and PDF/UA-1, with bookmarks, title, authors, pages, described figures."""
+    """The PDF follows PDF/A-2a and PDF/UA-1 and has bookmarks, title, authors and page numbers."""
     reader = pypdf.PdfReader(folders[3] / "report.pdf")
 
     assert reader.metadata is not None
@@ -319,7 +319,7 @@ HOSTILE = '#import "/etc/passwd": * $x^2$ <script>alert(1)</script> {{ 7*7 }} `#
 
 
 def test_hostile_text_stays_text(tmp_path):
-    """Markup of typst, HTML, Jinja and Markdown in every field is shown as text."""
+    """Markup of typst, HTML, Jinja and Markdown in any field appears as plain text."""
     analysis = make_analysis(2)
     evil = replace(
         analysis,
@@ -346,7 +346,7 @@ def test_hostile_text_stays_text(tmp_path):
 
 
 def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
-    """Chinese and emoji appear on the page; the PDF has boxes, and both say so."""
+    """If the PDF's fonts lack characters of a name, the PDF has boxes, and a warning says so."""
     said = []
     analysis = replace(make_analysis(1), authors=(("s1", "李雷 😀"), ("s2", "Žofie Ελένη Иван")))
     render_report(analysis, tmp_path, progress=said.append)
@@ -364,7 +364,7 @@ def test_names_that_the_fonts_lack_are_warned_of(tmp_path):
 
 
 def test_control_characters_do_no_harm(tmp_path):
-    """Ids and titles with bytes that XML and PDF forbid still give both files."""
+    """Ids and titles with characters that XML and PDF forbid still give both files."""
     analysis = make_analysis(1)
     odd = "a\x00b\x0bc\ud800d\ufffee"
     render_report(
@@ -382,7 +382,7 @@ def test_control_characters_do_no_harm(tmp_path):
 
 
 def bare(analysis: Analysis, **parts) -> Analysis:
-    """Return an analysis that found nothing, except the given parts."""
+    """Return an analysis without results, except for the given parts."""
     empty = replace(
         analysis,
         records=(),
@@ -404,7 +404,7 @@ def bare(analysis: Analysis, **parts) -> Analysis:
 
 
 def test_without_anything_the_reasons_are_told(tmp_path):
-    """No data at all still gives a report, with the reason for each missing result."""
+    """If there are no results at all, the report gives the reason for each missing one."""
     page, pdf = render(bare(make_analysis(2)), tmp_path)
     for text in (page.text, pdf):
         assert "No model of the chain of 2 carts could be identified" in text
@@ -414,7 +414,7 @@ def test_without_anything_the_reasons_are_told(tmp_path):
 
 
 def test_without_anything_and_without_reasons_there_is_still_a_report(tmp_path):
-    """No link leads to a missing section."""
+    """If there are neither results nor reasons, a report is still made, without dead links."""
     page, pdf = render(bare(make_analysis(1), skipped=()), tmp_path)
     assert "No model of the single cart could be identified" in pdf
     assert {href[1:] for href in page.values("href")} <= set(page.values("id"))
@@ -426,7 +426,7 @@ def test_without_anything_and_without_reasons_there_is_still_a_report(tmp_path):
      "checks", "feedback", "hardware", "discussion"],
 )  # fmt: skip
 def test_any_part_may_be_missing(part, tmp_path):
-    """Without one part the rest of the page is there."""
+    """If one part of the analysis is missing, the rest of the page is there."""
     analysis = make_analysis(1, repeats=1)
     empty = None if part in ("fit", "feedback", "discussion") else ()
     page, _ = render(replace(analysis, **{part: empty}), tmp_path, pdf=False)
@@ -440,7 +440,7 @@ def test_any_part_may_be_missing(part, tmp_path):
     ["log_decrements", "step_gains", "sine_points", "frequency_responses", "feedback", "hardware"],
 )
 def test_any_part_may_stand_alone(part, tmp_path):
-    """One stage's results, with their records, give a page and a PDF."""
+    """Results of a single stage with their records give a page and a PDF."""
     analysis = make_analysis(1)
     kept = bare(analysis, records=analysis.records, **{part: getattr(analysis, part)})
     page, pdf = render(kept, tmp_path)
@@ -449,7 +449,7 @@ def test_any_part_may_stand_alone(part, tmp_path):
 
 
 def test_a_table_of_ratios_has_no_phase(tmp_path):
-    """The Bode figure has magnitude and residual only, and names its source."""
+    """For a table of ratios, the Bode figure has no phase and names its source."""
     analysis = make_analysis(1)
     (response,) = analysis.frequency_responses
     table = replace(response, phase=None, phase_std=None, source="table")
@@ -477,7 +477,7 @@ CHAINS = {
 
 @pytest.mark.parametrize("name", CHAINS)
 def test_unusual_chains_are_shown(name, tmp_path):
-    """A rigid body, heavy damping, no walls, four carts, a negative spring: all have a model."""
+    """Unusual chains have a model on the page, for example a rigid body or a negative spring."""
     chain = CHAINS[name]
     analysis = make_analysis(min(chain.n, 3))
     assert analysis.fit is not None
@@ -504,7 +504,7 @@ def test_unusual_chains_are_shown(name, tmp_path):
 
 
 def test_a_poor_result_is_called_so(tmp_path):
-    """The summary lists disagreements, failures and unconverged fits, with what to do."""
+    """If results disagree or the fit failed, the summary says so and what to do."""
     analysis = make_analysis(2)
     assert analysis.fit is not None
     fit = replace(analysis.fit, converged=False, message="k_1 at its bound", chi_square_per_dof=9.0)
@@ -519,7 +519,7 @@ def test_a_poor_result_is_called_so(tmp_path):
     assert "The failed fit ended at K_1" in text
     assert "It has" not in text
     assert "the residual is larger than the stated noise" in text
-    assert "±" in terminal_summary(analysis)  # which needs that only noise is left
+    assert "±" in terminal_summary(analysis)  # this needs a fit that leaves only noise
     assert "±" not in text
     assert "K_1 (+23.4 %)" in text
     assert "1 of 2 checks failed" in text
@@ -528,7 +528,7 @@ def test_a_poor_result_is_called_so(tmp_path):
 
 
 def test_a_cart_that_a_step_set_swinging_was_not_let_go():
-    """Without a decay, the ring-down of a step of the single cart is used."""
+    """Without a decay, the figure shows the ring-down of a step and calls it that."""
     analysis = make_analysis(1)
     ringing = {decay.experiment for decay in analysis.log_decrements}
     records = tuple(replace(r, kind="step") if r.id in ringing else r for r in analysis.records)
@@ -543,7 +543,10 @@ def test_a_cart_that_a_step_set_swinging_was_not_let_go():
 
 
 def test_what_was_not_used_is_not_said_to_be():
-    """A record left out is not a source of the model; a missing file is asked for."""
+    """A record left out is not listed as a source of the model.
+
+    If a file is missing, the summary asks for it.
+    """
     analysis = make_analysis(2)
     dwells = [record.id for record in analysis.records if record.kind == "sine"]
     left_out = LeftOut(experiment=dwells[0], reason="froze", is_wrong=True)
@@ -568,7 +571,7 @@ def test_what_was_not_used_is_not_said_to_be():
 
 
 def test_a_file_that_cannot_be_read_asks_for_no_experiment():
-    """The summary asks for that file; only other skipped stages ask for more."""
+    """If a file cannot be read, the summary asks for this file and not for a new experiment."""
     unread = Skipped(stage=Stage.READING, run="step-1", reason="empty")
     reason = "no closed-loop run was recorded"
     other = Skipped(stage=Stage.HARDWARE_CHECK, reason=reason, missing="a closed-loop run")
@@ -581,7 +584,7 @@ def test_a_file_that_cannot_be_read_asks_for_no_experiment():
 
 
 def test_skipped_stages_are_told_apart():
-    """Names of stages contain commas, so another sign separates them."""
+    """Skipped stages are separated by semicolons, since their names contain commas."""
     skipped = tuple(
         Skipped(stage=Stage.LOG_DECREMENT, run=f"decay-{i}", cart=1, reason="too short")
         for i in range(5)
@@ -593,7 +596,7 @@ def test_skipped_stages_are_told_apart():
 
 
 def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
-    """In the summary, on the terminal and in the list, as in submission.toml."""
+    """An id with underscores is shown unchanged in the lists of skipped stages."""
     decay = Skipped(stage=Stage.LOG_DECREMENT, run="my_decay_1", cart=1, reason="too short")
     skipped = (decay,)
     analysis = replace(make_analysis(1), skipped=skipped)
@@ -603,7 +606,7 @@ def test_an_id_keeps_its_underscores_where_it_was_skipped(tmp_path):
 
 
 def test_a_good_result_is_called_so():
-    """Without any problem the summary says so in a few lines."""
+    """If there is no problem, the summary says so in a few lines."""
     analysis = make_analysis(1, repeats=1)
     rows = tuple(replace(row, consistent=True) for row in analysis.rows)
     checks = tuple(check for check in analysis.checks if check.outcome == "pass")
@@ -620,7 +623,7 @@ def test_a_good_result_is_called_so():
 
 
 def test_one_swing_shows_no_rise_of_the_damping():
-    """The figure of damping against swing needs a record with two of them."""
+    """Damping is drawn against amplitude only if a decay has at least two amplitudes."""
     analysis = make_analysis(1)
     one = tuple(
         replace(decay, zeta_at_amplitude=decay.zeta_at_amplitude[:, :1])
@@ -632,7 +635,7 @@ def test_one_swing_shows_no_rise_of_the_damping():
 
 
 def test_what_may_be_either_of_two_values_is_said_with_both():
-    """If a gain of the fit may differ from that of the steps, both are shown."""
+    """If it is open whether a gain changed, the summary gives both values."""
     analysis = make_analysis(1)
     (first, *others) = analysis.rows
     initial, final = Estimate(value=29.0, std=0.1, source="step"), first.final
@@ -645,9 +648,9 @@ def test_what_may_be_either_of_two_values_is_said_with_both():
 
 
 def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
-    """If steps contradict a fit with too few springs, springs are named.
+    """If steps contradict a fit with few springs, the summary asks for the springs.
 
-    Dry friction comes apart.
+    Dry friction is mentioned separately.
     """
     analysis = make_analysis(2)
     assert analysis.fit is not None
@@ -667,7 +670,7 @@ def test_gains_that_the_fit_cannot_give_ask_for_the_springs():
 
 
 def test_a_wrong_sign_is_said_first():
-    """A sign that the data contradict comes first, as it may cause the other failures."""
+    """A sign that the data contradict is named first, since it may cause other failures."""
     analysis = make_analysis(1, repeats=1)
     wrong = Check(
         kind="input",

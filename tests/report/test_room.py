@@ -1,4 +1,4 @@
-"""How pages are filled: the layouts tried, and the one kept."""
+"""Pages are filled by trying several layouts and keeping the best."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,7 @@ TOP, BOTTOM = 50.0, 750.0
 
 
 def figures(*heights: float) -> Callable[[Choices], Pages]:
-    """Return the layout of figures with these heights, one after the other."""
+    """Return the layout of figures with these heights, one below the other."""
 
     def lay_out(choices: Choices) -> Pages:
         ends, page, y = [], 1, TOP
@@ -25,19 +25,19 @@ def figures(*heights: float) -> Callable[[Choices], Pages]:
 
 
 def test_a_figure_that_nearly_fits_comes_up():
-    """It and the one above it are drawn smaller by the same factor."""
+    """A figure that nearly fits, and the one above it, are drawn smaller by the same factor."""
     shares = fill_pages(figures(400.0, 350.0, 100.0)).shares
     assert shares == {1: shares[1], 2: shares[1]}
     assert (BOTTOM - TOP) * 0.9 < shares[1] * 750.0 <= BOTTOM - TOP
 
 
 def test_no_figure_becomes_too_small_to_read():
-    """If it does not fit by far, the page keeps its white space."""
+    """If a figure would become too small to read, the page keeps its white space."""
     assert fill_pages(figures(400.0, 600.0, 100.0)) == Choices()
 
 
 def test_full_pages_are_left_as_they_are():
-    """The document is laid out once."""
+    """If all pages are full, the document is laid out once."""
     told = []
 
     def lay_out(choices: Choices) -> Pages:
@@ -49,7 +49,7 @@ def test_full_pages_are_left_as_they_are():
 
 
 def test_a_table_stays_whole_where_less_is_white_then():
-    """It was split in two, and the page of the second part was half empty."""
+    """A table is kept on one page if that leaves less white space."""
 
     def lay_out(choices: Choices) -> Pages:
         begun = 2 if choices.whole == (7,) else 1
@@ -65,5 +65,5 @@ def test_a_table_stays_whole_where_less_is_white_then():
 
 
 def test_a_document_without_blocks_has_no_pages_to_fill():
-    """Nothing is chosen."""
+    """A document without blocks needs no choices."""
     assert fill_pages(lambda choices: Pages(ends=[], top=TOP, bottom=BOTTOM)) == Choices()

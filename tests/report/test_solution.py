@@ -1,4 +1,4 @@
-"""The worked reference: every printed formula is true, and its numbers are the model's."""
+"""In the worked reference every printed formula is true, and its numbers are the model's."""
 
 import json
 from collections.abc import Mapping
@@ -128,7 +128,7 @@ def truth(request):
 
 
 def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
-    """Newton's laws, their transforms and every step of the elimination are identities."""
+    """Each printed step from Newton's laws to the transfer functions is an identity."""
     springs, chain = truth
     n = len(springs) - 1
     equations = [*derivation.newton(springs), *derivation.laplace(springs)]
@@ -143,7 +143,7 @@ def test_motion_and_elimination_are_true_of_the_impedance_matrix(truth):
 
 
 def test_the_way_back_is_true_of_the_impedance_matrix(truth):
-    """Every step from coefficients to carts, couplings, masses and springs is an identity."""
+    """Each printed step from coefficients back to masses and springs is an identity."""
     springs, chain = truth
     n = len(springs) - 1
     names = chain.names()
@@ -156,7 +156,7 @@ def test_the_way_back_is_true_of_the_impedance_matrix(truth):
 
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_coefficients_are_those_of_the_product_of_factors(n):
-    """The printed sums are the expanded product of the table's quadratic factors."""
+    """The printed coefficients are those of the product of the quadratic factors."""
     modes = {"d": "abcd"[:n]} | ({"n": "xy"} if n == 3 else {})
     table = {
         f"{greek}_{mode}": sympy.Symbol(f"{greek}_{mode}")
@@ -180,7 +180,7 @@ def test_coefficients_are_those_of_the_product_of_factors(n):
 
 
 def test_the_redundancies_are_as_many_as_the_checks():
-    """One for two carts, five for three: 8 parameters for 7, 15 for 10."""
+    """The number of redundancies is 1 for two carts and 5 for three, as in the checks."""
     assert [len(derivation.redundancies(n)) for n in (1, 2, 3)] == [0, 1, 5]
 
 
@@ -198,7 +198,7 @@ def test_numbers_put_in_step_by_step_end_in_the_state_model(chain):
     assert_allclose([evaluate(text, values) for text in column], B[:, 0], rtol=1e-9)
 
 
-# --------------------------------------------------------- what is displayed is true
+# -------------------------------------------- displayed formulas equal the tested ones
 
 WRITTEN = {
     "ω": "omega", "ζ": "zeta", "κ": "kappa", "Δ": "Delta", "·": "*",
@@ -206,7 +206,7 @@ WRITTEN = {
 
 
 def read_back(term) -> str:
-    """Return mathematics as a reader takes it: side by side is a product."""
+    """Return a displayed formula as a reader takes it: adjacent parts are multiplied."""
     if isinstance(term, str):
         return WRITTEN.get(term, term.replace("−", "-"))
     parts = [read_back(part) for part in term.parts]
@@ -233,7 +233,7 @@ def side_by_side(parts):
 
 @pytest.mark.parametrize("springs", SPRINGS, ids=numbered)
 def test_a_formula_reads_as_the_text_it_is_made_from(springs):
-    """Read back with its brackets, every displayed formula is the expression tested."""
+    """Every displayed formula, read back with its brackets, equals the tested expression."""
     n = len(springs) - 1
     equations = [*derivation.newton(springs), *derivation.laplace(springs)]
     equations += [*derivation.couplings(n), *derivation.physical(springs)]
@@ -260,7 +260,7 @@ def test_a_formula_reads_as_the_text_it_is_made_from(springs):
 
 
 def test_numbers_put_in_are_worked_out_as_written():
-    """With numbers for names, signs and powers of ten, the displayed line gives the result."""
+    """A displayed line with numbers put in gives the result, whatever signs and powers it has."""
     values = {"a": -2.0, "b": 3e-7, "c": 0.5}
     for text in ("a*b-c", "(a-b)/c", "c-a*(b+a)", "-a**2+c", "a-(b-c)", "a/b*c"):
         seen = parsed(read_back(shown_with(text, values)))
@@ -273,7 +273,7 @@ def test_numbers_put_in_are_worked_out_as_written():
 @pytest.mark.parametrize("method", ["lqr", "poles"])
 @pytest.mark.parametrize("preset", ["throne-1dof", "throne-2dof", "throne-3dof"])
 def test_the_worked_gains_are_the_designed_ones(preset, method):
-    """Riccati's equation and Ackermann's formula give the gains of the design stage."""
+    """The worked Riccati and Ackermann solutions give the gains of the design stage."""
     chain = PRESETS[preset]
     design = design_feedback(
         chain,
@@ -296,7 +296,7 @@ def test_the_worked_gains_are_the_designed_ones(preset, method):
 
 
 def test_ackermann_is_exact_in_symbols():
-    """For any plant of two states the formula gives phi - gamma G the desired polynomial."""
+    """For any plant with two states, Ackermann's formula gives the desired polynomial."""
     a, b, c, d, e, f, p, q = sympy.symbols("a:f p q")
     phi, gamma, z = sympy.Matrix([[a, b], [c, d]]), sympy.Matrix([e, f]), sympy.Symbol("z")
     reach = sympy.Matrix.hstack(gamma, phi * gamma)
@@ -309,7 +309,7 @@ def test_ackermann_is_exact_in_symbols():
 
 
 def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
-    """Every expected value passes; a frequency in Hz or a doubled gain is far outside."""
+    """Every expected value is within its own tolerance; a value in Hz or a doubled gain is not."""
     analysis = make_analysis(3)
     for p in expected_parameters(analysis, default_rubric(analysis)):
         assert p.tolerance is not None
@@ -326,7 +326,7 @@ def test_the_reference_passes_its_own_tolerances_and_a_slip_does_not():
     ("carts", "hide"), [(1, ()), (3, ()), pytest.param(1, ("dead_zone",), id="not linear")]
 )
 def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide):
-    """A student at a bound earns all points, and beyond it fewer."""
+    """A student at a bound of the solution earns all points by the rubric, beyond it fewer."""
     one = student(carts, hide=hide)
     expected = expected_parameters(one.analysis, one.rubric)
     assert len(expected) == len(one.rubric.names)
@@ -334,7 +334,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
         assert p.low is not None
         assert p.high is not None
         for bound, out in ((p.low, 0.995), (p.high, 1.005)):
-            if bound == 0:  # within the errors: no lower one
+            if bound == 0:  # within the errors there is no lower bound
                 continue
             shares = []
             for value in (bound * (2 - out), bound * out**4):
@@ -346,7 +346,7 @@ def test_the_solution_accepts_what_the_rubric_gives_full_points_for(carts, hide)
 
 
 def test_another_rubric_has_other_bounds(tmp_path):
-    """The rubric of `--rubric` decides what the page and the file accept, and is named there."""
+    """With `--rubric`, the bounds on page and in file are those of this rubric, which is named."""
     analysis = make_analysis(2)
     text = (RUBRICS / "throne-2dof.toml").read_text(encoding="utf-8")
     text = text.replace(
@@ -382,7 +382,7 @@ def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
         worked = work_out(derivation.state_steps(chain.n), moved)
         A = np.array([[evaluate(text, worked) for text in line] for line in rows])
         inside.append(np.abs(A - model.A) <= model.A_tolerance + 1e-6 * np.abs(model.A))
-    # A third of the tolerance is one standard error: three hold 99.7 %.
+    # A third of the tolerance is one standard error, so the tolerance holds 99.7 %.
     assert np.mean(inside) > 0.97
 
 
@@ -391,7 +391,7 @@ def test_entry_tolerances_cover_tables_that_are_off_as_accepted(chain, seed):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_the_document_works_everything_out(carts):
-    """Each worked section is there, with the model's numbers."""
+    """The document has every worked section with the model's numbers."""
     analysis = make_analysis(carts)
     document = build_solution(analysis)
     ids = [section.id for section in document.sections]
@@ -410,7 +410,7 @@ def test_the_document_works_everything_out(carts):
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_nothing_that_students_wrote_stands_in_the_solution(carts):
-    """Their notes are left out, and every question of the data has a model answer."""
+    """The solution leaves out students' notes and answers every question of the data itself."""
     analysis = make_analysis(carts)
     asked = ask(analysis)
     notes = "# Discussion\n\nOurs alone.\n" + "".join(
@@ -426,14 +426,14 @@ def test_nothing_that_students_wrote_stands_in_the_solution(carts):
 
 @pytest.mark.parametrize("kind", get_args(Kind))
 def test_every_kind_of_question_has_a_model_answer(kind):
-    """Each has a text, which is not itself a question."""
+    """Each kind of question has a model answer that asks nothing."""
     answer = model_answer(Asked(kind=kind, id="x", section="x", text="x"))
     assert len(plain(answer.text)) > 100
     assert "?" not in plain(answer.text)
 
 
 def test_what_has_no_table_is_left_out():
-    """Without a fit there is only the derivation; a rigid cart has its own, short one."""
+    """Without a fit the solution has only the derivation; a rigid cart has a short one."""
     bare = replace(make_analysis(2), fit=None, rows=(), feedback=None)
     ids = [section.id for section in build_solution(bare).sections]
     assert ids[1:3] == ["motion", "transfer-functions"]
@@ -454,7 +454,7 @@ def analyse_rigid():
 
 
 def test_solution_json_is_the_reference_for_programs():
-    """All parameters with tolerances, A and B with theirs, the gains; the same bytes twice."""
+    """`solution.json` has parameters, A and B with tolerances, and gains, always the same bytes."""
     analysis = make_analysis(2)
     text = solution_text(analysis)
     assert text == solution_text(analysis)
@@ -466,7 +466,7 @@ def test_solution_json_is_the_reference_for_programs():
 
 
 def test_a_reference_that_failed_a_check_says_so_where_its_numbers_stand():
-    """In the file, under the title and before the table of expected values; nowhere else."""
+    """If the reference failed a check, the page says so under its title and above the values."""
     doubtful = make_analysis(2)
     (failed,) = doubtful.failed_checks
     sound = replace(doubtful, checks=tuple(c for c in doubtful.checks if c != failed))

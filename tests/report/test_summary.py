@@ -1,4 +1,4 @@
-"""The summary's sentences follow from the evidence; every failed check has its action."""
+"""The summary follows from the evidence, and gives an action for each failed check."""
 
 import json
 import shutil
@@ -28,20 +28,23 @@ needs_real = pytest.mark.skipif(
 
 
 def next_part(analysis: Analysis) -> list[str]:
-    """Return what to do next, one line each."""
+    """Return the lines of the part on what to do next."""
     _, _, advice = terminal_summary(analysis).partition("What to do next.")
     return [line.removeprefix("- ") for line in advice.splitlines() if line]
 
 
 def every_failed_check_is_named(analysis: Analysis) -> bool:
-    """Whether the advice names each failed check."""
+    """Check that the advice names each failed check."""
     told = "\n".join(next_part(analysis))
     return all((check.about or check.id) in told for check in analysis.failed_checks)
 
 
 @needs_real
 def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
-    """Five steps give both estimates, and without a decay friction cannot show."""
+    """With only steps, the summary does not claim two methods and does not mention friction.
+
+    Both estimates come from the same steps.
+    """
     analysis = analyse(load_submission(write_one_cart_submission(tmp_path / "s", REAL_DATA)))
     text = terminal_summary(analysis)
     assert "identified from 5 steps" in text
@@ -64,7 +67,10 @@ def test_only_steps_are_no_two_ways_and_no_decays(tmp_path):
 
 @needs_real
 def test_the_steps_counted_are_those_of_the_fit(tmp_path):
-    """Of ten steps four were fitted: one was left out, and five were of one cart alone."""
+    """The summary counts only the steps that the fit used.
+
+    Of ten steps one was left out, and five were of one cart alone.
+    """
     folder = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     analysis = analyse(load_submission(folder))
     assert analysis.fit is not None
@@ -75,12 +81,15 @@ def test_the_steps_counted_are_those_of_the_fit(tmp_path):
     assert "For K_1, K_2, ω_a and ω_b both estimates use the same recordings." in text
     assert every_failed_check_is_named(analysis)
     advice = next_part(analysis)
-    assert advice[0].startswith("Fix the recordings that were left out")  # the worst first
+    assert advice[0].startswith("Fix the recordings that were left out")  # the worst one first
     assert "Failed: record.both-1" in advice[0]
 
 
 def test_an_independent_check_is_not_called_the_same():
-    """Decays and steps beside dwells are two methods; peaks read off the dwells are not."""
+    """Initial estimates from decays and steps are called independent of dwells.
+
+    Peaks read off the dwells are not.
+    """
     analysis = analysed("two-cart")
     said = {row.name: row.independent for row in analysis.rows if row.independent is not None}
     assert said == {
@@ -89,13 +98,13 @@ def test_an_independent_check_is_not_called_the_same():
     }  # fmt: skip
     text = terminal_summary(analysis)
     assert "identified from 23 sine dwells, by" in text
-    assert "sweep" not in text.splitlines()[0]  # no number rests on it
+    assert "sweep" not in text.splitlines()[0]  # no number depends on it
     notes = plain_of(parameter_blocks(Page(analysis)))
     assert "ω_a, ω_b: initial and final estimates use the same recordings" in notes
 
 
 def plain_of(blocks) -> str:
-    """Return lists and paragraphs among blocks as text."""
+    """Return the text of lists and paragraphs among blocks."""
     found = []
     for block in blocks:
         if block.kind == "paragraph":
@@ -106,7 +115,7 @@ def plain_of(blocks) -> str:
 
 
 def test_the_sources_of_the_table_are_those_there_are():
-    """Without a decay no sentence mentions one."""
+    """If there is no decay, no sentence about the table mentions one."""
     analysis = make_analysis(1)
     without = tuple(
         replace(row, initial=None) if row.initial and row.initial.source == "log_decrement" else row
@@ -119,7 +128,7 @@ def test_the_sources_of_the_table_are_those_there_are():
 
 
 def test_a_check_that_nobody_foresaw_is_named_too():
-    """By its id and message, before the error of the linear carts."""
+    """An unknown failed check is named by id and message, before the fit's error."""
     odd = Check(
         kind="order", run="run-1", outcome="fail", value=1.0, limit=0.5, message="run-1: odd."
     )
@@ -139,7 +148,10 @@ def test_a_check_that_nobody_foresaw_is_named_too():
 
 @pytest.mark.parametrize("drop", ["step", "step sine sweep"])
 def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
-    """It does not repeat the reason of the failure, nor ask for an impossible table."""
+    """Without runs of all carts, the advice is what to record.
+
+    It neither repeats the reason nor asks for a table.
+    """
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
     head, *tables = toml.read_text(encoding="utf-8").split("[[experiments]]")
@@ -161,7 +173,7 @@ def test_without_runs_of_all_carts_the_advice_is_what_to_record(drop, tmp_path):
 
 
 def test_nothing_failed_is_named_in_no_list():
-    """A good report lists no failed checks, in the summary or in its section."""
+    """If no check failed, neither the summary nor its section lists failed checks."""
     analysis = analysed("one-cart")
     assert not any("Failed:" in line for line in next_part(analysis))
     blocks = check_blocks(Page(analysis))
@@ -170,7 +182,7 @@ def test_nothing_failed_is_named_in_no_list():
 
 
 def test_a_question_about_one_recording_does_not_ask_of_two():
-    """If both estimates use the same recordings, the question does not speak of two amplitudes."""
+    """If both estimates use the same recordings, the question does not ask about two amplitudes."""
     analysis = make_analysis(1)
     rows = tuple(
         replace(row, consistent=False, change_percent=80.0, independent=False)

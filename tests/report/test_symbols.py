@@ -1,4 +1,4 @@
-"""Parameters appear as symbols wherever a person reads, whatever their names in files."""
+"""A parameter is shown as its symbol, whatever its name in files."""
 
 import re
 from decimal import Decimal
@@ -26,7 +26,7 @@ def raw(html: str) -> list[str]:
 
 @pytest.mark.parametrize("carts", [1, 2, 3])
 def test_reports_write_symbols(carts):
-    """The report, the solution and the terminal; a key to type is set as code."""
+    """Report, solution and terminal show symbols for parameters, never names of files."""
     analysis = make_analysis(carts)
     assert raw(render_html(build_document(analysis))) == []
     assert raw(render_html(build_solution(analysis))) == []
@@ -34,7 +34,7 @@ def test_reports_write_symbols(carts):
 
 
 def test_grades_write_symbols():
-    """The feedback to a student with many mistakes, and its form for a platform."""
+    """The feedback to a student shows symbols, also in its form for a platform."""
     one = student(2)
     off = {name: one.value("final", name) * 2 for name in ("zeta_b", "omega_1", "K_1")}
     feedback = one.reported.feedback

@@ -1,4 +1,4 @@
-"""Tables of a report: the students' own numbers, the limits, the dwells."""
+"""A report's tables show the students' own numbers, the limits and the dwells."""
 
 from dataclasses import replace
 from decimal import Decimal
@@ -17,7 +17,10 @@ def page(rows, reported=None) -> Page:
 
 
 def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
-    """A factor of 2π names the likely slip; a rounded number gets no hint."""
+    """If a reported number is off by a factor of 2π, a hint names the likely slip.
+
+    A number that is merely rounded gets no hint.
+    """
     rows = make_analysis(1).rows
     true = {row.name: row.final.value for row in rows if row.final}
     mine = {"K": f"{true['K']:.3g}", "omega_n": f"{true['omega_n'] / 6.2832:.3g}"}
@@ -33,7 +36,7 @@ def test_a_number_of_ones_own_that_is_off_says_what_to_look_at():
 
 
 def test_what_was_assumed_says_nothing_of_a_number():
-    """A guess is not a measurement that a student's number could contradict."""
+    """An assumed value is not compared with the student's number."""
     row = make_analysis(1).rows[0]
     assert row.initial
     assumed = replace(row, initial=replace(row.initial, source="assumed"))
@@ -42,7 +45,7 @@ def test_what_was_assumed_says_nothing_of_a_number():
 
 
 def test_nothing_found_and_no_known_slip_say_nothing():
-    """A number without an estimate is beside a dash; a wrong mass gets no hint."""
+    """A number without an estimate has a dash beside it, and an unknown slip gets no hint."""
     row = make_analysis(1).rows[0]
     mine = {row.name: Decimal("3.0")}
     table = reported_table(page([replace(row, final=None)], {"final": mine}))
@@ -54,7 +57,7 @@ def test_nothing_found_and_no_known_slip_say_nothing():
 
 
 def test_agree_stands_beside_its_limit():
-    """A gain within 15 %, a damping ratio within 50 %."""
+    """The table gives the limit of agreement: 15 % for gains and frequencies, 50 % for damping."""
     rows = [row for row in make_analysis(1).rows if row.consistent is not None]
     table = parameter_table(page(rows))
     limits = {plain(row[0].text): plain(row[6].text) for row in table.rows}
@@ -63,7 +66,7 @@ def test_agree_stands_beside_its_limit():
 
 
 def test_a_dwell_that_did_not_settle_is_said():
-    """The table has every dwell and cart."""
+    """The table lists every dwell and cart, and marks a dwell that did not settle."""
     analysis = make_analysis(2)
     settled = [replace(point, settled=True) for point in analysis.sine_points]
     points = (replace(settled[0], settled=False), *settled[1:])

@@ -21,7 +21,7 @@ RUBRIC = RUBRICS / "throne-1dof.toml"
 
 
 def change(folder, old, new):
-    """Type something else into `submission.toml`, once."""
+    """Replace one text in `submission.toml`, once."""
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8")
     assert old in text
@@ -34,19 +34,19 @@ def check(folder, *more) -> Done:
 
 @pytest.fixture
 def honest(tmp_path):
-    """A submission whose numbers are right."""
+    """Write a submission whose numbers are right."""
     return a_submission(tmp_path / "team")
 
 
 @pytest.fixture
 def in_hertz(honest):
-    """A submission whose first frequency is in Hz."""
+    """Write a submission whose first frequency is in Hz."""
     change(honest, "omega_n = 13.1", "omega_n = 2.085")
     return honest
 
 
 def test_right_numbers_are_status_0(honest):
-    """The one question is recorded in the folder."""
+    """If all numbers agree, the exit status is 0, and the folder records the one question."""
     done = check(honest, "--rubric", RUBRIC)
     assert done.returncode == 0
     assert re.match(r"All \d+ numbers that were checked agree", done.stdout)
@@ -54,7 +54,10 @@ def test_right_numbers_are_status_0(honest):
 
 
 def test_first_which_then_where(in_hertz):
-    """Status 1 both times; the value, 13.1, is in neither, nor in the file."""
+    """The first answer names the wrong number, the second says where to look.
+
+    Neither gives the right value, and the exit status is 1 both times.
+    """
     first, second = check(in_hertz), check(in_hertz)
     assert (first.returncode, second.returncode) == (1, 1)
     assert "initial.omega_n" in first.stdout
@@ -67,7 +70,10 @@ def test_first_which_then_where(in_hertz):
 
 
 def test_a_change_begins_again_with_which(in_hertz):
-    """Also after a change that is wrong again; every question is counted."""
+    """After any change, the next answer again says only which numbers disagree.
+
+    Every question is counted.
+    """
     check(in_hertz)
     change(in_hertz, "omega_n = 2.085", "omega_n = 9.0")
     again = check(in_hertz)
@@ -76,7 +82,10 @@ def test_a_change_begins_again_with_which(in_hertz):
 
 
 def test_json_is_the_line_that_is_added(in_hertz):
-    """It fits the shipped schema, and holds no time."""
+    """The line that `--json` prints is the line added to the file; it follows the schema.
+
+    It contains no time.
+    """
     schema = json.loads((ROOT / "docs" / "check.schema.json").read_text(encoding="utf-8"))
     lines = [check(in_hertz, "--json").stdout for _ in range(3)]
     assert (in_hertz / FILE).read_text(encoding="utf-8") == "".join(lines)
@@ -86,7 +95,7 @@ def test_json_is_the_line_that_is_added(in_hertz):
 
 
 def test_a_rubric_of_other_carts_cannot_be_used(honest):
-    """One line says so; nothing is counted."""
+    """If the rubric is for other carts, one line says so and nothing is counted."""
     done = check(honest, "--rubric", "throne-2dof")
     assert done.returncode == 2
     assert "the submission is for 1 cart, the rubric for 2" in done.stderr
@@ -94,7 +103,7 @@ def test_a_rubric_of_other_carts_cannot_be_used(honest):
 
 
 def test_nothing_reported_cannot_be_checked(honest):
-    """The message says what to write where."""
+    """If no number is reported, the message says what to write where."""
     path = honest / "submission.toml"
     text = path.read_text(encoding="utf-8").partition("[reported")[0]
     path.write_text(text, encoding="utf-8")
@@ -107,7 +116,7 @@ def test_nothing_reported_cannot_be_checked(honest):
     "text", ["", "\n", "{}\n", "no json\n", '{"ask": 1}\n', "[" * 100_000, "\x00", "\u2028\n"]
 )
 def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
-    """One line names it; the file stays. An empty file is accepted."""
+    """A changed file of answers is refused by one line and stays; an empty file is accepted."""
     (honest / FILE).write_text(text, encoding="utf-8")
     done = check(honest)
     if text:
@@ -119,7 +128,10 @@ def test_a_file_of_asks_that_is_not_as_it_was_is_refused(honest, text):
 
 
 def test_a_line_taken_out_is_refused(in_hertz):
-    """Questions are numbered, so a missing one shows."""
+    """If a line of the file is missing, `cartlab check` refuses to answer.
+
+    The questions are numbered, so a missing one shows.
+    """
     for _ in range(3):
         check(in_hertz)
     _, *rest = (in_hertz / FILE).read_text(encoding="utf-8").splitlines(keepends=True)
@@ -129,7 +141,7 @@ def test_a_line_taken_out_is_refused(in_hertz):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="links of POSIX")
 def test_a_link_is_not_followed(honest, tmp_path):
-    """The file behind it is neither read nor written."""
+    """If the file of answers is a link, the file that it points to is neither read nor written."""
     other = tmp_path / "other.txt"
     other.write_text("mine", encoding="utf-8")
     (honest / FILE).symlink_to(other)
@@ -140,7 +152,10 @@ def test_a_link_is_not_followed(honest, tmp_path):
 
 
 def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
-    """A note in the grade, without lost points; it also says if the file was changed."""
+    """A note in the grade says how often the check was asked, or that its file was changed.
+
+    It costs no points.
+    """
     check(in_hertz)
     check(in_hertz)
 
@@ -156,7 +171,7 @@ def test_the_grade_tells_how_often_it_was_asked(in_hertz, tmp_path):
 
 
 def test_what_students_see_is_report_or_check(honest, tmp_path):
-    """Any other value is one line with the values allowed, in a rubric and in a submission."""
+    """If `see` has an unknown value, in rubric or submission, one line gives the allowed values."""
     rubric = tmp_path / "lab.toml"
     text = RUBRIC.read_text(encoding="utf-8")
     rubric.write_text(text + '\n[students]\nsee = "chekc"\n', encoding="utf-8")

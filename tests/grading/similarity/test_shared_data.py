@@ -178,7 +178,10 @@ def test_under_feedback_the_input_gives_a_copy_away(teams, others):
 
 
 def test_a_whole_copy_is_found_under_much_noise(teams, others):
-    """Noise of six times the encoder's own hides single recordings, but not all of them."""
+    """If a whole submission is copied, even strong added noise cannot hide every recording.
+
+    The noise is six times the encoder's own.
+    """
     rng = np.random.default_rng(8)
     copied = [disguised(r, rng, noise=1.5, scale=0.9, keep=0.8) for r in teams[0]]
     found = find_shared([prints("a", teams[0]), prints("b", copied), *others])
