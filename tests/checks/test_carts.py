@@ -1,4 +1,4 @@
-"""Checks of the fitted carts: a mass, damper or spring that may not exist."""
+"""The fitted carts are checked for masses, dampers and springs that may not exist."""
 
 import shutil
 import tomllib
@@ -60,9 +60,9 @@ def vanishing(checks: tuple[Check, ...]) -> dict[str, str]:
     ],
 )
 def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std, found):
-    """Zero within its error, or tiny beside its neighbour.
+    """A parameter that is zero within its error, or tiny beside its neighbour, fails a check.
 
-    The message asks, with the line to change.
+    The message asks about it and gives the line to change.
     """
     plant = PRESETS["throne-2dof"]
     values = {"m": plant.m.copy(), "c": plant.c.copy(), "k": plant.k.copy()}
@@ -81,7 +81,10 @@ def test_what_may_as_well_not_be_there_fails_with_its_question(name, value, std,
 
 @pytest.mark.parametrize("preset", sorted(PRESETS))
 def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
-    """The paper's plants have no spring wall-1; if it is declared missing, nothing is asked."""
+    """A spring declared as missing is not asked about.
+
+    The paper's plants have no spring wall-1.
+    """
     chain = PRESETS[preset]
     springs = tuple(bool(k > 0) for k in chain.k)
     assert check_vanishing(fitted(chain), bench=Bench(springs=springs)) == []
@@ -94,14 +97,14 @@ def test_a_spring_that_is_said_to_be_missing_is_not_asked_about(preset):
 
 
 def test_the_shipped_examples_pass():
-    """None of their parameters vanishes."""
+    """In the shipped examples no parameter is asked about."""
     for name in ("one-cart", "two-cart", "three-cart"):
         assert vanishing(analysed(name).checks) == {}
 
 
 @pytest.mark.parametrize("name", ["two-cart", "three-cart"])
 def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
-    """The line to change lists the springs that the example's bench has."""
+    """If an example declares a spring too many, the message gives the right line of springs."""
     shutil.copytree(EXAMPLES / name, tmp_path / "s")
     toml = tmp_path / "s" / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -116,7 +119,10 @@ def test_a_spring_too_many_is_found_on_the_examples(name, tmp_path):
 
 @pytest.mark.skipif(not (REAL_DATA / "ecp210-ucsd").is_dir(), reason="the recordings are not here")
 def test_a_far_spring_that_the_real_rig_has_not_is_asked_about(tmp_path):
-    """If declared, it gets 1 % of its neighbour, since the fit uses it to explain dry friction."""
+    """A far spring that the real bench lacks is asked about if it is declared.
+
+    The fit gives it 1 % of its neighbour, to explain dry friction.
+    """
     folder: Path = write_two_cart_submission(tmp_path / "s", REAL_DATA, steps=(1, 2, 3, 4, 5))
     assert vanishing(analyse(load_submission(folder), design=False).checks) == {}
     toml = folder / "submission.toml"

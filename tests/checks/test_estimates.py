@@ -1,4 +1,4 @@
-"""Checks of single estimates: what they state about a number."""
+"""Single estimates are checked for what they state about a number."""
 
 from dataclasses import replace
 
@@ -14,7 +14,10 @@ from tests.helpers.examples import analysed
 
 
 def test_the_interval_of_a_cart_that_sticks_is_no_bound():
-    """Two steps of one bench may give intervals that share no gain; neither must contain it."""
+    """If a cart sticks, two steps may give gain intervals that do not overlap.
+
+    The gain need not be in either.
+    """
     steps = [
         StepGain(
             experiment=f"step-{i}",
@@ -34,7 +37,10 @@ def test_the_interval_of_a_cart_that_sticks_is_no_bound():
 
 
 def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
-    """It stops short equally on both sides, so one gain fits; other records show the friction."""
+    """A step stopped short by friction does not pass as settled.
+
+    One gain fits all edges, but other records show the friction.
+    """
     hidden = "coulomb_friction:cart=1,force=0.003"
     done = CliRunner().invoke(
         app,
@@ -44,7 +50,7 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
     assert done.exit_code == 0
     analysis = analyse(load_submission(tmp_path / "s"), design=False)
     alike = [gain for gain in analysis.step_gains if gain.interval is None]
-    assert alike  # some show one gain at all edges
+    assert alike  # some steps show one gain at all edges
     outcomes = {check.about: check for check in analysis.checks if check.kind == "step"}
     for gain in alike:
         check = outcomes[f"{gain.experiment}.cart_1"]
@@ -54,7 +60,7 @@ def test_a_step_that_friction_holds_off_does_not_pass_as_settled(tmp_path):
 
 
 def test_one_edge_does_not_tell_whether_a_cart_sticks():
-    """A step that is never switched off shows one level only; on and off again is a test."""
+    """A step with one edge skips the check for sticking; a step on and off again is checked."""
     (gain, *_) = analysed("one-cart").step_gains
     both, one = check_steps(
         [gain, replace(gain, edges=gain.edges[:1], rest_shift=None)],
@@ -80,7 +86,7 @@ def row(name: str, source: str, final: str) -> ParameterRow:
 
 
 def test_advice_looks_only_at_what_there_is():
-    """Dwells, decays or steps are named only if the estimates rest on them."""
+    """Advice names dwells, decays or steps only if the estimates use them."""
     said = {
         (name, source, final): check_rows([row(name, source, final)])[0].message
         for name, source, final in (

@@ -1,4 +1,4 @@
-"""The designed loop as python-control sees it: its step, its margins, its gains again."""
+"""The designed loop is checked with python-control: its step, margins and gains."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def designed(
 
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_the_closed_loop_makes_the_step_of_the_design(name, method):
-    """Its states are named, and its step response is the one that the design was judged by."""
+    """The closed loop as a python-control model has named states and the design's step response."""
     chain = PLANTS[name]
     design, controller = designed(chain, method)
 
@@ -76,10 +76,10 @@ def test_the_closed_loop_makes_the_step_of_the_design(name, method):
     ],
 )
 def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_time):
-    """Within them the loop is stable, on both sides, and just beyond them it is not.
+    """The loop is stable within its margins, on both sides, and unstable just beyond them.
 
-    A turn of the phase is a gain of size one, and the poles of the loop show both exactly. |1 + L|
-    is nowhere below the modulus margin, and reaches it.
+    A change of phase is a gain of size one, so the loop's poles show both margins exactly. |1 + L|
+    is never below the modulus margin, and reaches it.
     """
     chain = PLANTS[name]
     design, controller = designed(
@@ -112,7 +112,7 @@ def test_margins_are_the_edge_of_stability(name, method, sample_time, settling_t
     grid = np.geomspace(1e-2, np.pi / design.sample_time, 3000)
     nearest = np.abs(1 + response(grid)).min()
     assert nearest > 0.999 * found.modulus
-    if name != "lightly damped":  # there the grid passes over the modes
+    if name != "lightly damped":  # the grid misses the modes there
         assert nearest < 1.01 * found.modulus
 
 
@@ -127,7 +127,7 @@ def test_an_unstable_loop_has_no_margins():
 
 
 def test_undamped_carts_have_no_margins():
-    """A fit may put a damping at zero; the limit of the gain is then no property of the bench."""
+    """If a fit put a damping at zero, no margins are given, since they would not be the bench's."""
     design, _ = designed(UNDAMPED, "lqr")
     with pytest.raises(DataError, match="a mode of the carts has no damping"):
         design_margins(UNDAMPED, design)
@@ -136,7 +136,7 @@ def test_undamped_carts_have_no_margins():
 @pytest.mark.parametrize("sample_time", [None, 0.001])
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_the_gains_are_verified(name, method, sample_time):
-    """The check passes for the design, and fails if one gain is a hundredth off."""
+    """The check of the gains passes for the design and fails if one gain is 1 % off."""
     chain = PLANTS[name]
     design, _ = designed(chain, method, sample_time=sample_time)
     assert verify_design(chain, design).outcome == "pass"
@@ -152,7 +152,7 @@ def test_the_gains_are_verified(name, method, sample_time):
 @pytest.mark.parametrize("sample_time", [None, 0.001])
 @pytest.mark.parametrize(("name", "method"), CASES)
 def test_python_control_finds_the_same_loop(name, method, sample_time):
-    """Its dlqr or place, on the plant sampled by it, gives the polynomial of our loop."""
+    """The gains of python-control's `dlqr` or `place` give the same closed-loop polynomial."""
     chain = PLANTS[name]
     design, _ = designed(chain, method, sample_time=sample_time)
     sampled = control.sample_system(chain.to_control(), design.sample_time)
@@ -169,7 +169,7 @@ def test_python_control_finds_the_same_loop(name, method, sample_time):
 
 
 def test_poles_asked_for_twice_are_verified_too():
-    """Double poles are well placed, and well verified."""
+    """A design with double poles passes the check of its gains."""
     chain = PRESETS["throne-3dof"]
     design, _ = designed(chain, "poles", settling_time=0.1)
     assert design.requested_poles is not None
@@ -178,7 +178,7 @@ def test_poles_asked_for_twice_are_verified_too():
 
 
 def test_a_design_that_is_not_finite_does_not_pass():
-    """A prefilter that is not a number fails."""
+    """A design whose prefilter is NaN fails the check."""
     chain = PRESETS["throne-1dof"]
     design, _ = designed(chain, "lqr")
     assert verify_design(chain, replace(design, prefilter=np.nan)).outcome == "fail"

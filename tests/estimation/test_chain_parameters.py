@@ -1,4 +1,4 @@
-"""The fit vector of a chain, and standard errors of the named parameters."""
+"""A chain is converted to the vector of a fit, and standard errors to named parameters."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ from pipeline.set_up import Bench
 
 @st.composite
 def chains(draw: st.DrawFn) -> Chain:
-    """Chains of one to four carts, sizes over two decades, springs at both walls."""
+    """Draw chains of one to four carts, sizes over two decades, springs at both walls."""
     n = draw(st.integers(1, 4))
     size = st.floats(0.1, 10.0)
     m, c, k = (
@@ -54,7 +54,7 @@ def test_matrices_are_the_sum_of_the_directions(chain):
 
 
 def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
-    """dp/dtheta agrees with a central difference."""
+    """The matrix dp/dtheta agrees with a central difference."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(bench=Bench(springs=(True,) * 4))
     theta, h = P.pack(chain), 1e-6
@@ -66,7 +66,7 @@ def test_dp_dtheta_is_the_derivative_of_the_physical_parameters():
 
 
 def test_only_a_spring_that_may_be_missing_is_linear():
-    """k_1 enters linearly if the far wall holds the carts, else as a logarithm."""
+    """Spring k_1 enters linearly if the far wall also holds the carts, else as a logarithm."""
     both = Parametrisation(bench=Bench(springs=(True, True, True)))
     near = Parametrisation(bench=Bench(springs=(True, True, False)))
 
@@ -76,7 +76,7 @@ def test_only_a_spring_that_may_be_missing_is_linear():
 
 
 def test_zero_parameters_leave_the_vector():
-    """A parameter held at zero has no entry and stays zero."""
+    """A parameter held at zero has no entry in the vector and stays zero."""
     P = Parametrisation(bench=Bench(springs=(True,) * 3)).holding_at_zero("c_2", "k_1")
 
     chain = P.unpack(P.pack(PRESETS["throne-2dof"]))
@@ -87,19 +87,19 @@ def test_zero_parameters_leave_the_vector():
 
 
 def test_one_cart_has_one_stiffness_whichever_springs_hold_it():
-    """One cart with only the far spring has the same vector as with only the near one."""
+    """One cart has the same vector whether its spring is at the near or the far wall."""
     assert Parametrisation(bench=Bench(springs=(False, True))).names == ("m_1", "c_1", "k_1")
     assert Parametrisation(bench=Bench(springs=(False, False))).names == ("m_1", "c_1")
 
 
 def test_carts_that_nothing_drives_are_refused():
-    """A missing spring between carts is an error that names them."""
+    """A missing spring between two carts is an error that names both."""
     with pytest.raises(DataError, match="between carts 2 and 3, found none"):
         Parametrisation(bench=Bench(springs=(True, True, False, True)))
 
 
 def test_standard_errors_of_one_cart_follow_its_formulas():
-    """K = 1/k, omega_n = sqrt(k/m) and zeta = c / 2 sqrt(km) give their errors by hand."""
+    """For one cart, the errors of K, ω_n and ζ equal those derived by hand."""
     m, c, k = 2e-4, 5e-4, 0.035
     relative = np.array([0.02, 0.05, 0.01])  # of m, c, k, independent
     covariance = np.diag((relative * [m, c, k]) ** 2)
@@ -119,7 +119,7 @@ def test_standard_errors_of_one_cart_follow_its_formulas():
 
 
 def test_standard_errors_agree_with_a_sample():
-    """Over a sample of chains the named parameters scatter as their standard errors say."""
+    """Over a sample of chains the named parameters scatter as their standard errors state."""
     chain = PRESETS["throne-3dof"]
     P = Parametrisation(bench=Bench(springs=(True,) * 4))
     p = P.physical(chain)
@@ -138,7 +138,10 @@ def test_standard_errors_agree_with_a_sample():
 
 
 def test_a_start_is_a_possible_chain():
-    """A negative spring is raised, the mask respected, the damping set; masses stay."""
+    """A start for the fit has positive springs, the declared springs only, and usual dampings.
+
+    Its masses stay.
+    """
     found = Chain(m=np.array([3e-4, 2e-4]), c=np.array([-1.0, 1.0]), k=np.array([-0.01, 0.1, 0.05]))
 
     got = physical_start(found, bench=Bench(springs=(True, True, False)))
@@ -162,6 +165,6 @@ def test_an_even_chain_has_the_gain_it_is_asked_for(n, gain, omega):
 
 
 def test_an_even_chain_needs_something_to_go_by():
-    """Without a gain or a resonance the scale is unknown."""
+    """An even chain cannot be made without a gain and a resonance, since its scale is unknown."""
     with pytest.raises(DataError, match="gain of cart 1 and a resonance"):
         even_chain({"K_1": 1.0}, bench=Bench(springs=(True,) * 3))

@@ -1,4 +1,4 @@
-"""Hands are found where they acted, and no effect is taken for one."""
+"""Touches by hand are found when they happened, and no effect is taken for one."""
 
 from dataclasses import replace
 
@@ -10,16 +10,16 @@ from pipeline.results import Intervention
 from tests.truth.bench import Hand
 from tests.truth.cases import EFFECTS, Case, make_case
 
-TO = 0.08  # s: half a window of 0.1 s, and the grip that fades during a tenth of a pluck
+TO = 0.08  # s, half a window of 0.1 s and the time in which a pluck's grip fades
 
 
 def pulls(case: Case) -> list[tuple[str, Hand]]:
-    """Return the hands that pull or push, by record, without those that only hold."""
+    """Return the touches that pull or push, by record, without those that only hold."""
     return [(name, hand) for name, laid in case.hands.items() for hand in laid if hand.end < 1e9]
 
 
 def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
-    """Return the hands that were missed, and the finds without a hand."""
+    """Return the touches that were missed, and the touches found that did not happen."""
     found = list(find_interventions(case.records))
     missed = []
     for name, hand in pulls(case):
@@ -41,9 +41,9 @@ def unmatched(case: Case) -> tuple[list[tuple[str, Hand]], list[Intervention]]:
     [(1, 113.1, ()), (2, 250.0, ()), (3, 1000.0, ()), (2, 250.0, ("coulomb_friction",))],
 )
 def test_hands_are_found_and_nothing_else(n, rate, effect):
-    """Plucks, two in a record, a nudge, a push at the end, beside a soft hold.
+    """Plucks, a nudge and a push are found on every bench, and nothing else is.
 
-    Of 486 hands on such benches 476 were found; a short pull may escape.
+    On such benches 476 of 486 touches were found; a short pull may be missed.
     """
     case = make_case(seed=60 + n, n=n, rate=rate, effects=effect, handled=True, dirt=True)
     missed, more = unmatched(case)
@@ -53,7 +53,7 @@ def test_hands_are_found_and_nothing_else(n, rate, effect):
 
 
 def test_a_hand_is_found_where_it_was():
-    """From its grip to its release, to the length of a window."""
+    """The start and end of a touch are found to within the length of a window."""
     case = make_case(seed=71, n=1, rate=250.0, handled=True)
     found = find_interventions(case.records)
     hands = sorted(pulls(case), key=lambda pair: (pair[0], pair[1].start))
@@ -66,7 +66,7 @@ def test_a_hand_is_found_where_it_was():
 
 @pytest.mark.parametrize("rate", [50.0, 25.0])
 def test_hands_are_found_at_low_rates(rate):
-    """The windows are then a sample apart, which is more than usual."""
+    """Touches are found even at low sampling rates, when windows are one sample apart."""
     case = make_case(seed=71, n=1, rate=rate, handled=True)
     missed, more = unmatched(case)
 
@@ -75,7 +75,10 @@ def test_hands_are_found_at_low_rates(rate):
 
 
 def test_a_recording_that_is_listed_twice_keeps_its_hands():
-    """A hand is not taken for an effect because a copied file repeats it exactly."""
+    """A touch is still found if its recording is listed twice.
+
+    The exact repeat does not make it an effect.
+    """
     case = make_case(seed=71, n=1, rate=250.0, handled=True)
     found = find_interventions(case.records)
     driven = {r.id for r in case.records if r.u is not None and np.any(r.u)}
@@ -96,14 +99,14 @@ def test_a_recording_that_is_listed_twice_keeps_its_hands():
     ],
 )
 def test_no_effect_is_a_hand(effect):
-    """Stops, play, sticking, resonances, late inputs are no hands, however large."""
+    """Large effects such as stops, play, sticking and resonances are not taken for touches."""
     case = make_case(seed=80, n=2, rate=200.0, effects=effect, severity=1.5, dirt=True)
 
     assert find_interventions(case.records) == ()
 
 
 def test_a_record_is_cut_at_its_hands():
-    """The rest has no sample of a hand, and all other samples."""
+    """A record is cut at its touches: no other sample is lost."""
     record = make_case(seed=71, n=1, rate=113.1).records[0]
     hands = [
         Intervention(experiment=record.id, cart=1, start=1.0, end=1.5),
@@ -121,7 +124,7 @@ def test_a_record_is_cut_at_its_hands():
 
 
 def test_what_is_not_understood_is_not_judged():
-    """Runs under feedback, and benches whose neighbour was not measured, report no hand."""
+    """Runs under feedback, and carts with an unmeasured neighbour, report no touch."""
     case = make_case(seed=62, n=2, rate=250.0, handled=True)
     assert find_interventions(case.records) != ()
 
@@ -139,7 +142,7 @@ def test_what_is_not_understood_is_not_judged():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(38))
 def test_no_effect_of_any_size_is_a_hand(seed):
-    """Every effect of the second simulator, and pairs of them, small and large."""
+    """No effect of the second simulator, or pair of effects, of any size is taken for a touch."""
     effects = [EFFECTS[seed % len(EFFECTS)], *EFFECTS[(5 * seed) % 17 : (5 * seed) % 17 + seed % 2]]
     case = make_case(seed=300 + seed, n=2 + seed % 2, effects=effects, dirt=True, wide=True)
 

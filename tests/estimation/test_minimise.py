@@ -1,4 +1,4 @@
-"""A model is computed once for its residual and its derivatives, at one point."""
+"""A model is computed only once per point for its residual and derivatives."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from pipeline.estimation.minimise import evaluated_once
 
 
 class _Decay:
-    """A residual exp(-p t) that keeps the rate p it was made for."""
+    """A residual exp(-p t) that stores the rate p for which it was made."""
 
     def __init__(self, t, p):
         self.t, self.p = t, p

@@ -1,4 +1,4 @@
-"""The fit of one chain to all frequency responses: truth, coverage, starts, hard cases."""
+"""One chain is fitted to all frequency responses: truth, coverage, starts, hard cases."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ FOUR_CARTS = Chain(
 
 
 def exact(chain: Chain, omega: Array = BENCH_BAND) -> tuple[FrequencyResponse, ...]:
-    """Return magnitudes without error, said to be good to 1 %."""
+    """Return magnitudes without error that are stated to be good to 1 %."""
     size = np.abs(chain.frequency_response(omega))
     return tuple(
         FrequencyResponse(
@@ -62,7 +62,7 @@ def thinned(responses: tuple[FrequencyResponse, ...], points: slice) -> list[Fre
 
 @pytest.mark.parametrize("chain", [*PRESETS.values(), FOUR_CARTS], ids=lambda c: f"{c.n}-carts")
 def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
-    """From error-free magnitudes and nothing else, every named parameter is right."""
+    """From error-free magnitudes alone, without a start, every named parameter is right."""
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * (chain.n + 1)))
 
     assert got.converged
@@ -74,7 +74,7 @@ def test_exact_magnitudes_give_the_chain_back_without_a_start(chain):
 
 @st.composite
 def chains(draw: st.DrawFn) -> Chain:
-    """Benches of one to three carts with modes between 1 and 8 Hz or so."""
+    """Draw benches of one to three carts with modes between about 1 and 8 Hz."""
     n = draw(st.integers(1, 3))
     size = st.floats(0.5, 2.0)
     m, zeta, k = (
@@ -101,7 +101,7 @@ def test_any_bench_is_found(chain):
 
 @pytest.mark.parametrize("unit", [1.0, 440.0, 0.01], ids=["cm", "count", "m"])
 def test_the_position_unit_does_not_matter(unit):
-    """The same bench in counts or metres gives the same frequencies and scaled gains."""
+    """With positions in counts or metres, frequencies stay the same and gains are scaled."""
     chain = PRESETS["throne-3dof"]
     scaled = Chain(m=chain.m / unit, c=chain.c / unit, k=chain.k / unit)
 
@@ -113,7 +113,7 @@ def test_the_position_unit_does_not_matter(unit):
 
 
 def test_a_rigid_body_has_mass_and_damping():
-    """Without any spring the fit gives the mass and the damping of the cart."""
+    """If the bench has no spring, the fit gives the cart's mass and damping."""
     cart = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))
 
     got = fit_bode(exact(cart), bench=Bench(springs=(False, False)))
@@ -124,7 +124,7 @@ def test_a_rigid_body_has_mass_and_damping():
 
 
 def test_the_staged_fit_is_reported_as_well():
-    """On exact data the stage-by-stage fit finds the same parameters, recomputed ones included."""
+    """From exact data the stage-by-stage fit finds all parameters, recomputed ones included."""
     chain = PRESETS["throne-3dof"]
 
     got = fit_bode(exact(chain), bench=Bench(springs=(True,) * 4), initial=PAPER_STARTS[3])
@@ -142,12 +142,13 @@ def test_the_staged_fit_is_reported_as_well():
 @pytest.mark.parametrize("phases", [False, True], ids=["magnitudes", "phases"])
 @pytest.mark.parametrize("preset", PRESETS)
 def test_intervals_cover_the_truth(preset, phases):
-    """Over 16 noisy sets, each parameter's 95 % interval holds the truth as often as it should."""
+    """Over 16 noisy data sets, each 95 % interval contains the truth as often as it should."""
     got = quality(PRESETS[preset], seeds=16, phases=phases)
 
-    # A right interval falls below this once in 1e4 tries.
+    # A right interval falls below this limit once in 10,000 tries.
     assert np.all(got.coverage >= binom.ppf(1e-4, 16, 0.95) / 16)
-    # The mean of 16 chi²/dof with 17 dof and more: its standard error is 0.086 at most; 4 of them.
+    # The mean of 16 values of chi²/dof, each with 17 dof or more, has a standard error of at most
+    # 0.086; 4 of those are allowed.
     assert_allclose(np.mean(got.chi_square), 1.0, atol=0.35)
 
 
@@ -155,7 +156,10 @@ def test_intervals_cover_the_truth(preset, phases):
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """With k_1 = 0 half the noisy sets want it negative: it is held at zero, with a note."""
+    """If k_1 is zero, about half of the noisy fits hold it at zero, with a note.
+
+    The other half find it slightly positive.
+    """
     fits = [
         fit_bode(noisy("throne-2dof", seed=seed), bench=Bench(springs=(True,) * 3))
         for seed in range(20)
@@ -169,7 +173,7 @@ def test_a_spring_that_is_not_there_is_held_at_zero():
 
 
 def test_a_far_spring_and_a_damper_that_are_not_there_are_held_at_zero():
-    """Without a far spring and a damper on cart 2, both are found to be zero."""
+    """If the far spring and the damper of cart 2 are missing, the fit finds both to be zero."""
     chain = PRESETS["throne-2dof"]
     loose = Chain(m=chain.m, c=np.array([6e-4, 0.0]), k=np.array([0.05, 0.127, 0.0]))
 
@@ -186,7 +190,7 @@ BESIDE = np.sqrt(300.0) * np.array([0.4, 0.6, 0.8, 1.25, 1.5, 2.0])
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """A damping held at zero is noted and has no standard error; gain and frequency are known."""
+    """A damping held at zero is noted and has no standard error; gain and frequency have theirs."""
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)))
 
     assert got.at_bound == ("c_1",)
@@ -197,7 +201,10 @@ def test_a_damping_at_its_bound_is_no_measurement():
 
 
 def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
-    """With one of two dampings at zero, the errors of the modes allow for it on both sides."""
+    """If one of two dampings is held at zero, the modes' standard errors allow for it.
+
+    They allow for it on both sides.
+    """
     chain = replace(PRESETS["throne-2dof"], c=np.array([6e-4, 0.0]))
     got = fit_bode(exact(chain), bench=Bench(springs=(False, True, True)))
 
@@ -212,7 +219,7 @@ def test_what_rests_on_a_damping_at_its_bound_is_known_no_better_than_it():
 
 
 def test_the_decay_tells_a_damping_that_the_response_leaves_open():
-    """Six points beside a sharp peak allow any small damping, so the decay's value is used."""
+    """If the points beside a sharp peak leave the damping open, the decay's value is used."""
     decay = Estimate(value=0.017, std=0.0005, source="log_decrement")
     got = fit_bode(exact(SHARP, BESIDE), bench=Bench(springs=(True, True)), decays={1: decay})
 
@@ -224,7 +231,7 @@ def test_the_decay_tells_a_damping_that_the_response_leaves_open():
 
 
 def test_where_one_damping_is_open_all_decays_are_fitted_along():
-    """The response alone puts one of two dampings at zero; both decays decide."""
+    """If the response leaves one of two dampings open, both decays are used in the fit."""
     chain = PRESETS["throne-2dof"]
     decays = {
         cart: Estimate(value=float(zeta), std=0.02 * float(zeta), source="log_decrement")
@@ -237,13 +244,13 @@ def test_where_one_damping_is_open_all_decays_are_fitted_along():
 
     got = fit_bode(vague, bench=Bench(springs=(False, True, True)), decays=decays)
     assert got.at_bound == ("c_1", "c_2")
-    # Two standard errors of the decays; a response 30 % uncertain adds nothing.
+    # Two standard errors of the decays; a response with 30 % error adds nothing.
     assert_allclose(got.chain.zeta_carts, chain.zeta_carts, rtol=0.04)
     assert {got.parameters[f"zeta_{cart}"].source for cart in (1, 2)} == {"log_decrement"}
 
 
 def test_a_decay_that_the_response_rules_out_is_not_used():
-    """Points on a peak of 1 in 1000 damping contradict 0.05: the two are not mixed."""
+    """A decay that contradicts a clearly measured peak is not used."""
     undamped = exact(SHARP, np.sqrt(300.0) * np.array([0.5, 0.9, 0.99, 0.998, 1.002, 1.01, 1.1]))
     decay = Estimate(value=0.05, std=0.001, source="log_decrement")
     got = fit_bode(undamped, bench=Bench(springs=(True, True)), decays={1: decay})
@@ -253,7 +260,10 @@ def test_a_decay_that_the_response_rules_out_is_not_used():
 
 
 def test_a_decay_is_not_used_where_the_response_tells():
-    """Initial and final estimate then come from different data."""
+    """If the response determines the damping, the decay is not used.
+
+    Initial and final estimate then come from different data.
+    """
     responses = noisy("throne-1dof")
     decay = Estimate(value=0.3, std=1e-4, source="log_decrement")
     alone, given = (
@@ -264,7 +274,7 @@ def test_a_decay_is_not_used_where_the_response_tells():
 
 
 def test_a_spring_known_to_be_missing_is_not_fitted():
-    """The mask takes the spring out, and the other errors get no larger."""
+    """A spring stated as missing is not fitted, and the other errors do not grow."""
     responses = noisy("throne-3dof")
 
     free = fit_bode(responses, bench=Bench(springs=(True,) * 4))
@@ -281,7 +291,7 @@ def test_a_spring_known_to_be_missing_is_not_fitted():
 
 @pytest.mark.parametrize("change", ["delay", "sign"])
 def test_phases_that_contradict_the_magnitudes_are_left_out(change):
-    """A sample's delay or a turned sign in the phases does not reach the parameters."""
+    """Phases that contradict the magnitudes, by a delay or a reversed sign, change no parameter."""
     responses = noisy("throne-2dof", phases=True)
     wrong = [
         replace(r, phase=r.phase - 0.00884 * r.omega if change == "delay" else r.phase + np.pi)
@@ -298,7 +308,7 @@ def test_phases_that_contradict_the_magnitudes_are_left_out(change):
 
 
 def test_good_phases_sharpen_the_dampings():
-    """With phases as good as the magnitudes, the errors get smaller."""
+    """Phases as good as the magnitudes reduce the standard errors of the dampings."""
     responses = noisy("throne-3dof", phases=True)
 
     both = fit_bode(responses, bench=Bench(springs=(True,) * 4))
@@ -315,7 +325,7 @@ def test_good_phases_sharpen_the_dampings():
 
 
 def test_a_misfit_widens_the_errors():
-    """Points that lie 5 % off but claim 0.01 % give errors of a 5 % measurement."""
+    """If points scatter by 5 % but state 0.01 %, the fit's errors are those of 5 %."""
     chain = PRESETS["throne-2dof"]
     rng = np.random.default_rng(4)
     scattered = [
@@ -338,7 +348,7 @@ def test_a_misfit_widens_the_errors():
     for name, value in chain.parameters().items():
         estimate = got.parameters[name]
         assert estimate.std is not None
-        # Ten parameters of one draw: none beyond 4 standard errors.
+        # For ten parameters of one draw, none is beyond 4 standard errors.
         assert abs(estimate.value - value) < 4 * estimate.std
         # 500 times the error that 0.01 % would give, so 100 times is safe.
         claimed = honest.parameters[name].std
@@ -347,7 +357,7 @@ def test_a_misfit_widens_the_errors():
 
 
 def test_a_table_is_judged_by_its_own_scatter():
-    """A table rounded to three digits, its errors not known, has errors of that rounding."""
+    """A table rounded to three digits, without stated errors, gets errors of that rounding."""
     chain = PRESETS["throne-3dof"]
     rounded = [
         replace(r, magnitude=np.array([float(f"{m:.3g}") for m in r.magnitude]), source="table")
@@ -364,7 +374,7 @@ def test_a_table_is_judged_by_its_own_scatter():
 
 
 def test_one_measured_cart_may_do():
-    """The first cart alone determines two carts whose near spring is known to be missing."""
+    """The response of cart 1 alone is enough for two carts if their near spring is missing."""
     got = fit_bode(
         noisy("throne-2dof")[:1], bench=Bench(springs=(False, True, True)), initial=PAPER_STARTS[2]
     )
@@ -372,18 +382,21 @@ def test_one_measured_cart_may_do():
     for name, value in PRESETS["throne-2dof"].parameters().items():
         estimate = got.parameters[name]
         assert estimate.std is not None
-        assert abs(estimate.value - value) < 4 * estimate.std  # ten parameters of one draw
+        assert abs(estimate.value - value) < 4 * estimate.std  # for ten parameters of one draw
     assert set(got.standardised) == {"1"}
 
 
 def test_the_last_cart_alone_does_not_determine_two():
-    """X_2/U has five coefficients, two carts have seven parameters: the error says so."""
+    """The response of cart 2 alone cannot determine two carts, and the error says so.
+
+    It has five coefficients, but the carts have seven parameters.
+    """
     with pytest.raises(DataError, match="response of cart 2 does not determine all of m_1"):
         fit_bode(noisy("throne-2dof")[1:], bench=Bench(springs=(True,) * 3))
 
 
 def test_few_points_are_refused():
-    """Six points for seven parameters: the message counts both."""
+    """Six points for seven parameters are refused, and the message gives both numbers."""
     few = thinned(noisy("throne-2dof"), slice(0, 3))
     with pytest.raises(DataError, match=r"2 carts with 7 parameters .* found 6"):
         fit_bode(few, bench=Bench(springs=(True,) * 3))
@@ -398,20 +411,20 @@ def test_few_points_are_refused():
     ],
 )
 def test_impossible_responses_are_refused(change, message):
-    """Values that are not finite, negative frequencies and carts that do not exist are named."""
+    """Infinite values, negative frequencies and carts that do not exist are refused by name."""
     (response,) = noisy("throne-1dof")
     with pytest.raises(DataError, match=message):
         fit_bode([replace(response, **change)], bench=Bench(springs=(True, True)))
 
 
 def test_no_response_is_refused():
-    """Without a response there is nothing to fit."""
+    """If there is no frequency response, the fit is refused."""
     with pytest.raises(DataError, match="needs a frequency response, found none"):
         fit_bode([], bench=Bench(springs=(True, True)))
 
 
 def test_residuals_belong_to_their_points():
-    """One magnitude raised by ten errors has a residual near ten at its own place."""
+    """If one magnitude is raised by ten standard errors, only its own residual is near ten."""
     responses = list(noisy("throne-3dof"))
     raised = responses[1].magnitude.copy()
     raised[7] += 10 * responses[1].magnitude_std[7]
@@ -427,7 +440,7 @@ def test_residuals_belong_to_their_points():
 
 
 def test_the_same_data_give_the_same_fit():
-    """Two runs agree to the last bit, random starts included."""
+    """Two fits to the same data agree to the last bit, although starts are random."""
     responses = thinned(noisy("throne-3dof"), slice(2, 30, 5))
 
     first, second = (fit_bode(responses, bench=Bench(springs=(True,) * 4)) for _ in range(2))

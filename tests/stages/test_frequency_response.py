@@ -1,4 +1,4 @@
-"""The measured frequency response from dwells and from records, and its peaks and nulls."""
+"""The frequency response is measured from dwells and records; its peaks and nulls are found."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from pipeline.stages.frequency_response import (
     response_from_records,
 )
 
-COUNT_NOISE = 0.00115  # cm; half an encoder count
+COUNT_NOISE = 0.00115  # cm, half an encoder count
 
 
 def dwell(
@@ -48,7 +48,7 @@ def record(
     seed: int = 0,
     hold: Hold = "zero_order",
 ) -> Record:
-    """Simulate all carts of a chain, noise added."""
+    """Simulate all carts of a chain with noise."""
     y = simulate_linear(chain, t, u, hold=hold)
     carts = tuple(range(1, chain.n + 1))
     return Record(
@@ -69,12 +69,12 @@ def pulse(t: Array) -> Array:
 
 
 def chirp(t: Array) -> Array:
-    """0.3 to 8 Hz over 20 s, cut off at full swing."""
+    """Sweep from 0.3 to 8 Hz over 20 s, cut off at full amplitude."""
     return 0.2 * np.sin(2 * np.pi * (0.3 * t + 0.1925 * t**2))
 
 
 def errors(chain: Chain, response: FrequencyResponse) -> Array:
-    """Return the complex errors over their standard errors, real and imaginary parts."""
+    """Return real and imaginary parts of the errors in standard errors."""
     assert response.phase is not None
     measured = response.magnitude * np.exp(1j * response.phase)
     off = measured - chain.frequency_response(response.omega)[response.cart - 1]
@@ -85,7 +85,7 @@ def errors(chain: Chain, response: FrequencyResponse) -> Array:
 
 
 def test_dwells_come_out_in_ascending_order():
-    """Each dwell becomes one point, sorted by frequency, gain and errors kept."""
+    """Each dwell becomes one point with its gain and error, in ascending order of frequency."""
     (got,) = collect_dwells([dwell(omega=20.0, gain=3.0), dwell(omega=5.0, gain=2.0)])
 
     assert_allclose(got.omega, [5.0, 20.0])
@@ -95,7 +95,7 @@ def test_dwells_come_out_in_ascending_order():
 
 
 def test_repeats_that_agree_halve_the_variance():
-    """Two equal dwells of one frequency combine to one point, better by sqrt 2."""
+    """Two equal dwells of one frequency become one point with a standard error smaller by √2."""
     (got,) = collect_dwells([dwell(omega=5.0, gain=2.0), dwell(omega=5.002, gain=2.0)])
 
     assert got.omega.size == 1
@@ -103,7 +103,7 @@ def test_repeats_that_agree_halve_the_variance():
 
 
 def test_repeats_that_scatter_say_so():
-    """Two dwells that differ by 0.1 have an error of 0.05, whatever they claim."""
+    """If two dwells of one frequency differ by 0.1, their mean has an error of 0.05."""
     (got,) = collect_dwells([dwell(omega=5.0, gain=1.95), dwell(omega=5.0, gain=2.05)])
 
     assert_allclose(got.magnitude, 2.0, rtol=1e-12)
@@ -111,7 +111,7 @@ def test_repeats_that_scatter_say_so():
 
 
 def test_repeats_around_half_a_turn_do_not_cancel():
-    """Phases of 179° and -179° combine to 180°, not to zero."""
+    """Phases of 179° and −179° combine to 180°, not to zero."""
     phase = np.deg2rad(179.0)
     (got,) = collect_dwells(
         [dwell(omega=5.0, gain=2.0, phase=phase), dwell(omega=5.0, gain=2.0, phase=-phase)]
@@ -122,7 +122,7 @@ def test_repeats_around_half_a_turn_do_not_cancel():
 
 
 def test_a_dwell_that_did_not_settle_counts_little():
-    """It keeps a point alone, at 5 %, and hardly moves a settled repeat."""
+    """A dwell that did not settle counts with an error of 5 %, so it hardly moves a settled one."""
     (alone,) = collect_dwells([dwell(omega=5.0, gain=2.0, settled=False)])
     (both,) = collect_dwells(
         [dwell(omega=5.0, gain=2.2, settled=False), dwell(omega=5.0, gain=2.0)]
@@ -133,7 +133,7 @@ def test_a_dwell_that_did_not_settle_counts_little():
 
 
 def test_dwells_without_an_input_are_refused():
-    """A gain needs an input amplitude."""
+    """A dwell without an input amplitude is refused, since a gain needs one."""
     silent = SinePoint(
         experiment="sine-1",
         cart=1,
@@ -157,7 +157,7 @@ def test_dwells_without_an_input_are_refused():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_step_record_gives_the_response_exactly(preset):
-    """Without noise, a record between two rests gives the response at every line."""
+    """A step record without noise, between two rests, gives the exact response at every line."""
     chain = PRESETS[preset]
     t = np.arange(0, 20, 1 / 113)
 
@@ -190,7 +190,7 @@ DRIVES = {
 @pytest.mark.parametrize("drive", DRIVES)
 @pytest.mark.parametrize("preset", PRESETS)
 def test_errors_of_a_record_are_honest(preset, drive):
-    """With half a count of noise, the errors found are what the standard errors say."""
+    """With noise of half a count, errors of the response are as large as their standard errors."""
     chain = PRESETS[preset]
     t, u, kind = DRIVES[drive]
 
@@ -200,14 +200,14 @@ def test_errors_of_a_record_are_honest(preset, drive):
     for response in responses:
         z = errors(chain, response)
         # 100 and more values of unit size: their rms is within 1 ± 0.2; up to 1.4 is allowed for
-        # the error of the local polynomials at a resonance. Caution is accepted, because of the
-        # half count allowed at rest; a tenth would mean no error estimate at all.
+        # the error of the local polynomials at a resonance. Larger standard errors are accepted,
+        # because half a count is allowed at rest; a tenth would mean no error estimate at all.
         assert 0.1 < np.sqrt(np.mean(z**2)) < 1.4
         assert response.omega.size > 50
 
 
 def test_records_combine():
-    """Four records have half the error of one, where noise is all there is."""
+    """Four records together have half the error of one, if noise is the only error."""
     chain = PRESETS["throne-2dof"]
     t = np.arange(0, 20, 1 / 113)
     runs = [record(chain, t, pulse(t), noise=COUNT_NOISE, seed=seed) for seed in range(4)]
@@ -219,13 +219,13 @@ def test_records_combine():
     gain = np.interp(shared, four.omega, four.magnitude_std) / np.interp(
         shared, one.omega, one.magnitude_std
     )
-    # Scatter beyond the errors is taken in, and that of four alone varies by 40 %: the median
-    # over the lines lies between exactly half and half times 1.4.
+    # Scatter beyond the errors is included, and that of four varies by 40 %: the median over the
+    # lines is between exactly half and half times 1.4.
     assert 0.45 < np.median(gain) < 0.7
 
 
 def test_a_band_limited_input_is_taken_as_smooth():
-    """A sweep that is interpolated smoothly between samples gives no false phase lag."""
+    """A smooth sweep gives no false phase lag if its input is declared band-limited."""
     chain = PRESETS["throne-2dof"]
     t = np.arange(0, 20, 1 / 113)
     u = chirp(t) * np.clip((15 - t) / 2, 0, 1)
@@ -241,7 +241,7 @@ def test_a_band_limited_input_is_taken_as_smooth():
 
 
 def test_records_without_an_input_are_refused():
-    """A record in which the input never moves is no measurement of a response."""
+    """A record whose input never moves is refused."""
     t = np.arange(0, 5, 0.01)
     silent = record(PRESETS["throne-1dof"], t, 0 * t)
     with pytest.raises(DataError, match="needs a step or sweep with its input, found none"):
@@ -249,7 +249,7 @@ def test_records_without_an_input_are_refused():
 
 
 def test_a_record_of_nothing_but_noise_is_refused():
-    """If no frequency stands out, there is no response to report."""
+    """A record in which no frequency is above the noise is refused."""
     t = np.arange(0, 5, 0.01)
     still = record(PRESETS["throne-1dof"], t, 1e-7 * pulse(t + 0.4), noise=COUNT_NOISE)
     with pytest.raises(DataError, match="step-0 is not above its noise"):
@@ -278,7 +278,7 @@ def table(chain: Chain, omega: Array, *, noise: float = 0.0) -> tuple[FrequencyR
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_peaks_and_nulls_are_found(preset):
-    """At 40 frequencies with 1 % noise, every resonance, null and gain is near its parameter."""
+    """Every resonance, null and gain is found near its true value in 40 points with 1 % noise."""
     chain = PRESETS[preset]
     omega = 2 * np.pi * np.geomspace(0.3, 7.0, 40)
 
@@ -294,13 +294,13 @@ def test_peaks_and_nulls_are_found(preset):
     }
     assert expected <= set(got)
     for name in expected:
-        # The grid's ratio is 1.08, and a peak lies sqrt(1 - 2 zeta²) low: 6 % at zeta 0.25.
+        # The grid's ratio is 1.08, and a peak is sqrt(1 - 2 zeta²) low: 6 % at zeta 0.25.
         assert_allclose(got[name].value, truth[name], rtol=0.08)
     assert all(e.value == 0.1 for e in got.values() if e.source == "assumed")
 
 
 def test_a_mode_too_damped_to_peak_is_found_from_the_roll_off():
-    """With the first mode heavily damped, the second peaks alone, and the fall gives the first."""
+    """If the first mode is too damped to have a peak, it is found from the roll-off."""
     chain = PRESETS["throne-2dof"]
     damped = Chain(m=chain.m, c=np.array([1, 1.7]) * 3e-3, k=chain.k * [1, 20, 1])
     assert damped.parameters()["zeta_a"] > 0.72  # no peak above 1/sqrt 2
@@ -308,13 +308,13 @@ def test_a_mode_too_damped_to_peak_is_found_from_the_roll_off():
 
     got = find_resonances(table(damped, omega), n=2)
 
-    # Only a start for a fit: the formula leaves the damping out.
+    # This is only a start for a fit: the formula ignores the damping.
     assert_allclose(got["omega_a"].value, damped.parameters()["omega_a"], rtol=0.3)
     assert_allclose(got["omega_b"].value, damped.parameters()["omega_b"], rtol=0.05)
 
 
 def test_noise_makes_no_resonance():
-    """A flat response with 5 % noise has no peak, so no resonance is named."""
+    """A flat response with 5 % noise gives no resonance."""
     omega = np.geomspace(1.0, 50.0, 40)
     rng = np.random.default_rng(1)
     flat = FrequencyResponse(
@@ -333,5 +333,5 @@ def test_noise_makes_no_resonance():
 
 
 def test_no_response_gives_no_estimates():
-    """Without a response there are no estimates, not even assumed dampings."""
+    """Without a response no estimates are returned, not even assumed dampings."""
     assert find_resonances([], n=2) == {}

@@ -1,4 +1,4 @@
-"""The hardware check: simulated benches with a known truth, and a real one."""
+"""The hardware check compares simulated benches with a known truth, and a real one."""
 
 import re
 from dataclasses import replace
@@ -47,7 +47,7 @@ def encoder(x: Array, seed: int = 1) -> Array:
 
 
 def noise_floor(y: Array) -> float:
-    """Return the NRMSE of a perfect model: noise and rounding over the motion."""
+    """Return the NRMSE of a perfect model: noise and rounding relative to the motion."""
     return float(np.sqrt((NOISE**2 + COUNT**2 / 12) / np.mean(y**2)))
 
 
@@ -113,7 +113,10 @@ def bench(
 
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 def test_a_true_model_leaves_the_noise(name, cart):
-    """Both simulations of a run leave only the noise, and agree on the figures of the step."""
+    """If the model is true, both simulations of a run leave only noise.
+
+    They agree on overshoot, settling time and level.
+    """
     chain = PLANTS[name]
     design = designed(chain, cart)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
@@ -132,7 +135,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
         assert check.note == ""
         # The scale's error is the noise's over the root of the 340 samples that move.
         assert_allclose(known(check.input_scale), 1.0, atol=1e-3)
-        # A level that stands still is rounded by half a count, and the controller follows it.
+        # A level at rest is rounded by half a count, and the controller follows it.
         assert_allclose(
             known(check.steady_state_measured), known(check.steady_state_model), atol=COUNT
         )
@@ -146,7 +149,7 @@ def test_a_true_model_leaves_the_noise(name, cart):
 @pytest.mark.parametrize(("name", "cart"), LAST_CART)
 @pytest.mark.parametrize("factor", [-0.5, -1.0, 3.0])
 def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
-    """The factor of the log is found, reported, and used in both simulations."""
+    """If the log's input has another sign or scale, the factor is found, reported and used."""
     chain = PLANTS[name]
     design = designed(chain, cart)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=chain)
@@ -166,7 +169,7 @@ def test_a_log_of_another_sign_and_scale_is_found_out(name, cart, factor):
 
 
 def test_an_input_a_little_off_is_the_models_error():
-    """A gain that is 20 % off is reported and not corrected."""
+    """If the bench's gain is 20 % off the model's, the difference is reported and not corrected."""
     y = encoder(1.2 * simulate_linear(TWO, CLOCK, 0.06 * STEPS))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -182,7 +185,10 @@ def test_an_input_a_little_off_is_the_models_error():
 
 
 def test_a_stated_sign_that_the_log_contradicts_is_said():
-    """If the log has the opposite sign of the stated law, the loop is closed as logged."""
+    """If the log has the opposite sign of the stated law, the loop is simulated as logged.
+
+    A note says so.
+    """
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -195,7 +201,7 @@ def test_a_stated_sign_that_the_log_contradicts_is_said():
 
 
 def test_a_stated_scale_that_the_log_contradicts_is_said():
-    """A PID whose scale was left out is closed with the factor found in the log."""
+    """If the stated PID lacks its scale, the loop is simulated with the factor found in the log."""
     law = Pid(kp=2.0, kd=0.1, scale=0.009765625)
     run = simulate_loop(TWO, law, t=CLOCK, reference=STEPS)
     y = encoder(run.x)
@@ -207,14 +213,14 @@ def test_a_stated_scale_that_the_log_contradicts_is_said():
         controlled_cart=1,
     )
 
-    # The middle one of many ratios of an input to one of rounded readings.
+    # The median of many ratios of an input to one of rounded readings.
     assert re.match(r"the logged input is 0\.0097\d times what the stated", checks[0].note)
     assert checks[0].nrmse < 1.35 * noise_floor(y[0])
 
 
 @pytest.mark.parametrize("wrong", ["input", "reference", "gains", "controlled_cart", "counts"])
 def test_what_contradicts_the_run_fails_a_check(wrong):
-    """A tenfold column, swapped gains or another cart: the statement is not what ran."""
+    """A column in another unit, swapped gains or another cart fail a check of the loop."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -243,7 +249,7 @@ def test_what_contradicts_the_run_fails_a_check(wrong):
 
 
 def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
-    """At 1 kHz the velocity from noisy readings is mostly noise; the true controller stays."""
+    """At 1 kHz, where velocities are mostly noise, the true controller is not called misscaled."""
     t = 0.001 * np.arange(4000, dtype=np.float64)
     steps = np.where((t > 0.2) & (t < 2.5), 1.0, 0.0)
     design = design_feedback(
@@ -273,7 +279,7 @@ def test_noise_at_a_fast_sample_is_no_scale_of_the_log():
     ],
 )
 def test_the_timing_of_the_bench_is_found(law, sample_time):
-    """Slow and fast controllers, with and without a model, are all simulated to the noise."""
+    """Slow and fast controllers, with and without a model, are simulated down to the noise."""
     y, u = bench(TWO, law, sample_time=sample_time)
     controller: submission.Controller
     if isinstance(law, Pid):
@@ -293,7 +299,7 @@ def test_the_timing_of_the_bench_is_found(law, sample_time):
 
 
 def test_saturation_is_read_off_the_log():
-    """A limit that nobody stated shows as a plateau and is simulated."""
+    """An input limit that nobody stated is seen as a plateau in the log and simulated."""
     law = Pid(kp=0.2, kd=0.01)
     y, u = bench(TWO, law, limit=0.06)
     assert np.sum(np.abs(u) >= 0.06) > 5
@@ -309,7 +315,10 @@ def test_saturation_is_read_off_the_log():
 
 
 def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
-    """`controlled_cart` says where the PID's reading comes from; its own `cart` comes first."""
+    """A PID without its own `cart` reads the cart given by `controlled_cart`.
+
+    Its own `cart` comes first.
+    """
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = record(y, u=u, reference=STEPS)
@@ -322,7 +331,7 @@ def test_a_pid_is_closed_around_the_controlled_cart_unless_it_names_one():
 
 
 def test_only_the_cart_that_is_steered_has_the_set_point():
-    """The other carts have no set point; if the cart is not stated, none of them has one."""
+    """Only the controlled cart has a set point; if no cart is stated, none has one."""
     y, u = bench(TWO, Pid(kp=0.008, kd=0.0008, cart=2))
     run = record(y, u=u, reference=STEPS)
     unnamed = submission.PidController(type="pid", kp=0.008, kd=0.0008)
@@ -335,7 +344,7 @@ def test_only_the_cart_that_is_steered_has_the_set_point():
 
 
 def test_a_pid_acts_on_the_files_own_counts():
-    """Gains stated per count close the same loop as gains per cm, whatever unit ingest made."""
+    """A PID's gains act on the file's unit, so gains per count and per cm give the same loop."""
     law = Pid(kp=0.008, kd=0.0008, cart=2)
     y, u = bench(TWO, law)
     run = replace(record(y, u=u, reference=STEPS), position_scale=COUNT)
@@ -345,7 +354,7 @@ def test_a_pid_acts_on_the_files_own_counts():
 
 
 def test_a_displaced_rest_is_no_error_of_the_model():
-    """Encoders zeroed away from the rest leave the open check at the noise."""
+    """If encoders were zeroed away from rest, the open check still leaves only noise."""
     y = encoder(simulate_linear(TWO, CLOCK, 0.06 * STEPS) + np.array([[3.0], [-2.0]]))
 
     checks = check_hardware(record(y, u=0.06 * STEPS, kind="step"), TWO)
@@ -358,7 +367,7 @@ def test_a_displaced_rest_is_no_error_of_the_model():
 
 
 def test_a_record_that_begins_in_motion_has_its_start_fitted():
-    """A sweep cut out of a longer one leaves the noise, whatever its sign."""
+    """If a sweep was cut from a longer recording, its initial motion is fitted."""
     u = -0.05 * np.sin(2 * np.pi * (0.5 * CLOCK + 0.4 * CLOCK**2))
     x = simulate_linear(TWO, CLOCK, u) + 0.7
     cut = slice(200, None)
@@ -375,7 +384,10 @@ def test_a_record_that_begins_in_motion_has_its_start_fitted():
 
 @pytest.mark.parametrize("start", [0, 30, 57, 90, 240])
 def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
-    """At rest, just after the step, or settled on it: the start is found."""
+    """A closed-loop run may be cut at rest, just after the step, or after settling.
+
+    Its initial motion is found in each case.
+    """
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, u = bench(TWO, law)
@@ -390,7 +402,7 @@ def test_a_closed_loop_cut_anywhere_is_checked_from_there(start):
 
 
 def test_uneven_and_rounded_time_does_no_harm():
-    """Samples lost and stamps rounded to the millisecond leave a small difference."""
+    """Lost samples and time stamps rounded to a millisecond hardly change the check."""
     rng = np.random.default_rng(3)
     kept = np.sort(rng.permutation(CLOCK.size)[:600])
     t = np.round(CLOCK[kept], 3)
@@ -402,7 +414,7 @@ def test_uneven_and_rounded_time_does_no_harm():
 
 
 def test_a_cart_held_and_a_cart_not_measured_have_no_check():
-    """Only carts that were free and measured are reported; the held one is a wall."""
+    """Only carts that were free and measured are checked; a held cart acts as a wall."""
     u = 0.06 * STEPS
     held = simulate_linear(TWO, CLOCK, u, free=[1])
     y = np.vstack([encoder(held), np.zeros((1, CLOCK.size))])
@@ -415,7 +427,7 @@ def test_a_cart_held_and_a_cart_not_measured_have_no_check():
 
 
 def test_without_an_input_the_loop_alone_is_checked():
-    """A file without an input column still has its closed loop simulated."""
+    """Without a logged input, only the closed loop is simulated."""
     design = designed(TWO, 2)
     law = StateFeedback(gains=design.gains, prefilter=design.prefilter, model=TWO)
     y, _ = bench(TWO, law)
@@ -432,7 +444,7 @@ def test_without_an_input_the_loop_alone_is_checked():
     [None, submission.StateFeedbackController(type="state_feedback", gains=(), prefilter=1.0)],
 )
 def test_without_gains_the_measured_input_alone_is_checked(controller):
-    """Nothing stated, or a state feedback without gains: the open check only."""
+    """If no gains are stated, only the open check is made."""
     law = Pid(kp=0.02, kd=0.001)
     y, u = bench(TWO, law)
 
@@ -443,7 +455,10 @@ def test_without_gains_the_measured_input_alone_is_checked(controller):
 
 
 def test_an_unstable_statement_is_said():
-    """Gains that cannot have run are called unstable, and the open check goes on."""
+    """If the stated gains make the loop unstable, a note says so.
+
+    The open check is still made.
+    """
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     wild = submission.StateFeedbackController(
         type="state_feedback", gains=(-1.0, -0.5, 0.0, 0.0), prefilter=1.0
@@ -452,14 +467,17 @@ def test_an_unstable_statement_is_said():
     with pytest.raises(DataError, match="stated controller makes it unstable"):
         check_hardware(stub, TWO, controller=wild)
 
-    # A log that contradicts even the sign of what is stated has the loop closed its way.
+    # If the log contradicts even the sign of the statement, the loop is closed as logged.
     checks = check_hardware(record(y, u=u, reference=STEPS), TWO, controller=wild)
     assert all(np.isfinite(check.nrmse) for check in checks)
     assert {check.loop for check in checks} >= {"open"}
 
 
 def test_gains_that_do_not_fit_leave_the_open_check():
-    """Two gains for two carts: the loop is not simulated, and the open check says why."""
+    """If the number of gains does not fit the carts, the loop is not simulated.
+
+    The open check says why.
+    """
     y, u = bench(TWO, Pid(kp=0.02, kd=0.001))
     short = submission.StateFeedbackController(
         type="state_feedback", gains=(0.1, 0.01), prefilter=0.1
@@ -481,7 +499,7 @@ def test_gains_that_do_not_fit_leave_the_open_check():
     ],
 )
 def test_runs_that_cannot_be_checked_are_refused(run, message):
-    """No input and no controller, no motion, or cart 1 held: an error that says so."""
+    """A run without input and controller, without motion, or with cart 1 held is refused."""
     with pytest.raises(DataError, match=f"control: .*{message}"):
         check_hardware(run, TWO)
 
@@ -523,7 +541,7 @@ UCSD = Chain(  # V, count, s; damping of about a tenth
     ],
 )
 def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_limit, sign):
-    """The closed-loop logs need two to four times the input, with the sign reversed."""
+    """The real closed-loop logs need two to four times the logged input, with its sign reversed."""
     run = ucsd(real_data / "ecp210-ucsd", name, sign=sign)
 
     checks = check_hardware(
@@ -539,7 +557,7 @@ def test_the_ucsd_logs_differ_in_sign_and_scale(real_data, name, gains, closed_l
     assert "the logged input explains the motion only if multiplied by" in opened.note
     assert ("opposite sign" in closed.note) == (sign < 0)
     assert closed.nrmse < closed_limit
-    if name == "closed_loop_pid.csv":  # integral action: within a percent of 1000 counts
+    if name == "closed_loop_pid.csv":  # by integral action: within a percent of 1000 counts
         assert_allclose(known(closed.steady_state_measured), 1000.0, rtol=0.01)
         assert_allclose(known(closed.steady_state_model), 1000.0, rtol=0.01)
 

@@ -1,4 +1,4 @@
-"""Free decay: damping, frequency, dry friction, and where the decay begins."""
+"""A free decay gives damping, frequency, dry friction, and the start of the decay."""
 
 from dataclasses import replace
 
@@ -17,15 +17,15 @@ from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 
 COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual logging rate
+FS = 113.1  # Hz, its usual sampling rate
 OMEGA, RELEASE = 20.0, 0.4  # rad/s, s
 
 
 def held_then_free(t, *, zeta, omega_n=OMEGA, start=1.2, release=RELEASE, d=0.0):
-    """Hold a cart at `start`, release it: exact, half cycle by half cycle, dry friction d = F/k.
+    """Simulate a cart held at `start` and released, exactly, with friction band d = F/k.
 
-    While the cart moves one way it swings about d on the other side; once it turns within d of its
-    rest point it stays.
+    In each half cycle the cart swings about a point d away from its rest position. It stops as soon
+    as it turns within d of the rest position.
     """
     omega_d, decay = omega_n * np.sqrt(1 - zeta**2), zeta * omega_n
     half = np.pi / omega_d
@@ -56,7 +56,7 @@ def record(t, y, *, u=None, kind: Kind = "decay", count=COUNT):
 
 
 def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **motion):
-    """A record of a release by hand; long enough for 4.5 time constants."""
+    """Return a record of a release by hand, long enough for 4.5 time constants."""
     t = np.arange(0, duration or RELEASE + min(4.5 / (zeta * OMEGA), 10.0), 1 / fs)
     y = held_then_free(t, zeta=zeta, **motion)
     if rng is not None:
@@ -65,7 +65,7 @@ def released(*, zeta, fs=FS, duration=None, count=COUNT, noise=0.0, rng=None, **
 
 
 def friction_of(got):
-    """The outcome of the friction test."""
+    """Return the result of the friction test."""
     assert got.friction is not None
     return got.friction
 
@@ -77,12 +77,12 @@ def friction_of(got):
 @pytest.mark.parametrize("fs", [113.1, 333.0, 1000.0])
 @pytest.mark.parametrize("start", [1.2, -0.8])
 def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
-    """Damping to 0.2 % and frequency to 0.02 % at any usual damping, rate and side."""
+    """Damping is found to 0.2 % and frequency to 0.02 %, at any usual damping, rate and side."""
     got = fit_log_decrement(released(zeta=zeta, fs=fs, start=start), cart=1)
     assert_allclose(got.zeta, zeta, rtol=2e-3)
     assert_allclose(got.omega_n, OMEGA, rtol=2e-4)
-    # Rounding: 0.29 count on each turning point, of at most 500 counts and only six at ζ = 0.15;
-    # at the smallest, 4 counts, it moves the turning point by 0.07 rad of the 19 rad they span.
+    # Rounding: 0.29 count on each turning point, of at most 500 counts and only six at ζ = 0.15; at
+    # the smallest, 4 counts, it moves the turning point by 0.07 rad of the 19 rad they span.
     assert_allclose(got.zeta_peaks, zeta, rtol=1e-2)
     assert_allclose(got.omega_n_peaks, OMEGA, rtol=4e-3)
     assert_allclose(got.delta, 2 * np.pi * zeta / np.sqrt(1 - zeta**2), rtol=1e-2)
@@ -91,14 +91,14 @@ def test_recovers_the_damping_that_made_the_data(zeta, fs, start):
 
 
 def test_an_exact_decay_comes_back_exactly():
-    """Without rounding the exponential fit is exact, the peaks to the parabola's error."""
+    """Without rounding the fit is exact, and the peaks are exact to the parabola's error."""
     got = fit_log_decrement(released(zeta=0.05, count=0.0), cart=1)
     assert_allclose([got.zeta, got.omega_n], [0.05, OMEGA], rtol=1e-9)
     assert_allclose(got.zeta_peaks, 0.05, rtol=2e-4)
 
 
 def test_the_error_of_clean_decays_is_half_a_per_mille():
-    """Over 40 decays with rounding only, ζ errs by 0.05 % root-mean-square."""
+    """Over 40 decays with rounding only, the rms error of ζ is 0.05 %."""
     rng = np.random.default_rng(1)
     errors = []
     for _ in range(40):
@@ -111,7 +111,7 @@ def test_the_error_of_clean_decays_is_half_a_per_mille():
 
 @pytest.mark.parametrize("zeta", [0.3, 0.45, 0.6])
 def test_heavy_damping_still_gives_an_answer(zeta):
-    """A cart that swings but once or twice is fitted from its release on."""
+    """A cart that swings only once or twice is fitted from its release on."""
     got = fit_log_decrement(released(zeta=zeta, duration=3.0), cart=1)
     assert_allclose(got.zeta, zeta, rtol=5e-3)
     assert_allclose(got.omega_n, OMEGA, rtol=5e-3)
@@ -120,7 +120,7 @@ def test_heavy_damping_still_gives_an_answer(zeta):
 
 
 def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
-    """With fewer than four peaks, delta and its error come from the exponential fit."""
+    """With fewer than four peaks, the decrement and its error come from the exponential fit."""
     got = fit_log_decrement(released(zeta=0.6, duration=3.0), cart=1)
     assert got.peak_t.size < 4
     assert_allclose(got.zeta_peaks, got.zeta, rtol=1e-9)
@@ -128,13 +128,13 @@ def test_standard_errors_of_heavy_damping_are_those_of_the_fit():
 
 
 def test_the_figure_shows_the_fit_within_its_envelope():
-    """Fit and envelope share their times; the decay touches the envelope and stays inside."""
+    """In the figure, fit and envelope have the same times, and the decay stays in the envelope."""
     got = fit_log_decrement(released(zeta=0.05), cart=1)
     assert got.fit_t.shape == got.fit_y.shape == got.envelope_upper.shape
     assert np.all(got.fit_y <= got.envelope_upper + 1e-9)
     assert np.all(got.fit_y >= got.envelope_lower - 1e-9)
     assert got.fit_t[0] == got.release
-    # Turning points lie on the exponential itself, not on the envelope: lower by 1 - zeta²/2.
+    # Turning points are on the exponential itself, not on the envelope: lower by 1 - zeta²/2.
     inside = np.interp(got.peak_t, got.fit_t, got.fit_y)
     assert_allclose(got.peak_y, inside, atol=COUNT)
     assert got.amplitude.size == got.peak_t.size - 2
@@ -145,14 +145,14 @@ def test_the_figure_shows_the_fit_within_its_envelope():
 
 
 def test_the_hold_before_the_release_is_left_out():
-    """The decay begins where the hand lets go."""
+    """The decay begins when the hand releases the cart."""
     got = fit_log_decrement(released(zeta=0.05, release=1.7, duration=6.0), cart=1)
     assert 1.7 <= got.release < 1.75
     assert_allclose(got.zeta, 0.05, rtol=2e-3)
 
 
 def test_a_record_may_begin_at_the_release():
-    """If the first sample is already free, the whole record counts."""
+    """If the first sample is already free, the whole record is used."""
     t = np.arange(0, 4, 1 / FS)
     got = fit_log_decrement(record(t, held_then_free(t, zeta=0.05, release=-0.1)), cart=1)
     assert got.release == 0.0
@@ -161,7 +161,7 @@ def test_a_record_may_begin_at_the_release():
 
 @pytest.mark.parametrize("hand", [12.0, 18.0, 20.0, 25.0])
 def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
-    """Shaken ever further in some rhythm, released in mid-swing: only the decay is fitted."""
+    """If a hand swings the cart ever further before the release, only the decay is fitted."""
     t, zeta, release = np.arange(0, 6, 1 / FS), 0.04, 1.9
     decay, omega_d = zeta * OMEGA, OMEGA * np.sqrt(1 - zeta**2)
     x0 = 0.8 * np.sin(hand * release)
@@ -175,7 +175,7 @@ def test_a_hand_that_shakes_the_cart_is_told_from_the_decay(hand):
 
 
 def test_a_touch_after_the_decay_is_left_out():
-    """Someone takes the cart away after a while."""
+    """If somebody takes the cart away after a while, the rest of the record is not used."""
     run = released(zeta=0.05, duration=5.0)
     y = run.position(1) + np.where(run.t > 2.5, np.sin(9 * (run.t - 2.5)), 0.0)
     got = fit_log_decrement(record(run.t, y), cart=1)
@@ -186,7 +186,7 @@ def test_a_touch_after_the_decay_is_left_out():
 @pytest.mark.parametrize("on_off", [True, False])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
-    """After an edge the cart swings about its new rest point."""
+    """The ring-down after an edge of a step is a decay about the new rest position."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = sign * 0.03 * ((t > 0.5) & ((t < 4.0) | (not on_off)))
     run = record(t, simulate_linear(chain, t, u)[0], u=u, kind="step")
@@ -198,7 +198,7 @@ def test_the_ring_down_of_a_step_is_a_decay(on_off, sign):
 
 
 def test_the_driven_part_of_a_decay_is_left_out():
-    """A cart started by the motor decays once the input is zero."""
+    """If the motor started the cart, the decay begins when the input is zero."""
     chain, t = PRESETS["throne-1dof"], np.arange(0, 8, 1 / FS)
     u = 0.03 * np.sin(14 * t) * (t < 3.0)
     got = fit_log_decrement(record(t, simulate_linear(chain, t, u)[0], u=u), cart=1)
@@ -210,7 +210,7 @@ def test_the_driven_part_of_a_decay_is_left_out():
 
 
 def test_a_noisy_log_of_an_input_at_rest_is_no_drive():
-    """Noise about zero in the input column does not hide the decay."""
+    """Noise about zero in the input column is not taken for a drive."""
     run = released(zeta=0.05)
     noise = 1e-3 * np.random.default_rng(0).normal(size=run.t.size)
     assert_allclose(fit_log_decrement(replace(run, u=noise), cart=1).zeta, 0.05, rtol=2e-3)
@@ -218,14 +218,14 @@ def test_a_noisy_log_of_an_input_at_rest_is_no_drive():
 
 @pytest.mark.parametrize("drift", [0.02, -0.2])
 def test_a_drifting_rest_point_does_no_harm(drift):
-    """An offset and a drift of the rest point are part of the model."""
+    """An offset and a slow drift of the rest position do not change the damping."""
     run = released(zeta=0.05, count=0.0)
     got = fit_log_decrement(record(run.t, run.position(1) + 0.4 + drift * run.t), cart=1)
     assert_allclose(got.zeta, 0.05, rtol=3e-3)
 
 
 def test_an_uneven_clock_does_no_harm():
-    """Measured times are used as they are, gaps included."""
+    """If the samples are uneven and have gaps, the measured times are used."""
     rng = np.random.default_rng(2)
     t = np.sort(np.arange(0, 4, 1 / FS) + rng.uniform(-0.3, 0.3, size=453) / FS)
     t = np.delete(t, np.arange(100, 120))
@@ -235,7 +235,7 @@ def test_an_uneven_clock_does_no_harm():
 
 @pytest.mark.parametrize("scale", [0.01, 1 / COUNT])
 def test_units_do_not_matter(scale):
-    """Metres, centimetres and counts give the same damping."""
+    """The damping is the same in metres, centimetres and counts."""
     run = released(zeta=0.05)
     scaled = replace(run, y=run.y * scale, resolution=run.resolution * scale)
     assert_allclose(
@@ -244,7 +244,7 @@ def test_units_do_not_matter(scale):
 
 
 def test_a_small_decay_is_measured_within_its_error():
-    """A release by thirty counts gives an answer, and an error to match."""
+    """A release by thirty counts gives a damping within its standard error."""
     got = fit_log_decrement(released(zeta=0.03, start=30 * COUNT), cart=1)
     assert abs(got.zeta - 0.03) < 4 * got.zeta_std
     assert got.zeta_std > 1e-3 * 0.03
@@ -256,7 +256,7 @@ def test_a_small_decay_is_measured_within_its_error():
 @pytest.mark.parametrize("d", [0.002, 0.01, 0.03])
 @pytest.mark.parametrize("zeta", [0.01, 0.05, 0.1])
 def test_dry_friction_is_found_and_taken_out(d, zeta):
-    """The friction band, and the viscous damping that is left, come back; the note says so."""
+    """Dry friction and the viscous damping beside it are found, and the note says so."""
     got = fit_log_decrement(released(zeta=zeta, d=d, duration=4.0), cart=1)
     assert friction_of(got).present
     assert abs(friction_of(got).drop - d) < 4 * friction_of(got).drop_std + 1e-5
@@ -264,13 +264,16 @@ def test_dry_friction_is_found_and_taken_out(d, zeta):
     assert_allclose(friction_of(got).drop, d, rtol=0.15)
     assert got.zeta > friction_of(got).zeta  # viscous damping alone claims the friction's share
     assert "dry friction" in got.note
-    # As friction's share of the loss grows, so does the damping from swing to swing.
+    # As friction's share of the loss grows, so does the change of damping from swing to swing.
     local = got.zeta_at_amplitude
     assert local[1, local[0].argmin()] > local[1, local[0].argmax()]
 
 
 def test_damping_that_grows_with_amplitude_is_no_friction():
-    """Quadratic drag bends the envelope the other way: not exponential, but no friction."""
+    """Quadratic drag is not called dry friction.
+
+    The note says that the decay is not exponential.
+    """
     fine = np.linspace(0, 4, 40001)
     y, x, v = np.empty_like(fine), 1.2, 0.0
     for i in range(fine.size):
@@ -303,7 +306,7 @@ def flags(seeds, *, d):
 
 
 def test_friction_is_told_from_none():
-    """In twenty decays each: never without friction, always at d = 0.01 cm."""
+    """Of twenty decays each, none without friction and all with d = 0.01 cm are flagged."""
     assert not flags(20, d=0.0).any()
     assert flags(20, d=0.01).all()
 
@@ -312,7 +315,10 @@ def test_friction_is_told_from_none():
 
 
 def standardised(seeds):
-    """(ζ, ω_n, ζ by peaks) minus truth over standard error, of decays with noise and rounding."""
+    """Return errors of (ζ, ω_n, ζ by peaks) in standard errors.
+
+    The decays have noise and rounding.
+    """
     errors = []
     for seed in range(seeds):
         rng = np.random.default_rng(1000 + seed)
@@ -331,7 +337,7 @@ def standardised(seeds):
 
 
 def test_the_standard_errors_are_about_right():
-    """Over 60 noisy decays the standardised errors of the fit spread by about one."""
+    """Over 60 noisy decays the errors are about as large as their standard errors."""
     spread = np.sqrt(np.mean(standardised(60) ** 2, axis=0))
     assert np.all((0.65 < spread[:2]) & (spread[:2] < 1.35))  # 1 ± 4/sqrt(120)
     assert spread[2] < 1.35
@@ -341,28 +347,28 @@ def test_the_standard_errors_are_about_right():
 
 
 def test_a_cart_at_rest_is_refused():
-    """No motion, no decay: the message says what was needed and found."""
+    """A record without motion is refused; the message says what is needed and what was found."""
     t = np.arange(0, 4, 1 / FS)
     with pytest.raises(DataError, match=r"^decay: log decrement needs 3 turning points.*found 0$"):
         fit_log_decrement(record(t, np.zeros_like(t)), cart=1)
 
 
 def test_a_motion_without_return_is_refused():
-    """A ramp turns nowhere."""
+    """A motion that never turns, such as a ramp, is refused."""
     t = np.arange(0, 4, 1 / FS)
     with pytest.raises(DataError, match="needs 3 turning points"):
         fit_log_decrement(record(t, t), cart=1)
 
 
 def test_a_motion_that_does_not_decay_is_refused():
-    """A steady sine has no damping ratio."""
+    """A motion that does not decay, such as a steady sine, is refused."""
     t = np.arange(0, 4, 1 / FS)
     with pytest.raises(DataError, match="needs a decaying oscillation of cart 1"):
         fit_log_decrement(record(t, np.sin(9 * t)), cart=1)
 
 
 def test_a_hold_without_release_is_refused():
-    """If the hand never lets go, only noise is left to fit."""
+    """If the hand never lets go, the record is refused."""
     run = released(zeta=0.05)
     held = run.t < RELEASE
     with pytest.raises(DataError, match="needs 3 turning points"):
@@ -371,7 +377,7 @@ def test_a_hold_without_release_is_refused():
 
 @pytest.mark.parametrize("n", [1, 2, 6, 7, 12])
 def test_a_handful_of_samples_is_refused(n):
-    """A file that was cut off gives the same clear error."""
+    """A record of a few samples is refused with the same message."""
     t = np.arange(n) / FS
     with pytest.raises(DataError, match="needs 3 turning points"):
         fit_log_decrement(record(t, np.cos(20 * t)), cart=1)
@@ -389,7 +395,10 @@ def real_records(real_data, tmp_path_factory):
 
 @pytest.mark.parametrize("repeat", range(1, 6))
 def test_the_real_first_cart(real_records, repeat):
-    """Both edges of a real step: viscous-only damping, larger while the motor holds."""
+    """Both edges of the real cart 1's step give its damping.
+
+    It is larger while the motor holds.
+    """
     run = real_records[f"alone-1-{repeat}"]
     off = fit_log_decrement(run, cart=1)
     assert 23.2 <= off.omega_n <= 23.7
@@ -401,7 +410,7 @@ def test_the_real_first_cart(real_records, repeat):
 
 @pytest.mark.parametrize("repeat", range(1, 6))
 def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
-    """Dry friction is found in each repeat; with it little viscous damping is left."""
+    """In each real decay of cart 2 dry friction is found, with little viscous damping beside it."""
     got = fit_log_decrement(real_records[f"alone-2-{repeat}"], cart=2)
     assert 15.6 <= got.omega_n <= 15.9
     assert friction_of(got).present
@@ -411,21 +420,21 @@ def test_the_real_second_cart_pulled_by_hand(real_records, repeat):
 
 
 def test_a_crest_of_equal_readings_turns_in_its_middle():
-    """If an encoder is too coarse for a crest to curve, the turning point is still right."""
+    """If the encoder is so coarse that a peak is flat, its turning point is the middle."""
     zeta = 0.05
     run = released(zeta=zeta, count=0.03)
     got = fit_log_decrement(run, cart=1)
-    # Half a radian to either side a parabola is fitted, where there is one.
+    # A parabola is fitted within half a radian to either side, if there is one.
     crests = [run.y[0, np.abs(run.t - peak) <= 0.5 / OMEGA] for peak in got.peak_t]
     flat = got.peak_t[[np.ptp(crest) == 0 for crest in crests]]
     assert flat.size >= 3
     half = np.pi / (OMEGA * np.sqrt(1 - zeta**2))
-    # The middle of a whole number of samples, the first and last of them up to one off.
+    # The middle of a whole number of samples; the first and the last may be one sample off.
     assert_allclose((flat - RELEASE) / half, np.round((flat - RELEASE) / half), atol=1 / FS / half)
 
 
 def test_a_fit_of_spikes_is_finite_before_its_start():
-    """A fit to values of 1e12 is no decay; extended backwards, nothing overflows."""
+    """A fit to values of 1e12 stays finite when it is extended backwards."""
     fit = Ringing(
         t0=1.25,
         level=0.0,

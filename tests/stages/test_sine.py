@@ -1,4 +1,4 @@
-"""Sinusoidal steady state: amplitude, phase, frequency, and where the steady part begins."""
+"""A dwell gives amplitude, phase and frequency of its steady part, and where that begins."""
 
 from dataclasses import asdict, replace
 
@@ -14,11 +14,11 @@ from pipeline.stages.sine import Dwell, fit_sine
 
 CHAIN = PRESETS["throne-1dof"]
 COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual logging rate
+FS = 113.1  # Hz, its usual sampling rate
 
 
 def dwell(t, *, hertz=3.0, amplitude=1.0, chain=CHAIN, noise=0.0, count=COUNT, rng=None):
-    """Drive the chain from rest, cart 1 to about `amplitude`; also the true response."""
+    """Return a dwell from rest that moves cart 1 to about `amplitude`, and the true response."""
     omega = 2 * np.pi * hertz
     truth = chain.frequency_response(np.array([omega]))[:, 0]
     half = omega * np.mean(np.diff(t)) / 2  # a held sine is smaller by sin(half)/half
@@ -57,33 +57,33 @@ def sampled(duration, *, fs=FS):
 @pytest.mark.parametrize("hertz", [0.8, 2.09, 3.0, 6.0])
 @pytest.mark.parametrize("fs", [113.1, 500.0])
 def test_one_centimetre_is_measured_to_half_a_per_mille(hertz, fs):
-    """Below, at and above the resonance, a settled dwell of 1 cm gives amplitude and phase."""
+    """A settled dwell of 1 cm gives amplitude and phase below, at and above the resonance."""
     run, truth = dwell(sampled(9.0, fs=fs), hertz=hertz)
     got = fit_sine(run, cart=1)
     assert got.settled
     assert got.note == ""
-    # The rounding of 200 and more samples leaves 0.29 count sqrt(2/200) = 7e-5 of 440 counts;
-    # what is left of a transient at resonance adds up to 3e-4.
+    # The rounding of 200 and more samples leaves 0.29 count sqrt(2/200) = 7e-5 of 440 counts; what
+    # is left of a transient at resonance adds up to 3e-4.
     assert_allclose(got.amplitude, 1.0, rtol=5e-4)
     assert_allclose(got.gain, abs(truth[0]), rtol=5e-4)
     assert_allclose(got.phase, np.angle(truth[0]), atol=5e-4)
 
 
 def test_an_exact_steady_state_comes_back_exactly():
-    """Without rounding, the response to the held staircase is the chain's to its sine."""
+    """Without rounding, a steady dwell gives the exact frequency response of the chain."""
     run, truth = dwell(sampled(40.0), hertz=4.0, count=0.0)
     late = slice(int(30 * FS), None)  # 40 time constants: the transient is down to 1e-17
     run = cut(run, late)
     got = fit_sine(run, cart=1)
-    # A staircase also holds images about the sampling rate, which fold back onto the sine; the
+    # A staircase also contains images about the sampling rate, which fold back onto the sine; the
     # plant passes (4/113)² of their 4/113: 5e-5 each.
     assert_allclose(got.gain, abs(truth[0]), rtol=2e-4)
     assert_allclose(got.phase, np.angle(truth[0]), atol=2e-4)
-    assert got.steady_from < run.t[0] + 0.25 / 6  # from the input's first half amplitude on
+    assert got.steady_from < run.t[0] + 0.25 / 6  # from the first half amplitude of the input on
 
 
 def test_a_smooth_input_is_taken_as_sampled():
-    """With a band-limited input nothing is held, and amplitudes are those of the samples."""
+    """If the input is band-limited, amplitudes are those of the samples, without a hold."""
     t, omega = sampled(4.0), 2 * np.pi * 5.0
     run = record(t, 0.5 * np.sin(omega * t), np.sin(omega * t - 1.0)[None], omega=omega, count=0.0)
     got = fit_sine(replace(run, hold="band_limited"), cart=1)
@@ -91,7 +91,7 @@ def test_a_smooth_input_is_taken_as_sampled():
 
 
 def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
-    """All carts of three are fitted from one record, also beyond a phase of pi."""
+    """Each cart of a chain gets its own amplitude and phase, even beyond a phase of π."""
     run, truth = dwell(sampled(12.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     for cart in (1, 2, 3):
         got = fit_sine(run, cart=cart)
@@ -100,7 +100,7 @@ def test_every_cart_of_a_chain_has_its_own_amplitude_and_phase():
 
 
 def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
-    """Fitted one after another, in any order, carts have the numbers of a fit alone."""
+    """Carts fitted together, in any order, get the same numbers as a cart fitted alone."""
     run, _ = dwell(sampled(6.0), chain=PRESETS["throne-3dof"], hertz=3.0)
     together = Dwell(run)
     for cart in (3, 1, 2):
@@ -108,7 +108,7 @@ def test_what_the_carts_of_a_dwell_share_changes_none_of_their_numbers():
 
 
 def test_the_transient_is_left_out():
-    """The steady part starts where the transient of a dwell from rest has died away."""
+    """The steady part begins when the transient from rest has died away."""
     run, _ = dwell(sampled(9.0), hertz=3.0)
     got = fit_sine(run, cart=1)
     # 1 cm e^(-1.32 t) is one encoder step at 4.6 s.
@@ -119,7 +119,7 @@ def test_the_transient_is_left_out():
 
 @pytest.mark.parametrize("clock", ["jittered", "rounded", "gap"])
 def test_the_measured_times_are_used_as_they_are(clock):
-    """An uneven clock costs nothing."""
+    """If the samples are uneven or have gaps, the measured times are used."""
     rng = np.random.default_rng(3)
     t = np.sort(sampled(9.0) + rng.uniform(-0.3, 0.3, size=sampled(9.0).size) / FS)
     if clock == "rounded":
@@ -129,11 +129,11 @@ def test_the_measured_times_are_used_as_they_are(clock):
         keep = np.delete(np.arange(run.t.size), np.arange(800, 840))
         run = cut(run, keep)
     got = fit_sine(run, cart=1)
-    assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the held input is uneven, too
+    assert_allclose(got.gain, abs(truth[0]), rtol=2e-3)  # the hold of the input is uneven too
 
 
 def test_an_offset_and_a_drift_do_no_harm():
-    """The carts swing about some rest point, which may creep."""
+    """An offset and a slow drift of the rest position do not change the amplitude."""
     run, truth = dwell(sampled(9.0), hertz=3.0, count=0.0)
     y = np.round((run.y + 0.7 + 0.02 * run.t) / COUNT) * COUNT
     got = fit_sine(replace(run, y=y, resolution=np.array([COUNT])), cart=1)
@@ -141,7 +141,7 @@ def test_an_offset_and_a_drift_do_no_harm():
 
 
 def test_without_a_stated_frequency_it_is_found():
-    """The frequency comes from the input, to better than a thousandth of a line."""
+    """If no frequency is stated, it is found from the input."""
     run, truth = dwell(sampled(9.0), hertz=3.217)
     got = fit_sine(replace(run, omega=None), cart=1)
     assert_allclose(got.omega, 2 * np.pi * 3.217, rtol=1e-9)  # the input is exact
@@ -149,7 +149,10 @@ def test_without_a_stated_frequency_it_is_found():
 
 
 def test_a_frequency_that_the_input_contradicts_is_not_believed():
-    """Rad/s typed for Hz, or a clock that runs wrong: the input's own frequency is used."""
+    """If the stated frequency contradicts the input, the input's own frequency is used.
+
+    For example, rad/s was typed for Hz, or a clock runs wrong.
+    """
     run, truth = dwell(sampled(9.0), hertz=3.0)
     got = fit_sine(replace(run, omega=2 * np.pi * 3.0 * 1.01), cart=1)
     assert_allclose(got.omega, 2 * np.pi * 3.0, rtol=1e-6)
@@ -158,7 +161,7 @@ def test_a_frequency_that_the_input_contradicts_is_not_believed():
 
 
 def test_a_noisy_input_leaves_the_stated_frequency():
-    """Noise on the logged input is no reason to doubt the stated frequency."""
+    """If the logged input is noisy, the stated frequency is still used."""
     rng = np.random.default_rng(4)
     run, truth = dwell(sampled(9.0), hertz=3.0)
     assert run.u is not None
@@ -170,7 +173,7 @@ def test_a_noisy_input_leaves_the_stated_frequency():
 
 
 def test_an_input_that_stops_ends_the_dwell():
-    """Samples after the input's end, or before its start, are not steady state."""
+    """Samples before the input's start or after its end are not used."""
     t = sampled(14.0)
     omega = 2 * np.pi * 3.0
     truth = CHAIN.frequency_response(np.array([omega]))[0, 0]
@@ -183,7 +186,7 @@ def test_an_input_that_stops_ends_the_dwell():
 
 
 def test_a_dwell_cut_short_is_said_not_to_be_settled():
-    """If the transient still runs, the estimate is marked and has a large error."""
+    """If the transient has not died away, the estimate is marked and has a large error."""
     run, truth = dwell(sampled(1.6), hertz=2.4)
     got = fit_sine(run, cart=1)
     assert not got.settled
@@ -192,7 +195,7 @@ def test_a_dwell_cut_short_is_said_not_to_be_settled():
 
 
 def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
-    """A record that begins in steady state may be as short as that."""
+    """Two cycles of steady state are enough for an estimate."""
     run, truth = dwell(sampled(12.0), hertz=3.0)
     late = slice(int(11.3 * FS), None)
     got = fit_sine(cut(run, late), cart=1)
@@ -201,7 +204,7 @@ def test_two_cycles_of_steady_state_are_enough_for_an_estimate():
 
 
 def test_few_counts_are_mentioned():
-    """An amplitude below twenty encoder counts is noted."""
+    """If the amplitude is below twenty encoder counts, a note says so."""
     run, _ = dwell(sampled(9.0), amplitude=10 * COUNT)
     got = fit_sine(run, cart=1)
     assert "10.0 encoder counts" in got.note
@@ -209,7 +212,10 @@ def test_few_counts_are_mentioned():
 
 
 def test_a_motion_that_is_no_sine_is_mentioned():
-    """A third harmonic, as friction makes, is named with its size and enters the error."""
+    """If the motion has a third harmonic, as with friction, a note gives its size.
+
+    The harmonic also enters the standard error.
+    """
     t, omega = sampled(6.0), 2 * np.pi * 3.0
     y = np.sin(omega * t) + 0.05 * np.sin(3 * omega * t)
     got = fit_sine(record(t, np.sin(omega * t), y[None], omega=omega), cart=1)
@@ -218,21 +224,21 @@ def test_a_motion_that_is_no_sine_is_mentioned():
 
 
 def test_without_an_input_the_error_says_what_to_do():
-    """Amplitude and phase are against the input: a file without it cannot be used."""
+    """A file without the input is refused, since amplitude and phase are relative to it."""
     run, _ = dwell(sampled(9.0))
     with pytest.raises(DataError, match=r"needs the input beside the positions.*`columns`"):
         fit_sine(replace(run, u=None), cart=1)
 
 
 def test_an_input_at_rest_is_refused():
-    """A constant input is no dwell."""
+    """If the input is constant, the dwell is refused."""
     run, _ = dwell(sampled(9.0))
     with pytest.raises(DataError, match="needs an input that oscillates, found 0 throughout"):
         fit_sine(replace(run, u=np.zeros_like(run.t)), cart=1)
 
 
 def test_less_than_a_cycle_is_refused():
-    """Half a cycle could be anything."""
+    """Less than a full cycle is refused."""
     t = sampled(0.5)
     run = record(t, np.sin(6.0 * t), np.sin(6.0 * t)[None], omega=6.0)
     with pytest.raises(DataError, match="needs a full cycle"):
@@ -240,7 +246,10 @@ def test_less_than_a_cycle_is_refused():
 
 
 def coverage(seeds, *, from_rest):
-    """Standardised errors of gain and phase over random dwells of one to three carts."""
+    """Return errors of gain and phase in standard errors, of random dwells.
+
+    The dwells are of one to three carts.
+    """
     errors = []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
@@ -265,13 +274,13 @@ def coverage(seeds, *, from_rest):
 
 
 def test_the_standard_errors_are_about_right():
-    """Over 60 dwells the standardised errors spread by about one."""
+    """Over 60 dwells the errors are about as large as their standard errors."""
     spread = np.sqrt(np.mean(coverage(60, from_rest=False) ** 2, axis=0))
     assert np.all((0.75 < spread) & (spread < 1.35))  # 1 ± 4/sqrt(120)
 
 
 def test_another_signal_is_refused():
-    """Random input is no dwell, whatever the experiment is called."""
+    """A random input is refused, even if the experiment is declared as a dwell."""
     t = sampled(5.0)
     u = np.random.default_rng(0).normal(size=t.size)
     with pytest.raises(DataError, match="needs an input of one frequency"):
@@ -279,7 +288,7 @@ def test_another_signal_is_refused():
 
 
 def test_a_cart_that_does_not_move_is_refused():
-    """An unplugged encoder has no phase."""
+    """If a cart does not move, for example by an unplugged encoder, its dwell is refused."""
     run, _ = dwell(sampled(5.0))
     with pytest.raises(DataError, match="cart 1 does not move"):
         fit_sine(replace(run, y=np.zeros_like(run.y)), cart=1)

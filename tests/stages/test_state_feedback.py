@@ -1,4 +1,4 @@
-"""State-feedback design: the gains against other programs, the design against its goal."""
+"""State-feedback gains agree with other programs, and the design meets its goal."""
 
 import control
 import numpy as np
@@ -62,7 +62,7 @@ def design(
 
 
 def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
-    """Return the chain with masses and springs up to 3 %, dampings up to 30 % off."""
+    """Return the chain with masses and springs off by up to 3 %, dampings by up to 30 %."""
     return Chain(
         m=chain.m * (1 + 0.03 * rng.uniform(-1, 1, chain.n)),
         c=chain.c * (1 + 0.30 * rng.uniform(-1, 1, chain.n)),
@@ -76,7 +76,7 @@ def off_by(chain: Chain, rng: np.random.Generator) -> Chain:
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("weight", [1e-2, 1.0, 1e2])
 def test_lqr_gains_agree_with_control(name, weight):
-    """The doubling algorithm finds the gains that control.dlqr finds."""
+    """The doubling algorithm finds the same gains as `control.dlqr`."""
     phi, gamma = discretise(PLANTS[name], T)
     gamma = gamma / np.abs(gamma).max()
     Q = weight * np.diag(np.tile([1.0, 1e-3], PLANTS[name].n))
@@ -84,12 +84,12 @@ def test_lqr_gains_agree_with_control(name, weight):
     got = lqr_gains(phi, gamma, Q)
 
     expected, _, _ = control.dlqr(phi, gamma[:, None], Q, np.eye(1))
-    # Either program solves a Riccati equation whose condition number is below 1e6 here.
+    # Both programs solve a Riccati equation whose condition number is below 1e6 here.
     assert_allclose(got, np.asarray(expected)[0], rtol=1e-8, atol=1e-10 * np.abs(got).max())
 
 
 def test_lqr_gains_of_many_weights_are_those_of_each():
-    """Weights in a stack do not disturb each other."""
+    """Gains for several weights computed at once equal those computed one by one."""
     phi, gamma = discretise(PRESETS["throne-3dof"], T)
     weights = np.array([scale * np.eye(6) for scale in (1e-4, 1e-2, 1.0)])
 
@@ -102,7 +102,7 @@ def test_lqr_gains_of_many_weights_are_those_of_each():
 @pytest.mark.parametrize("name", PLANTS)
 @pytest.mark.parametrize("sample_time", [T, 0.001])
 def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
-    """The eigenvalues of phi - gamma G match the request one to one."""
+    """The eigenvalues of phi - gamma G are the poles that were asked for."""
     chain = PLANTS[name]
     phi, gamma = discretise(chain, sample_time)
     unit = np.tile([1.0, 20.0], chain.n)  # positions and velocities of one size
@@ -114,12 +114,12 @@ def test_placed_poles_are_where_they_were_asked_for(name, sample_time):
 
     away = np.abs(wanted[:, None] - got[None, :])
     rows, columns = linear_sum_assignment(away)
-    # Poles 0.4 T apart and more: eight of them have a condition number up to 1e8 at 1 ms.
+    # Poles 0.4 T apart and more: eight such poles have a condition number up to 1e8 at 1 ms.
     assert away[rows, columns].max() < 1e-7
 
 
 def test_placed_gains_agree_with_control():
-    """Single-input gains are unique, so another algorithm's must be the same."""
+    """The placed gains equal those of python-control, since they are unique for one input."""
     phi, gamma = discretise(PRESETS["throne-2dof"], T)
     gamma = gamma / np.abs(gamma).max()
     wanted = np.exp(T * np.array([-5 + 6j, -5 - 6j, -8 + 30j, -8 - 30j]))
@@ -131,7 +131,7 @@ def test_placed_gains_agree_with_control():
 
 @pytest.mark.parametrize("name", ["throne-2dof", "throne-3dof", "four"])
 def test_level_error_is_what_wrong_springs_do(name):
-    """The stated error is the sum of what each spring, 3 % off, does to the level."""
+    """The stated level error is the sum of the errors that each spring, 3 % off, causes."""
     chain, cart = PLANTS[name], 2
     gains = design(chain, cart=cart, method="poles").gains
 
@@ -149,7 +149,7 @@ def test_level_error_is_what_wrong_springs_do(name):
 
 
 def test_robust_stability_sees_a_loop_on_the_edge():
-    """Gains that only just keep the model stable do not pass; the designed ones do."""
+    """The designed gains pass the test of robust stability; gains near the limit do not."""
     chain = PRESETS["throne-3dof"]
     gains = design(chain, cart=3).gains
     assert stays_stable(chain, StateFeedback(gains=gains, prefilter=1, model=chain), sample_time=T)
@@ -172,7 +172,7 @@ def test_robust_stability_sees_a_loop_on_the_edge():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize(("name", "cart"), EVERY_CART)
 def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
-    """The step of the designed loop, simulated finely, keeps overshoot and settling time."""
+    """The designed loop, simulated finely, meets overshoot and settling time."""
     chain = PLANTS[name]
     got = design(chain, cart=cart, method=method)
 
@@ -187,7 +187,7 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
     settled = float(settling_time(t, y, before=0.0, level=np.float64(1.0)))
     assert overshoot < 10.0
     assert settled < 1.0
-    # The design looks at the ticks only; between them the step moves by little.
+    # The design checks the ticks only; between them the step changes by little.
     assert_allclose(overshoot, got.overshoot_percent, atol=0.2)
     assert got.settling_time is not None
     assert_allclose(settled, got.settling_time, atol=T)
@@ -196,7 +196,7 @@ def test_the_design_meets_its_goal_on_the_true_plant(name, cart, method):
 
 @pytest.mark.parametrize(("name", "cart"), [(n, c) for n, c in EVERY_CART if n in PRESETS])
 def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
-    """Overshoot is at most 0.6 %, and the loop is stable on plants a few percent off."""
+    """LQR designs overshoot by at most 0.6 % and stay stable if the plant is a few percent off."""
     chain, rng = PRESETS[name], np.random.default_rng(7)
     got = design(chain, cart=cart)
 
@@ -213,7 +213,7 @@ def test_lqr_hardly_overshoots_the_presets_and_forgives_model_error(name, cart):
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("name", PLANTS)
 def test_poles_and_prefilter_are_those_of_the_gains(name, method):
-    """The result's poles are the loop's eigenvalues, and the prefilter its inverse DC gain."""
+    """The poles returned are the loop's eigenvalues, and the prefilter is its inverse DC gain."""
     chain = PLANTS[name]
     got = design(chain, cart=chain.n, method=method)
 
@@ -245,7 +245,7 @@ def test_units_do_not_matter(position, force, method):
     base = design(chain, cart=2, limit=0.08, method=method)
     same = design(other, cart=2, limit=0.08 * force, reference=position, method=method)
 
-    # The choice among candidates could flip on a rounding only if two were equal to 1e-12.
+    # The choice among candidates could change by rounding only if two were equal to 1e-12.
     assert_allclose(same.gains, base.gains * force / position, rtol=1e-7)
     assert_allclose(same.prefilter, base.prefilter * force / position, rtol=1e-7)
     assert_allclose(same.overshoot_percent, base.overshoot_percent, atol=1e-6)
@@ -254,7 +254,7 @@ def test_units_do_not_matter(position, force, method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_step_down_mirrors_the_step_up(method):
-    """A negative reference has the same gains and the mirrored step."""
+    """A negative reference gives the same gains and the negative step."""
     up = design(PRESETS["throne-2dof"], cart=2, reference=0.5, method=method)
     down = design(PRESETS["throne-2dof"], cart=2, reference=-0.5, method=method)
 
@@ -265,7 +265,7 @@ def test_a_step_down_mirrors_the_step_up(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_input_limit_is_kept(method):
-    """With a limit that leaves room the goal is met within it."""
+    """If the input limit allows the goal, the design meets it within the limit."""
     chain = PRESETS["throne-3dof"]
     roomy = design(chain, cart=3, method=method)
     got = design(chain, cart=3, limit=0.075, method=method)
@@ -277,7 +277,7 @@ def test_the_input_limit_is_kept(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
-    """If the limit cannot even hold the step, the message says how far it can."""
+    """If the input limit cannot hold the step, the message gives the level that it can hold."""
     chain = PRESETS["throne-2dof"]
     got = design(chain, cart=2, limit=0.05, method=method)
 
@@ -289,7 +289,10 @@ def test_a_level_beyond_the_input_is_said_to_be_out_of_reach(method):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
-    """Too little input for the speed: the nearest design within it, and its figures."""
+    """If the input limit is too small for the settling time, the best design within it is given.
+
+    The message names its overshoot and settling time.
+    """
     chain = PRESETS["throne-2dof"]
     holding = 1 / chain.static_gains()[1]
     got = design(chain, cart=2, settling=0.15, limit=1.05 * holding, method=method)
@@ -302,7 +305,7 @@ def test_a_settling_time_beyond_the_input_names_what_is_reachable(method):
 
 
 def test_cancelling_gains_are_warned_of():
-    """Poles forced far from a soft plant's own are reported to make the level sensitive."""
+    """If poles are placed far from a soft plant's own, a warning says the level is sensitive."""
     got = design(FOUR, cart=4, settling=0.5, method="poles")
 
     assert level_error_percent(FOUR, got.gains, cart=4) > 5.0
@@ -310,7 +313,7 @@ def test_cancelling_gains_are_warned_of():
 
 
 def test_a_fast_plant_is_sampled_faster():
-    """Without a sample time the design takes one that follows the fastest mode."""
+    """Without a stated sample time, the design takes one that suits the fastest mode."""
     chain = PRESETS["throne-2dof"]
     fast = Chain(m=chain.m / 400, c=chain.c / 20, k=chain.k)  # twenty times as fast
     got = design(fast, cart=2, settling=0.05)
@@ -324,7 +327,7 @@ def test_a_fast_plant_is_sampled_faster():
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("speed", [0.1, 10.0])
 def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, speed):
-    """The result's statement about its goal follows from its own step, at any time scale."""
+    """At any time scale, the statement whether the goal is met agrees with the designed step."""
     chain = PRESETS["throne-2dof"]
     other = Chain(m=chain.m / speed**2, c=chain.c / speed, k=chain.k)
     got = design(other, cart=2, settling=3.0, method=method)
@@ -341,7 +344,7 @@ def test_goals_much_slower_or_faster_than_the_plant_are_judged_rightly(method, s
 
 
 def test_no_overshoot_at_all_can_be_asked_for():
-    """A goal of no overshoot is met."""
+    """A goal without any overshoot is met."""
     assert design(PRESETS["throne-2dof"], cart=1, overshoot=0.0).overshoot_percent < 1e-3
 
 
@@ -359,6 +362,6 @@ def test_no_overshoot_at_all_can_be_asked_for():
     ],
 )
 def test_impossible_tasks_are_refused(chain, cart, reference, message):
-    """A missing cart, no step, or a cart that the motor cannot reach is an error."""
+    """A missing cart, a reference of zero, and a cart that the motor cannot reach are errors."""
     with pytest.raises(DataError, match=message):
         design(chain, cart=cart, reference=reference)

@@ -1,4 +1,4 @@
-"""Static gain from step runs: levels, gains, friction, and records that cannot be used."""
+"""Step runs give static gains, with levels, friction, and errors for unusable records."""
 
 from dataclasses import replace
 
@@ -17,7 +17,7 @@ from pipeline.submission import load_submission
 from tests.helpers.ucsd import write_two_cart_submission
 
 COUNT = 0.00227  # cm, the encoder of the ECP 210
-FS = 113.1  # Hz, its usual logging rate
+FS = 113.1  # Hz, its usual sampling rate
 FOUR = Chain(
     m=np.array([3e-4, 2.5e-4, 2e-4, 2e-4]),
     c=np.array([1.5e-3, 8e-4, 6e-4, 6e-4]),
@@ -26,7 +26,7 @@ FOUR = Chain(
 
 
 def staircase(t, *edges):
-    """An input that goes to a level at each (time, level)."""
+    """Return an input that goes to a level at each (time, level)."""
     u = np.zeros_like(t)
     for time, level in edges:
         u[t >= time] = level
@@ -63,7 +63,7 @@ def seconds(duration):
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
 @pytest.mark.parametrize("size", [0.03, -0.02])
 def test_every_cart_has_its_static_gain(name, size):
-    """A step on and off gives the gain of every cart of one, two and three, of either sign."""
+    """A step on and off gives the gain of each cart of one, two or three, with either sign."""
     chain = PRESETS[name]
     t = seconds(14.0)
     run = run_of(chain, t, staircase(t, (0.5, size), (7.0, 0.0)), offset=0.3)
@@ -80,7 +80,7 @@ def test_every_cart_has_its_static_gain(name, size):
 
 
 def test_four_carts():
-    """Nothing is special about three."""
+    """A step gives the gains of four carts too."""
     t = seconds(16.0)
     run = run_of(FOUR, t, staircase(t, (0.5, 0.03), (8.0, 0.0)))
     for cart, truth in enumerate(FOUR.static_gains(), start=1):
@@ -88,7 +88,7 @@ def test_four_carts():
 
 
 def test_an_exact_record_gives_the_exact_gain():
-    """Without rounding, the level comes from the sinusoids and is exact before they have died."""
+    """Without rounding, the gain is exact even if the record ends before the carts settle."""
     chain, t = PRESETS["throne-2dof"], seconds(5.0)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), count=0.0)
     got = fit_step_gain(run, cart=2)
@@ -96,7 +96,7 @@ def test_an_exact_record_gives_the_exact_gain():
 
 
 def test_several_sizes_and_signs_in_one_record():
-    """Each edge counts for itself, between any two levels."""
+    """If a record has steps of several sizes and signs, each edge gives a gain."""
     chain, t = PRESETS["throne-1dof"], seconds(24.0)
     u = staircase(t, (0.5, 0.02), (5.0, 0.04), (10.0, -0.03), (15.0, 0.0), (20.0, -0.01))
     got = fit_step_gain(run_of(chain, t, u), cart=1)
@@ -112,7 +112,7 @@ def test_several_sizes_and_signs_in_one_record():
 
 
 def test_the_windows_are_found():
-    """A level is taken where nothing moves: up to the edge, and after the ringing."""
+    """Levels are taken up to the edge and after the ringing."""
     t = seconds(14.0)
     run = run_of(PRESETS["throne-1dof"], t, staircase(t, (2.0, 0.03), (8.0, 0.0)))
     on, off = fit_step_gain(run, cart=1).edges
@@ -129,7 +129,10 @@ def test_the_windows_are_found():
 @pytest.mark.parametrize("wait", [0.9, 1.5, 3.0])
 @pytest.mark.parametrize("name", ["throne-1dof", "throne-2dof", "throne-3dof"])
 def test_a_record_that_ends_before_the_carts_settle(name, wait):
-    """The level is that of damped sinusoids, one for each cart, with a fitting error and a note."""
+    """If a record ends before the carts settle, the level is fitted with damped sinusoids.
+
+    The gain has a fitting error and a note.
+    """
     chain, t = PRESETS[name], seconds(0.5 + wait)
     run = run_of(chain, t, staircase(t, (0.5, 0.03)), noise=0.2 * COUNT)
     for cart, truth in enumerate(chain.static_gains(), start=1):
@@ -140,7 +143,7 @@ def test_a_record_that_ends_before_the_carts_settle(name, wait):
 
 
 def test_an_edge_before_the_carts_have_settled():
-    """If the input goes off too soon, both edges still count."""
+    """If the input goes off before the carts settle, both edges still count."""
     chain, t = PRESETS["throne-2dof"], seconds(8.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (0.5, 0.03), (1.7, 0.0))), cart=1)
     assert len(got.edges) == 2
@@ -148,7 +151,7 @@ def test_an_edge_before_the_carts_have_settled():
 
 
 def test_a_cart_that_never_settles_is_refused():
-    """Without a spring a constant force has no rest point."""
+    """A cart without a spring never settles under a constant force, so its step is refused."""
     rigid, t = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2)), seconds(3.0)
     with pytest.raises(DataError, match="cart 1 settles, found no such edge"):
         fit_step_gain(run_of(rigid, t, staircase(t, (0.5, 0.01))), cart=1)
@@ -158,7 +161,7 @@ def test_a_cart_that_never_settles_is_refused():
 
 
 def test_an_input_that_is_on_from_the_first_sample():
-    """A record may start with the edge itself: the cart sets off from its first position."""
+    """If the input is on from the first sample, the first position is taken as the rest."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, np.full_like(t, 0.03), offset=-0.2), cart=1)
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
@@ -167,7 +170,7 @@ def test_an_input_that_is_on_from_the_first_sample():
 
 
 def test_a_single_sample_of_rest_before_the_edge():
-    """The UCSD bench logs one sample of rest."""
+    """A single sample before the edge, as in UCSD logs, is enough for the rest position."""
     chain, t = PRESETS["throne-1dof"], seconds(6.0)
     got = fit_step_gain(run_of(chain, t, staircase(t, (t[1], 0.03))), cart=1)
     assert_allclose(got.gain, chain.static_gains()[0], atol=COUNT / 0.03)
@@ -175,7 +178,7 @@ def test_a_single_sample_of_rest_before_the_edge():
 
 @pytest.mark.parametrize("noise", [0.5, 3.0])
 def test_noise_is_averaged(noise):
-    """Noise on the position shrinks in the mean, and the error says how far."""
+    """Noise on the position is averaged, and the gain is within its standard error."""
     chain, t = PRESETS["throne-2dof"], seconds(14.0)
     u = staircase(t, (1.0, 0.03), (7.0, 0.0))
     got = fit_step_gain(run_of(chain, t, u, noise=noise * COUNT), cart=1)
@@ -184,7 +187,7 @@ def test_noise_is_averaged(noise):
 
 
 def test_a_noisy_input_still_has_its_edges():
-    """Noise on a logged input makes no edges of its own."""
+    """Noise on the logged input is not taken for edges."""
     chain, t = PRESETS["throne-1dof"], seconds(12.0)
     run = run_of(chain, t, staircase(t, (0.5, 0.03), (6.0, 0.0)))
     assert run.u is not None
@@ -195,7 +198,7 @@ def test_a_noisy_input_still_has_its_edges():
 
 
 def test_a_slow_edge_is_one_edge():
-    """An input that takes ten samples to reach its level steps once."""
+    """An input that takes ten samples to reach its level counts as one edge."""
     chain, t = PRESETS["throne-1dof"], seconds(7.0)
     u = 0.03 * np.clip((t - 0.5) / 0.09, 0, 1)
     got = fit_step_gain(run_of(chain, t, u), cart=1)
@@ -204,7 +207,7 @@ def test_a_slow_edge_is_one_edge():
 
 
 def test_a_drift_is_taken_out():
-    """A rest point that creeps equally before and after the edges shifts no gain."""
+    """If the rest position drifts steadily, the drift is removed from the gain."""
     chain, t = PRESETS["throne-1dof"], seconds(16.0)
     u = staircase(t, (3.0, 0.03), (9.0, 0.0))
     y = simulate_linear(chain, t, u) + 0.01 * t
@@ -218,7 +221,7 @@ def test_a_drift_is_taken_out():
 
 
 def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
-    """Exponential moves between levels, each short by the friction band."""
+    """Return exponential moves between levels, each short by the friction band."""
     y = np.full_like(t, rests[0])
     for edge, level, miss in zip((1.0, 6.0), levels[1:], rests[1:], strict=True):
         after = t >= edge
@@ -227,7 +230,7 @@ def sticking(t, *, rests, levels=(0.0, 0.9, 0.0)):
 
 
 def test_a_rest_point_that_does_not_return_is_reported():
-    """A cart that sticks gives an interval, which contains the gain without friction."""
+    """A cart that sticks gets an interval that contains the gain without friction."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.0))
     got = fit_step_gain(record(t, u, sticking(t, rests=(0.0, -0.01, 0.03))[None]), cart=1)
@@ -238,12 +241,12 @@ def test_a_rest_point_that_does_not_return_is_reported():
     assert low < 30.0 < high
     assert low < got.gain < high
     assert "away from where it began" in got.note
-    # The two edges differ by the shift: their spread is in the error.
+    # The two edges differ by the shift, so the standard error includes their spread.
     assert got.gain_std > 0.4 * 0.03 / 0.03 / 2
 
 
 def test_a_step_too_small_to_move_the_cart():
-    """An edge that friction holds is named and does not count."""
+    """If friction holds the cart at an edge, the edge is named and not used."""
     t = seconds(11.0)
     u = staircase(t, (1.0, 0.03), (6.0, 0.035))
     got = fit_step_gain(
@@ -258,7 +261,7 @@ def test_a_step_too_small_to_move_the_cart():
 
 
 def test_without_an_input_the_error_says_what_to_do():
-    """A gain is per input unit, so a file without the input cannot be used."""
+    """A file without the input is refused, since a gain is per input unit."""
     run = run_of(PRESETS["throne-1dof"], seconds(4.0), seconds(4.0) * 0)
     with pytest.raises(DataError, match=r"^step: step gain needs the input.*`columns`$"):
         fit_step_gain(replace(run, u=None), cart=1)
@@ -266,7 +269,7 @@ def test_without_an_input_the_error_says_what_to_do():
 
 @pytest.mark.parametrize("shape", ["zero", "sine", "ramp"])
 def test_an_input_without_a_step_is_refused(shape):
-    """No edge, a sine, a ramp: no static gain."""
+    """An input without an edge, such as a sine or a ramp, is refused."""
     t = seconds(8.0)
     u = {"zero": 0 * t, "sine": 0.03 * np.sin(9 * t), "ramp": 0.01 * t}[shape]
     with pytest.raises(DataError, match="needs an input that steps and then stays"):
@@ -274,7 +277,7 @@ def test_an_input_without_a_step_is_refused(shape):
 
 
 def test_a_held_cart_is_refused():
-    """A cart that somebody holds has no gain."""
+    """A cart that was held has no gain, so its step is refused."""
     t = seconds(8.0)
     run = run_of(PRESETS["throne-2dof"], t, staircase(t, (0.5, 0.03)))
     with pytest.raises(DataError, match="cart 2 is held"):
@@ -282,7 +285,7 @@ def test_a_held_cart_is_refused():
 
 
 def test_a_cart_that_does_not_move_is_refused():
-    """An unplugged encoder does not mean a gain of zero."""
+    """A cart that does not move is refused, since an unplugged encoder is not a gain of zero."""
     t = seconds(8.0)
     u = staircase(t, (0.5, 0.03), (4.0, 0.0))
     with pytest.raises(DataError, match="needs motion, cart 1 does not move"):
@@ -295,10 +298,13 @@ def test_a_cart_that_does_not_move_is_refused():
 
 
 def test_real_steps_agree_within_their_spread(real_data, tmp_path):
-    """Repeats 2 to 5 of the real two-cart step: gains within 5 %, a rest that hardly returns."""
+    """Gains of the real two-cart steps 2 to 5 agree within 5 %.
+
+    Friction still shifts the rest position.
+    """
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     runs = [r for r in read_data(load_submission(folder)).records if r.id.startswith("both")]
-    for cart, truth in ((1, 560.0), (2, 550.0)):  # counts per volt: 281 and 275 at 0.5 V
+    for cart, truth in ((1, 560.0), (2, 550.0)):  # counts per volt: 281 and 275 counts at 0.5 V
         got = [fit_step_gain(run, cart=cart) for run in runs]
         assert_allclose([abs(g.gain) for g in got], truth, rtol=0.05)
         assert all(g.rest_shift is not None and abs(g.rest_shift) < 10 for g in got)
@@ -306,7 +312,7 @@ def test_real_steps_agree_within_their_spread(real_data, tmp_path):
 
 
 def test_a_real_repeat_that_sticks_far_off(real_data, tmp_path):
-    """The first repeat's second cart stays 32 counts off its rest, which its interval shows."""
+    """In the first real repeat, cart 2 stops 32 counts off its rest, which its interval shows."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(1,))
     run = next(r for r in read_data(load_submission(folder)).records if r.id == "both-1")
     got = fit_step_gain(run, cart=2)

@@ -25,14 +25,14 @@ from tests.helpers.ucsd import write_two_cart_submission
 
 
 def std(fit: ChainFit, name: str) -> float:
-    """Return the standard error of a named parameter, which must exist."""
+    """Return the standard error of a named parameter that must exist."""
     found = fit.parameters[name].std
     assert found is not None
     return found
 
 
 def errors(fit: ChainFit, chain: Chain) -> np.ndarray:
-    """Return how many standard errors each named parameter is off."""
+    """Return the error of each named parameter in standard errors."""
     return np.array(
         [
             (fit.parameters[name].value - v) / std(fit, name)
@@ -58,7 +58,7 @@ def misfit(record: Record, chain: Chain, parametrisation: Parametrisation, *, at
 @pytest.mark.parametrize("jitter", [0.0, 0.5])
 @pytest.mark.parametrize("free", [(1, 2, 3), (1, 3), (1,)])
 def test_modes_and_simulation_agree(free, jitter):
-    """The response by modes is the simulated one, for any free carts and sample times."""
+    """The response by modes equals the simulated one, for any free carts and sample times."""
     chain, rng = PRESETS["throne-3dof"], np.random.default_rng(0)
     x0 = rng.standard_normal(2 * len(free))
     record = step_record(chain, rng=rng, free=free, jitter=jitter, noise=0.0, count=0.0, x0=x0)
@@ -72,7 +72,7 @@ def test_modes_and_simulation_agree(free, jitter):
 @pytest.mark.parametrize("zeta", [0.1, 1.0, 1.5])
 @pytest.mark.parametrize("at_rest", [True, False])
 def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
-    """The gradient from the Jacobian is that of the cost, also where a cart's poles meet."""
+    """The Jacobian gives the gradient of the cost, even if two poles of a cart coincide."""
     m, k = np.array([2e-4, 1e-4]), np.array([0.03, 0.04, 0.02])
     chain = Chain(m=m, c=2 * zeta * np.sqrt(m * (k[:-1] + k[1:])), k=k)
     record = step_record(chain, rng=np.random.default_rng(1), noise=0.01)
@@ -89,13 +89,13 @@ def test_the_jacobian_is_that_of_the_misfit(zeta, at_rest):
     gradient = np.einsum("pij,ij->p", here.jacobian, here.residual)
     step = 1e-5 * np.eye(theta.size)
     numeric = [(cost(theta + e) - cost(theta - e)) / 2e-5 for e in step]
-    # Central differences err by the step's square times the third derivative: 1e-10 of a cost
-    # of 1e5 to 1e6 over gradients of 1e3 to 1e5.
+    # Central differences err by the step's square times the third derivative: 1e-10 of a cost of
+    # 1e5 to 1e6 over gradients of 1e3 to 1e5.
     assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-5 * np.max(np.abs(gradient)))
 
 
 def test_a_band_limited_input_is_used_as_such():
-    """A smooth input is followed to 1e-4 of the motion; read as held it is not."""
+    """A band-limited input is simulated to 1e-4 of the motion, if it is not read as held."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(2)
     t = np.arange(600) / 113.0
     u = 0.05 * np.sin(15 * t) * np.sin(np.pi * t / t[-1]) ** 2
@@ -119,7 +119,7 @@ def test_a_band_limited_input_is_used_as_such():
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_exact_records_give_the_chain_back(n):
-    """Without noise or rounding all masses, dampings and springs come back, from no guess."""
+    """Records without noise or rounding give the chain back without a start."""
     rng = np.random.default_rng(n)
     chain, springs = random_chain(n, rng)
     record = step_record(chain, rng=rng, noise=0.0, count=0.0)
@@ -135,7 +135,7 @@ def test_exact_records_give_the_chain_back(n):
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 @pytest.mark.parametrize("all_springs", [False, True])
 def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
-    """Three steps of a random chain are enough, whether or not the missing spring is known."""
+    """Three steps of a random chain determine it, even if a missing spring is not declared."""
     rng = np.random.default_rng(10 + n)
     for _ in range(3):
         chain, springs = random_chain(n, rng)
@@ -147,7 +147,8 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
             records, bench=Bench(springs=(True,) * (n + 1) if all_springs else springs)
         )
         assert fit.converged
-        # 3 × 4 × at most 17 numbers: none beyond 4.5 standard errors but in 1 of 700 such tests.
+        # Of 3 × 4 × at most 17 numbers, one is beyond 4.5 standard errors in only 1 of 700 such
+        # tests.
         assert np.max(np.abs(errors(fit, chain))) < 4.5
         # chi² of over 2000 positions is within 0.1 of 1; a rounding error that is not uniform (a
         # cart at rest stays on one count) lowers it by up to 0.3.
@@ -155,7 +156,7 @@ def test_unseen_chains_are_found_from_noisy_records(n, all_springs):
 
 
 def test_held_carts_and_hand_releases_join_in():
-    """Steps with a cart held, and decays of single carts, are fitted together with the others."""
+    """Steps with a held cart and decays of single carts are fitted with the other records."""
     rng = np.random.default_rng(3)
     chain = PRESETS["throne-3dof"]
     records = [
@@ -173,7 +174,7 @@ def test_held_carts_and_hand_releases_join_in():
 
 
 def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
-    """A window cut out of a motion is recognised, with a note, and does no harm."""
+    """A record that begins in motion is recognised, with a note, and does not harm the fit."""
     rng = np.random.default_rng(4)
     chain = PRESETS["throne-2dof"]
     x0 = np.array([0.3, -4.0, -0.2, 3.0])  # cm, cm/s
@@ -187,7 +188,7 @@ def test_a_record_that_starts_in_motion_is_told_from_one_at_rest():
 
 
 def test_a_cart_that_was_not_measured_is_still_found():
-    """Without the middle cart's encoder, the other two carry all the information."""
+    """If the middle cart was not measured, the other two still determine it."""
     rng = np.random.default_rng(5)
     chain = PRESETS["throne-3dof"]
     whole = [step_record(chain, rng=rng, swing=swing, id=f"{swing}") for swing in (1.0, 0.5)]
@@ -198,7 +199,7 @@ def test_a_cart_that_was_not_measured_is_still_found():
 
 
 def test_a_long_fast_sweep_is_fitted_whole():
-    """Twenty seconds at 1 kHz are fitted from the first start, and every sample counts."""
+    """A sweep of 20 s at 1 kHz is fitted with all its samples from the first start."""
     rng = np.random.default_rng(17)
     chain = PRESETS["throne-2dof"]
     t = np.arange(20_000) / 1000.0
@@ -213,7 +214,7 @@ def test_a_long_fast_sweep_is_fitted_whole():
 
 
 def test_a_body_on_no_spring_has_mass_and_damping():
-    """One cart without springs is fitted as a rigid body, also where springs were expected."""
+    """A cart without springs is fitted as a rigid body, even if springs were declared."""
     truth = Chain(m=np.array([2e-4]), c=np.array([5e-4]), k=np.zeros(2))
     t = np.arange(500) / 113.0
     u = 0.01 * np.sign(np.sin(4 * t))
@@ -227,7 +228,7 @@ def test_a_body_on_no_spring_has_mass_and_damping():
 
 
 def test_a_damping_at_its_bound_is_no_measurement():
-    """An undamped cart's step: held at zero or not, its damping has no standard error."""
+    """If an undamped cart's damping is held at zero, it has no standard error."""
     chain = Chain(m=np.array([2e-3]), c=np.array([0.0]), k=np.array([0.6, 0.0]))
     fits = [
         fit_records(
@@ -241,12 +242,12 @@ def test_a_damping_at_its_bound_is_no_measurement():
         zeta = fit.parameters["zeta"]
         assert (zeta.value, zeta.std, zeta.at_bound) == (0.0, None, True)
         assert fit.at_bound == ("c_1",)
-        assert fit.names == ("m_1", "c_1", "k_1")  # with a standard error of its own
+        assert fit.names == ("m_1", "c_1", "k_1")  # with its own standard error
         assert fit.covariance[1, 1] > 0
 
 
 def test_a_spring_that_is_not_there_is_held_at_zero():
-    """The last spring, declared but missing, is held at zero, with a note."""
+    """If the last spring is declared but missing, it is held at zero with a note."""
     rng = np.random.default_rng(1)
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([6e-4, 4e-4]), k=np.array([0.1, 0.06, 0]))
     fit = fit_records([step_record(chain, rng=rng)], bench=Bench(springs=(True,) * 3))
@@ -260,7 +261,7 @@ def test_a_spring_that_is_not_there_is_held_at_zero():
 
 
 def test_the_same_records_give_the_same_fit():
-    """Nothing in the search is random: two fits agree to the last bit."""
+    """Two fits to the same records agree to the last bit."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(7))
     first, second = (fit_records([record], bench=Bench(springs=(True,) * 3)) for _ in range(2))
     assert np.array_equal(first.chain.k, second.chain.k)
@@ -271,28 +272,31 @@ def test_the_same_records_give_the_same_fit():
 
 
 def test_without_an_input_there_is_no_scale():
-    """Decays alone give no mass in input units, and the fit says what it needs."""
+    """Decays alone give no mass in input units, and the error says what is needed."""
     record = decay_record(PRESETS["throne-2dof"], free=(1, 2), rng=np.random.default_rng(8))
     with pytest.raises(DataError, match="needs a record that drives cart 1, found none"):
         fit_records([record], bench=Bench(springs=(True,) * 3))
 
 
 def test_what_the_records_do_not_determine_is_named():
-    """A step with cart 2 held says nothing about its mass."""
+    """If the records do not determine a parameter, the error names it.
+
+    Here cart 2 was held, so its mass is unknown.
+    """
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9), free=(1,))
     with pytest.raises(DataError, match=r"the records do not determine \w_\d"):
         fit_records([record], bench=Bench(springs=(True,) * 3))
 
 
 def test_a_broken_chain_is_refused():
-    """No spring between the carts: the motor does not reach the second."""
+    """If no spring joins two carts, the fit is refused, since the motor cannot reach the second."""
     record = step_record(PRESETS["throne-2dof"], rng=np.random.default_rng(9))
     with pytest.raises(DataError, match="spring between carts 1 and 2"):
         fit_records([record], bench=Bench(springs=(True, False, True)))
 
 
 def test_a_record_without_motion_is_left_out_and_said():
-    """A decay in which nothing moves does not stop the fit; the message names it."""
+    """A record without motion is left out of the fit, and the message names it."""
     rng = np.random.default_rng(11)
     chain = PRESETS["throne-1dof"]
     good = step_record(chain, rng=rng)
@@ -303,7 +307,7 @@ def test_a_record_without_motion_is_left_out_and_said():
 
 
 def test_an_input_that_explains_nothing_is_not_called_a_fit():
-    """With the input's sign reversed no chain follows, and the fit says so."""
+    """If no chain explains the records, as with a reversed input, the fit says so."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
@@ -313,7 +317,7 @@ def test_an_input_that_explains_nothing_is_not_called_a_fit():
 
 
 def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
-    """Beyond the allowed number of comparisons no start is tried; the first result is returned."""
+    """A search that reaches its limit of comparisons ends with the best result so far."""
     rng = np.random.default_rng(12)
     record = step_record(PRESETS["throne-1dof"], rng=rng)
     assert record.u is not None
@@ -331,7 +335,7 @@ def test_a_search_that_nothing_ends_is_cut_short_with_the_best_so_far():
 
 
 def test_a_decay_is_used_from_its_release_on():
-    """Pull and hold are left out, whatever the encoder's zero."""
+    """A decay is used from its release on, whatever the encoder's zero."""
     record = decay_record(PRESETS["throne-1dof"], free=(1,), rng=np.random.default_rng(13))
     start = record.t[usable_segment(record)][0]
     # Released at 1.5 s; half the swing is lost within a quarter of the 0.48 s period.
@@ -342,7 +346,7 @@ def test_a_decay_is_used_from_its_release_on():
 
 
 def test_correlated_residuals_count_for_less():
-    """Sums over an AR(1) series are as uncertain as its spectrum at their frequency says."""
+    """If residuals are correlated, errors of sums follow from their spectrum."""
     rng = np.random.default_rng(14)
     n, phi, runs = 1000, 0.8, 60
     slow, fast = np.ones((1, 1, n)), (-1.0) ** np.arange(n, dtype=np.float64)[None, None]
@@ -361,7 +365,7 @@ def test_correlated_residuals_count_for_less():
 
 
 def test_a_long_rest_before_the_step_is_one_reading():
-    """A constant reading before the step does not make a gain more certain."""
+    """A long constant reading before the step does not make a gain more certain."""
     chain, rng, runs, rate = PRESETS["throne-1dof"], np.random.default_rng(18), 24, 500.0
     t = np.arange(int(10 * rate)) / rate
     u = np.where(t > 5.0, 1.0 / chain.static_gains()[0], 0.0)
@@ -373,7 +377,7 @@ def test_a_long_rest_before_the_step_is_one_reading():
         )
         fit = fit_records([record], bench=Bench(springs=(True, True)))
         off.append(errors(fit, chain))
-        moving = t >= 5.0 - 1.5 / rate  # the same, no rest before it
+        moving = t >= 5.0 - 1.5 / rate  # the same without a rest before it
         short = replace(record, t=t[moving] - t[moving][0], u=u[moving], y=record.y[:, moving])
         white.append(
             std(fit, "K") / std(fit_records([short], bench=Bench(springs=(True, True))), "K")
@@ -384,7 +388,7 @@ def test_a_long_rest_before_the_step_is_one_reading():
 
 
 def test_readings_of_a_rest_share_an_error():
-    """The weighted mean of a first rest has the information of one mean with a common error."""
+    """All readings of the first rest count together as one mean with a common error."""
     chain, rng = PRESETS["throne-2dof"], np.random.default_rng(19)
     window = open_window(step_record(chain, rng=rng, noise=0.0))
     n = window.n_resting
@@ -400,7 +404,7 @@ def test_readings_of_a_rest_share_an_error():
 
 
 def test_real_repeats_give_the_masses_and_springs_found_before(real_data, tmp_path):
-    """Four real steps, no guess: masses and springs as an independent viscous fit found them."""
+    """Four real steps give the masses and springs that an independent viscous fit found."""
     folder = write_two_cart_submission(tmp_path / "two", real_data, steps=(2, 3, 4, 5))
     records = [r for r in read_data(load_submission(folder)).records if r.free == (1, 2)]
     steps = [record for record in records if record.kind == "step"]
