@@ -85,7 +85,7 @@ async def _news(ask: Ask, place: Any) -> AsyncIterator[str]:
         if job.news != seen:
             seen, quiet = job.news, 0.0
             shown = ask.job or job
-            said = " ".join(ask.user.told(shown.said).split())
+            said = " ".join(ask.user.without_folders(shown.said).split())
             yield f"event: {'end' if job.over else 'stage'}\ndata: {said}\n\n"
         elif quiet > 5.0:  # s without news; the line sent then keeps the connection open
             quiet = 0.0

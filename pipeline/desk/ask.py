@@ -256,7 +256,7 @@ class Ask:
         text = _environment().get_template(f"{template}.html.j2").render(everywhere | context)
         if prefix := self.request.scope.get("prefix"):
             text = _ADDRESS.sub(lambda found: f'{found[1]}="{escape(prefix)}/', text)
-        return HTMLResponse(self.user.told(text), status_code=status)
+        return HTMLResponse(self.user.without_folders(text), status_code=status)
 
     def go(self, to: str) -> Response:
         """Return an answer that makes htmx open another page.

@@ -14,7 +14,7 @@ from pipeline.errors import PipelineError
 from pipeline.processes import Failed, Supervisor
 
 _GLANCE = 0.1  # s between two looks at whether a job may start or must stop
-_HANDS = 3  # number of processes for short tasks; each takes 150 MB
+_SHORT_WORKERS = 3  # number of processes for short tasks; each takes 150 MB
 _WAITING = 8  # requests that may wait for one folder; each holds one of the server's 40 threads
 
 State = Literal["waiting", "running", "done", "failed", "stopped"]
@@ -150,7 +150,7 @@ class WorkerPool:
     def __init__(self) -> None:
         self._free: queue.LifoQueue[Supervisor] = queue.LifoQueue()
         self._closed = threading.Event()
-        for _ in range(_HANDS):
+        for _ in range(_SHORT_WORKERS):
             self._free.put(_worker())
         self._lock = threading.Lock()
         self._folders: dict[str, tuple[threading.Semaphore, threading.Lock]] = {}
@@ -177,7 +177,7 @@ class WorkerPool:
 
     def start(self) -> None:
         """Start all processes in the background, if many people will use the desk soon."""
-        for _ in range(_HANDS):
+        for _ in range(_SHORT_WORKERS):
             self._replace(self._free.get())
 
     def _replace(self, process: Supervisor) -> None:
@@ -209,7 +209,7 @@ class WorkerPool:
     def close(self) -> None:
         """End the processes and their tasks."""
         self._closed.set()
-        processes = [self._free.get() for _ in range(_HANDS)]
+        processes = [self._free.get() for _ in range(_SHORT_WORKERS)]
         for process in processes:
             process.close()
             self._free.put(process)

@@ -90,7 +90,7 @@ class User:
         """Return whether they may see the paths of folders on this computer."""
         return self.role not in ("student", "ta")
 
-    def told(self, text: str) -> str:
+    def without_folders(self, text: str) -> str:
         """Return a text as they may read it; students and TAs see no folders of the server."""
         if self.sees_places:
             return text

@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from pipeline.desk.app import DeskServer
-from pipeline.desk.jobs import _HANDS, _WAITING, Busy, Jobs, WorkerPool
+from pipeline.desk.jobs import _SHORT_WORKERS, _WAITING, Busy, Jobs, WorkerPool
 from pipeline.processes import Failed, LineProcess
 from tests.helpers.desks import Visitor, a_submission, some_files, wrongs
 from tests.helpers.waiting import PATIENCE, until
@@ -40,7 +40,7 @@ def test_a_slow_folder_is_waited_for_by_who_looks_at_it_only(tmp_path):
         return thread
 
     threads = [ask("make_report")]
-    until(lambda: workers._free.qsize() < _HANDS)
+    until(lambda: workers._free.qsize() < _SHORT_WORKERS)
     assert workers.do("list_files", folder=str(tmp_path)) == []
     threads += [ask("list_files") for _ in range(_WAITING - 1)]
     until(lambda: workers._folders[str(slow)][0]._value == 0)  # type: ignore[attr-defined]
@@ -58,7 +58,7 @@ def test_a_stop_waits_for_no_thread(tmp_path):
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         visitor, workers = Visitor.of(server.url), server._desk.workers
-        processes = [workers._free.get() for _ in range(_HANDS)]
+        processes = [workers._free.get() for _ in range(_SHORT_WORKERS)]
         path = "/exercises/picture.svg?preset=throne-2dof&hide=nothing"
         threads = [threading.Thread(target=visitor.get, args=(path,)) for _ in range(45)]
         for thread in threads:
@@ -199,7 +199,7 @@ def test_a_lab_server_has_its_processes_before_students_ask(tmp_path):
     """A lab server starts all its processes before students ask."""
     workers = WorkerPool()
     workers.start()
-    until(lambda: [hand.runs for hand in list(workers._free.queue)] == [True] * _HANDS)
+    until(lambda: [hand.runs for hand in list(workers._free.queue)] == [True] * _SHORT_WORKERS)
     assert workers.do("list_files", folder=str(tmp_path)) == []
     workers.close()
 

@@ -55,5 +55,5 @@ def _chirp_turns(start: Start, t: float, chirp_end: float | None) -> float:
     span = CHIRP_SPAN if chirp_end is None else chirp_end / start.frequency
     if span == 1.0:
         return start.frequency * t
-    grown = start.duration / math.log(span)  # s in which the frequency grows e-fold
-    return start.frequency * grown * math.expm1(t / grown)
+    growth_time = start.duration / math.log(span)  # s in which the frequency grows e-fold
+    return start.frequency * growth_time * math.expm1(t / growth_time)

@@ -66,7 +66,7 @@ def run_on(address: str) -> Executor:
             graders = f"cartlab-graders-{uuid4()}"
             client.register_plugin(Graders(setup), name=graders)
             try:
-                yield from _through(client, tasks, graders=graders, out_of=setup.rubric.out_of)
+                yield from _grade_all(client, tasks, graders=graders, out_of=setup.rubric.out_of)
             finally:
                 client.unregister_worker_plugin(graders)
 
@@ -125,7 +125,7 @@ def _threads(client: Client) -> int:
     return sum(worker["nthreads"] for worker in workers.values())
 
 
-def _through(
+def _grade_all(
     client: Client, tasks: Sequence[Task], *, graders: str, out_of: float
 ) -> Iterator[Grading]:
     """Yield each outcome when it is ready; if a worker is lost, Dask moves its tasks to another."""

@@ -137,14 +137,14 @@ def grade_class(
                 setup=options.setup(rubric, scratch=scratch),
                 book=book,
                 execute=_executor(options),
-                examples=lambda: list(_handed_out(rubric, folder=rubric_file.parent)),
+                examples=lambda: list(_example_prints(rubric, folder=rubric_file.parent)),
                 progress=_nameless(progress, hand_ins) if hidden else progress,
             )
             now = rubric.model_copy(update={"anonymous": hidden})
             changes = book.finish(batch, rubric=now, shown=shown)
             remarks = [
-                *_beside(passed, unknown, late_file=options.lateness, hidden=hidden),
-                *_told(batch, book, shown=shown),
+                *_skip_messages(passed, unknown, late_file=options.lateness, hidden=hidden),
+                *_class_messages(batch, book, shown=shown),
             ]
             failed = [
                 (shown(name), hidden_reason(reason, name, shown(name)) if hidden else reason)
@@ -199,7 +199,7 @@ def _nameless(progress: Progress, hand_ins: Sequence[HandIn]) -> Progress:
     return lambda done, total, last: progress(done, total, "" if last in names else last)
 
 
-def _beside(
+def _skip_messages(
     passed: Sequence[str], unknown: Sequence[str], *, late_file: Path | None, hidden: bool
 ) -> Iterator[str]:
     """Yield messages about skipped folders and unknown names in the late table."""
@@ -212,7 +212,7 @@ def _beside(
         yield f"{late_file.name}: no such submission: {who}"
 
 
-def _told(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
+def _class_messages(batch: Batch, book: Gradebook, *, shown: Callable[[str], str]) -> Iterator[str]:
     """Yield messages about springs that the rubric lacks and about changes of the class list."""
     grades = (entry.grade for entry in book.entries())
     if asked := wrong_springs(grade.springs for grade in grades if grade.status == "graded"):
@@ -261,7 +261,7 @@ def _executor(options: Options) -> Executor:
     return run_on(options.cluster)
 
 
-def _handed_out(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
+def _example_prints(rubric: Rubric, *, folder: Path) -> Iterator[bytes]:
     """Yield fingerprints of recordings that several teams may use: those of example submissions.
 
     These are the rubric's own examples, and the examples of cartlab with the same number of carts.

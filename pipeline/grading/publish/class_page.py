@@ -108,7 +108,7 @@ def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]
         blocks.append(paragraph(capital(asked)))
     if failed:
         reasons = bullet_list(
-            spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _hand(line))
+            spans(_link(line.submission), f": {clean(on_one_line(line.reason))}", _by_hand(line))
             for line in failed
         )
         if len(failed) > 8:  # fold a long list
@@ -121,7 +121,7 @@ def _to_look_at(lines: Sequence[Line], doubles: Sequence[Double]) -> list[Block]
     return blocks
 
 
-def _hand(line: Line) -> str:
+def _by_hand(line: Line) -> str:
     return f" ({points_text(line.points)} points by hand)" if line.by_hand else ""
 
 

@@ -21,7 +21,7 @@ from pipeline.grading.grade import Grade
 from pipeline.grading.gradebook.book import Gradebook
 from pipeline.grading.gradebook.rows import Entry
 from pipeline.grading.intake.lms_names import Platform
-from pipeline.grading.publish.gradescope import results_text, told_flags
+from pipeline.grading.publish.gradescope import flag_messages, results_text
 from pipeline.grading.publish.platforms import FORMS, WORKSHEET
 from pipeline.grading.publish.roster import POINTS_POSSIBLE, Roster
 from pipeline.grading.publish.students import Remark, Student, students_of
@@ -163,11 +163,11 @@ def _comment(student: Student) -> str:
     """Return short feedback as HTML, which Moodle expects."""
     if student.undecided:
         return ""
-    said = _said(student.grade, by_hand=student.by_hand)
+    said = _comment_lines(student.grade, by_hand=student.by_hand)
     return "<br>".join(html.escape(line, quote=False) for line in said)
 
 
-def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
+def _comment_lines(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
     """Return a line for each criterion that lost points or has points by hand, and for each flag.
 
     The deduction for lateness comes last.
@@ -181,7 +181,7 @@ def _said(grade: Grade, *, by_hand: Collection[str]) -> list[str]:
         if c.points < c.out_of or c.id in by_hand
     ]
     late = [f"Late: {points_text(grade.deducted)} points off."] if grade.deducted else []
-    return [*lost, *told_flags(grade), *late]
+    return [*lost, *flag_messages(grade), *late]
 
 
 def _clock(days: float) -> str:

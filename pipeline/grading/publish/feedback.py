@@ -10,7 +10,7 @@ from typing import Any
 from pipeline import __version__
 from pipeline.grading.grade import Criterion, Flag, Grade, Outcome
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import told
+from pipeline.grading.similarity.shared import student_message
 from pipeline.grading.words import WORDS, points_text
 from pipeline.names import read_name
 from pipeline.report.document import (
@@ -170,7 +170,7 @@ def _remarks(flags: Sequence[Flag]) -> list[Block]:
     for flag in flags:
         blocks += [
             Heading(rich(_capital(WORDS.text(f"title_{flag.code}")))),
-            paragraph(rich(sentence(told(flag)))),
+            paragraph(rich(sentence(student_message(flag)))),
             paragraph(WORDS.spans("where", place=rich(WORDS.text(f"place_{flag.code}")))),
         ]
     return blocks
@@ -227,7 +227,7 @@ def numbers_table(
     for name in names[:60]:
         expected, found = criterion.expected.get(name), criterion.found.get(name)
         row = [_label(name, units), _value(name, found), _value(name, expected)]
-        rows.append([*row, _off(name, found, expected)] if compared else row)
+        rows.append([*row, _difference(name, found, expected)] if compared else row)
     more, title = len(names) - len(rows), _capital(clean(criterion.title or criterion.id))
     caption = WORDS.text("in_numbers_and_more" if more else "in_numbers", title=title, more=more)
     return make_table(next(numbers), caption, head, rows, "lddd" if compared else "ldd")
@@ -295,7 +295,7 @@ def _value(name: str, value: Any) -> str:
     return clean(value)[:200] if isinstance(value, str) else NOTHING
 
 
-def _off(name: str, found: Any, expected: Any) -> str:
+def _difference(name: str, found: Any, expected: Any) -> str:
     """Return the difference of two numbers in words.
 
     The difference of two percentages is in percentage points, any other is a share of `expected`.

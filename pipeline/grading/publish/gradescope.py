@@ -13,7 +13,7 @@ from collections.abc import Collection
 from pipeline.grading.grade import CODES, Code, Criterion, Grade
 from pipeline.grading.judge.costs import find_remarks
 from pipeline.grading.rubric import Rubric
-from pipeline.grading.similarity.shared import told
+from pipeline.grading.similarity.shared import student_message
 from pipeline.grading.words import WORDS, points_text
 from pipeline.words.text import with_symbols
 
@@ -26,7 +26,7 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
     hidden = rubric.students.see == "check"
     document = {
         "score": grade.points,
-        "output": "\n".join(_say_of_all(grade, by_hand=by_hand, hidden=hidden)),
+        "output": "\n".join(_grade_lines(grade, by_hand=by_hand, hidden=hidden)),
         "output_format": "text",
         "test_output_format": "text",
         "test_name_format": "text",
@@ -38,7 +38,7 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
                 "status": "passed" if judged.outcome == "pass" else "failed",
                 "name": judged.title or judged.id,
                 "number": str(number),
-                "output": _say_of(judged, grade, rubric, hidden=hidden),
+                "output": _criterion_text(judged, grade, rubric, hidden=hidden),
                 "tags": [judged.id],
                 "visibility": "after_due_date" if hidden else "visible",
             }
@@ -49,12 +49,12 @@ def results_text(grade: Grade, *, rubric: Rubric, by_hand: bool = False) -> str:
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def told_flags(grade: Grade, *, codes: Collection[Code] = CODES) -> list[str]:
+def flag_messages(grade: Grade, *, codes: Collection[Code] = CODES) -> list[str]:
     """Return the text that students see for each flag with one of these codes."""
-    return [with_symbols(told(flag)) for flag in grade.flags if flag.code in codes]
+    return [with_symbols(student_message(flag)) for flag in grade.flags if flag.code in codes]
 
 
-def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
+def _grade_lines(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     """Return the lines that students see about the whole grade.
 
     Parameters
@@ -66,13 +66,13 @@ def _say_of_all(grade: Grade, *, by_hand: bool, hidden: bool) -> list[str]:
     said = [f"Could not be graded{how}: {grade.reason}"] if failed else []
     if hidden:
         said += [] if failed else [WORDS.text("gradescope_hidden")]
-    said += told_flags(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
+    said += flag_messages(grade, codes=_WITHOUT_NUMBERS if hidden else CODES)
     if grade.deducted:
         said.append(f"Late: {points_text(grade.deducted)} points off.")
     return said
 
 
-def _say_of(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
+def _criterion_text(judged: Criterion, grade: Grade, rubric: Rubric, *, hidden: bool) -> str:
     """Return the text that students see about a criterion.
 
     Parameters

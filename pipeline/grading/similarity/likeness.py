@@ -98,7 +98,7 @@ def compare(
             beside = [
                 _part(c, row, first + s, last + s) for c, s in others[: n[row] // _SAMPLES_EACH]
             ]
-            rest = _left(np.array([*x[row], *beside])[:, both[row]])
+            rest = _unexplained_products(np.array([*x[row], *beside])[:, both[row]])
             left[row] = rest * (n[row] / rest[1, 1] if rest[1, 1] > _LEAST_PART * n[row] else 0.0)
             n[row] -= len(beside)
     # Signs may be reversed in a copy: of all carts together, and of the input.
@@ -127,7 +127,7 @@ def _part(one: Print, row: int, first: int, last: int) -> np.ndarray:
     return part
 
 
-def _left(x: np.ndarray) -> np.ndarray:
+def _unexplained_products(x: np.ndarray) -> np.ndarray:
     """Return the products (2, 2) of the first two rows, minus what the other rows explain."""
     products = x.astype(np.float64) @ x.T
     size = np.sqrt(np.maximum(np.diag(products), 1.0))

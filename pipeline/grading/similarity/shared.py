@@ -125,7 +125,7 @@ def find_shared(
             entries, first_batch=len(batch), everyone=len(everyone), owners=owners
         ):
             matches[pair].append(likeness)
-    matches = _telling(matches)
+    matches = _proving(matches)
     compared = sum(len(entries) ** 2 for entries in groups.values())
     given = {
         (a, one.experiments[0])
@@ -205,7 +205,7 @@ def shared_message(recordings: Sequence[Mapping[str, Any]], others: Iterable[str
     )
 
 
-def told(flag: Flag) -> str:
+def student_message(flag: Flag) -> str:
     """Return the message of a flag as students see it, without the name of another submission."""
     if flag.code != "shared_data":
         return flag.message
@@ -231,7 +231,7 @@ def same_recordings(a: Member, b: Member) -> bool:
     return bool(of_a and of_b) and (of_a <= of_b or of_b <= of_a)
 
 
-def _telling(
+def _proving(
     matches: Mapping[tuple[int, int], Sequence[Likeness]],
 ) -> dict[tuple[int, int], list[Likeness]]:
     """Return the matches that prove a copy, by pair of submissions.

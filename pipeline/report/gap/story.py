@@ -98,7 +98,7 @@ def build_gap_document(gap: Gap, analysis: Analysis, *, progress: Progress = sil
     parts += [
         ("runs", "Measured against simulated", lambda page: _runs(page, gap, worst[1:])),
         ("force-left", "The unexplained force", lambda page: _force_left(page, gap)),
-        ("hands", WORDS.text("hands"), lambda page: _hands(page, gap)),
+        ("hands", WORDS.text("hands"), lambda page: _interventions(page, gap)),
         ("apart", "How to decide between the explanations", lambda page: _apart(page, gap)),
         ("model", capital(whole_model(gap)), lambda page: _model(page, gap)),
         ("method", "How this was found", lambda page: _method(gap)),
@@ -259,7 +259,7 @@ def _force_left(page: Page, gap: Gap) -> list[Block]:
     return blocks
 
 
-def _hands(page: Page, gap: Gap) -> list[Block]:
+def _interventions(page: Page, gap: Gap) -> list[Block]:
     hands = without_releases(gap.interventions, list(page.records.values()))
     return [intervention_table(page, hands)] if hands else []
 
@@ -306,7 +306,7 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
             drive=page.drive,
             **{key: str(table[key]) for key in ("wave", "amplitude", "frequency")},
         )
-    one, other = _told_apart(*(gap.contenders[i] for i in proposal.prediction.pair))
+    one, other = _distinct_effects(*(gap.contenders[i] for i in proposal.prediction.pair))
     figure = predicted_figure(proposal.prediction, names=(one, other), position_unit=page.position)
     paragraph_ = WORDS.spans(
         "predicted",
@@ -321,7 +321,7 @@ def _predicted(page: Page, gap: Gap) -> list[Block]:
     return [paragraph(paragraph_), picture]
 
 
-def _told_apart(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
+def _distinct_effects(one: AugmentedChain, other: AugmentedChain) -> tuple[str, str]:
     """Return, for each of two models, the effects that the other model lacks, in words."""
     mine, yours = (
         [effect_name(term.effect, term.where) for term in model.terms] for model in (one, other)

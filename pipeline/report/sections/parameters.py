@@ -142,7 +142,7 @@ def reported_table(page: Page) -> Table:
             cell(f"{yours:f}".replace("-", "−")),
             cell(_estimate(getattr(row, column))),
             cell(_unit(row)),
-            *_off(row.name, yours, getattr(row, column)),
+            *_error_cells(row.name, yours, getattr(row, column)),
         ]
         for column, claimed in page.analysis.reported.items()
         for row in page.analysis.rows
@@ -151,7 +151,7 @@ def reported_table(page: Page) -> Table:
     return page.table(_WORDS, "reported_table", lines, "llddldl")
 
 
-def _off(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
+def _error_cells(name: str, yours: Decimal, found: Estimate | None) -> tuple[Cell, Cell]:
     """Return the error of a number, and what to look at if it is too large."""
     if found is None or not found.value or found.source == "assumed":
         return cell(NOTHING, "quiet"), cell("")

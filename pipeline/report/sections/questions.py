@@ -79,13 +79,13 @@ def _turned(analysis: Analysis) -> Iterator[Asked]:
     yield Asked(kind="sign", id="sign", section=section, text=_WORDS.text("sign", runs=runs))
 
 
-def _off(analysis: Analysis) -> list[ParameterRow]:
+def _inconsistent_rows(analysis: Analysis) -> list[ParameterRow]:
     off = [row for row in analysis.rows if row.consistent is False]
     return sorted(off, key=lambda row: -abs(row.change_percent or 0.0))
 
 
 def _damping(analysis: Analysis) -> Iterator[Asked]:
-    off = [row for row in _off(analysis) if read_name(row.name).is_ratio]
+    off = [row for row in _inconsistent_rows(analysis) if read_name(row.name).is_ratio]
     if off:
         row, *others = off
         also = listing([f"{other.name} by {_change(other)}" for other in others])
@@ -94,7 +94,7 @@ def _damping(analysis: Analysis) -> Iterator[Asked]:
 
 
 def _gains_and_frequencies(analysis: Analysis) -> Iterator[Asked]:
-    for row in _off(analysis):
+    for row in _inconsistent_rows(analysis):
         name = read_name(row.name)
         if name.is_ratio or row.initial is None or row.final is None:
             continue
