@@ -444,6 +444,6 @@ def test_no_comment_names_the_other_team(tmp_path, platform):
     shared = make_outcome(make_grade("a", flags=(shared_flag("b-team"),)), owner="Ann (1024)")
     write(tmp_path, shared, platform=platform)
     texts = [path.read_text("utf-8") for path in (tmp_path / "out").rglob("*.*")]
-    said = [text for text in texts if "step-1 also stands in another submission" in text]
+    said = [text for text in texts if "step-1 is also in another submission" in text]
     assert said
     assert not any("b-team" in text for text in texts)

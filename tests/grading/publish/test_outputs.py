@@ -245,7 +245,7 @@ def test_a_name_that_is_a_number_or_a_word_garbles_nothing():
     hidden = anonymise(grade, {"3": "anon-a", "step": "anon-b"})
     assert [c.message for c in hidden.criteria] == [c.message for c in grade.criteria]
     assert hidden.flags[0] == grade.flags[0]
-    assert hidden.flags[1].message.startswith("step-1 also stands in anon-b: ")
+    assert hidden.flags[1].message.startswith("step-1 is also in anon-b: ")
     assert hidden.flags[1].evidence["recordings"][0]["submission"] == "anon-b"
 
 
@@ -299,7 +299,7 @@ def test_feedback_on_shared_data_names_nobody_and_does_not_praise():
     grade = make_grade("team-1", flags=(shared_flag("b-team"),))
     html = feedback_page(grade, rubric=RUBRIC, figures=(), name="team-1")
 
-    assert "also stands in another submission" in html
+    assert "is also in another submission" in html
     assert "All points were earned." in html
     assert not re.search("b-team|Well done", html)
 
