@@ -30,7 +30,8 @@ from pipeline.words.progress import Progress, silent
 _GLANCE = 0.05  # s between checks of time, memory and stop requests
 _START_LIMIT = 120.0  # s. A cold start on a busy machine takes ten
 _STARTS = 3  # attempts. The system may end a new process to free memory
-_TASKS_EACH = 500  # The process is then replaced, because libraries keep more and more memory
+# tasks of one worker process, which is then replaced, because libraries keep taking memory
+_TASKS_EACH = 500
 _GRACE = 30.0  # s. A task without a parent may run past its limit for so long.
 _LAST_WORDS = 300  # characters of a process's last output, or of an internal error.
 _LUMP = 65_536  # bytes to read at once

@@ -60,7 +60,7 @@ def test_what_is_wanted_stands_in_the_plan_after_what_is_there(work, kind, numbe
         ("sine", {"amplitude": 0.1, "frequency": 0.005}, "frequency: expected at least 0.0083 Hz"),
     ],
 )
-def test_what_the_limits_do_not_allow_is_said_of_its_number(work, kind, numbers, words):
+def test_a_number_outside_the_limits_is_refused_by_name(work, kind, numbers, words):
     """The message has the allowed range; nothing is written."""
     submission = load_submission(work)
     plan = load_plan(submission)

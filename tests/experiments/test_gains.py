@@ -159,7 +159,7 @@ def test_a_pid_is_sent_as_typed_and_runs_as_simulated(identified):
     assert abs(u - expected_u).mean() < 0.05 * abs(expected_u).max()
 
 
-def test_the_submission_is_told_what_ran(identified):
+def test_the_submission_records_what_ran(identified):
     """The table has the design again, in V and cm; a PID comes with the volts of a count."""
     submission, analysis = identified
     scales = bench_scales(submission, bench=BENCH, analysis=analysis)
@@ -287,7 +287,7 @@ def test_a_proposed_pid_brings_cart_1_to_the_level(example):
         propose_pid(recording, submission=submission, analysis=analysis, bench=bench, limits=weak)
 
 
-def test_a_scale_that_nobody_states_is_asked_for(identified):
+def test_an_unstated_scale_is_asked_for(identified):
     """Centimetres of the submission and counts of the bench need a scale."""
     submission, analysis = identified
     with pytest.raises(DataError, match=r"state system\.position\.per_count in cm"):

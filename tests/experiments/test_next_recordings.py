@@ -87,7 +87,7 @@ def test_what_is_known_is_what_the_fit_says(known, analysis):
 
 
 @pytest.mark.slow
-def test_what_is_promised_is_kept(tmp_path):
+def test_fit_reaches_the_predicted_errors(tmp_path):
     """On the emulator's carts the later fit has the promised errors, and the truth lies within.
 
     A stated error is itself uncertain by some 20 %, and the worst of ten by more.
@@ -243,7 +243,7 @@ def test_what_somebody_proposes_is_weighed_beside_what_is_chosen(analysis, known
     assert not found.why
 
 
-def test_what_makes_the_fit_know_worse_says_so(analysis):
+def test_a_proposal_that_makes_the_fit_worse_is_reported(analysis):
     """Minutes of rest, whose rounding error does not average out, cost more than they give."""
     mine = Recording(id="mine", kind="step", carts=(1, 2), wave="square", amplitude=0.005,
                      frequency=2 / 120, cycles=4)  # fmt: skip
@@ -261,7 +261,7 @@ def test_what_makes_the_fit_know_worse_says_so(analysis):
         ({"amplitude": 0.5}, "stopped at the travel limit: an amplitude up to"),
     ],
 )
-def test_a_proposal_that_brings_nothing_is_told_why(known, change, words):
+def test_a_useless_proposal_gets_a_reason(known, change, words):
     """It is of a kind that the fit does not use, holds a cart, or goes too far."""
     mine = Recording(id="mine", kind="sweep", carts=(1, 2), wave="square", amplitude=0.02,
                      frequency=0.4, cycles=8)  # fmt: skip
@@ -299,7 +299,7 @@ def test_carts_that_hardly_settle_get_no_dwells():
         propose_candidates(slow, limits=LIMITS, commands=COMMANDS, goal=goal)
 
 
-def test_a_promise_below_any_calibration_says_so(analysis):
+def test_a_predicted_error_below_calibration_is_reported(analysis):
     """The worst parameter is named before and after, if it changes."""
     found = choose_next(analysis, Plan(limits=LIMITS), n=1, goal="worst", commands=COMMANDS)
     assert (STATISTICAL in found.said) == (found.errors[-1] < CALIBRATION)
@@ -339,7 +339,7 @@ def test_the_tones_of_a_multisine_peak_at_its_amplitude(known):
         assert np.abs(u).max() == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_bench_adds_the_tones_it_is_told():
+def test_a_bench_adds_the_requested_tones():
     """The sum of the tones last received; harmonic zero and a reset clear them."""
     core = ReferenceCore(Description(name="x", encoders=2, carts=2, commands=EXTENSIONS))
     tones = (Tone(harmonic=3, share=0.5, phase=0.25), Tone(harmonic=7, share=-0.25, phase=1.0))

@@ -38,7 +38,7 @@ def names(gap: Gap) -> list[tuple[str, int]]:
 
 
 @pytest.mark.parametrize(("n", "dirt"), [(1, False), (2, True)])
-def test_nothing_hidden_is_said_to_be_nothing(n, dirt):
+def test_a_bench_without_hidden_effects_reports_none(n, dirt):
     """A linear bench gets the verdict `none`, even if encoders are zeroed before every run."""
     gap = explain(make_case(seed=42, n=n, rate=200.0, dirt=dirt))
 
@@ -360,7 +360,7 @@ def test_carts_that_no_run_shows_do_no_harm():
     assert gap.verdict == "none"
 
 
-def test_a_run_without_its_input_is_left_out_and_said():
+def test_a_run_without_its_input_is_left_out_with_a_message():
     """A step without a logged input explains nothing."""
     case = make_case(seed=49, n=1, rate=113.1)
     first, *others = case.records
@@ -390,7 +390,7 @@ def _late(*, seed: int) -> Record:
     )  # fmt: skip
 
 
-def test_what_acts_in_the_held_out_data_alone_is_found_there():
+def test_an_effect_only_in_the_held_out_data_is_found():
     """Training and held-out data change sides, and the notes say so."""
     gap = explain_gap([_late(seed=0)], Bench(springs=(True, False)))
     assert names(gap) == [("cubic_spring", 1)]

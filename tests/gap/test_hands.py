@@ -26,7 +26,7 @@ def test_a_linear_bench_with_hands_is_linear(explained):
     assert gap.final == pytest.approx(gap.noise_floor, rel=0.1)
 
 
-def test_hands_are_reported(explained):
+def test_interventions_by_hand_are_reported(explained):
     """In `gap.json` each has its record, cart and times."""
     case, gap = explained
     hands = [(name, h) for name, laid in case.hands.items() for h in laid if h.end < 1e9]
@@ -38,7 +38,7 @@ def test_hands_are_reported(explained):
         assert (name, hand.cart) in {(one["experiment"], one["cart"]) for one in own}
 
 
-def test_what_follows_a_hand_is_used_without_it(explained):
+def test_data_after_an_intervention_by_hand_are_used(explained):
     """Every plucked record is fitted or judged, without the samples in which a hand acts."""
     case, gap = explained
 

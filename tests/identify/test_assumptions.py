@@ -66,7 +66,7 @@ def test_what_an_example_states_is_listed_with_its_support():
     assert "Assumed" not in terminal_summary(analysed("two-cart"))
 
 
-def test_what_nobody_states_is_a_default(tmp_path):
+def test_an_unstated_value_is_a_default(tmp_path):
     """Springs, unit and sign are assumed, and marked so; a spring too many is contradicted."""
     analysis = edited(tmp_path / "s", (SPRINGS, ""), (UNITS, ""))
     found = by_key(analysis)

@@ -69,7 +69,7 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     assert len(read_data(submission).records) == 4
 
 
-def test_the_second_time_as_much_is_told_as_the_first(tmp_path):
+def test_a_second_run_prints_as_much_as_the_first(tmp_path):
     """Free carts and unsure facts, until somebody removes the mark from the file."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
@@ -259,7 +259,7 @@ def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
     assert "'x2' never changes: a held cart, or an encoder that is stuck" in asked
 
 
-def test_a_table_without_its_file_is_told(tmp_path):
+def test_a_table_without_its_file_is_reported(tmp_path):
     """A renamed file gets a table of its own, and the old table a hint."""
     put(tmp_path, "step-1.csv", time=T, input=STEP, x1=RING)
     fill_submission(tmp_path)

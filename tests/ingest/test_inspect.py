@@ -31,7 +31,7 @@ def inspect(folder: Path, **columns: np.ndarray) -> Inspection:
     return inspect_file(folder / "a.csv")
 
 
-def test_the_essentials_are_told(tmp_path):
+def test_the_essentials_are_printed(tmp_path):
     """Form, samples, rate, duration, roles, ranges and the encoder step."""
     got = inspect(tmp_path, time=T, input=STEP, x1=X, remark=0 * T)
     assert got.format == "table of text (CSV)"

@@ -177,7 +177,7 @@ def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
         ('position = { unit = "mm" }\ninput = { unit = "furlong" }', ["input_unit"]),
     ],
 )
-def test_a_unit_that_nobody_knows_is_asked_about(system, ids, tmp_path):
+def test_an_unknown_unit_is_asked_about(system, ids, tmp_path):
     """Known units of benches pass; any other unit raises a question."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
@@ -247,7 +247,7 @@ def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
     ],
     ids=["a step of one volt", "fractions", "a heading in volts"],
 )
-def test_a_scale_that_no_input_needs_is_said(content, tmp_path):
+def test_an_unneeded_scale_is_reported(content, tmp_path):
     """Volts stay volts, and an unused per_count is named."""
     data = read(tmp_path, PER_COUNT, STEP, content)
     assert data.records[0].input_scale == 1.0
@@ -452,7 +452,7 @@ def test_signs_may_differ_between_experiments(tmp_path):
     assert list(data.files) == sorted(f"{name}.csv" for name in runs)
 
 
-def test_data_that_do_not_tell_the_sign_are_said_to(tmp_path):
+def test_data_that_do_not_show_the_sign_are_reported(tmp_path):
     """If cart 1 is not measured, the sign is taken as +1, with a note."""
     data = read(tmp_path, "", STEP, csv(time=T, input=U, x2=X2))
     assert_array_equal(data.records[0].u, U)

@@ -172,7 +172,7 @@ def test_a_record_that_counts_the_other_way_is_found(bench):
         assert sum(majority.values()) > 0.8 * len(names)
 
 
-def test_the_report_asks_why_a_record_was_turned(tmp_path):
+def test_the_report_asks_why_a_record_was_inverted(tmp_path):
     """One step logged the other way is reversed, reported, and asked about."""
     folder = tmp_path / "bench"
     write_submission(folder, "throne-1dof", seed=5, compact=True)

@@ -53,7 +53,7 @@ def told(columns: dict[str, Array], order: np.random.Generator) -> tuple[Roles, 
 
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
-def test_what_is_said_without_a_doubt_is_right(example):
+def test_roles_assigned_without_doubt_are_right(example):
     """In every record of the examples, in any order of the columns; only some dwells are asked."""
     asked = []
     order = np.random.default_rng(1)
@@ -84,7 +84,7 @@ def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
         assert got == Roles(columns=roles), name
 
 
-def test_the_input_of_a_random_record_is_told(real_data):
+def test_the_input_of_a_random_record_is_found(real_data):
     """The Silverbox: one column moves the other, whichever comes first."""
     for name in ("SNLS80mV.mat", "Schroeder80mV.mat"):
         table, _ = read_table(real_data / "silverbox", name)
@@ -94,7 +94,7 @@ def test_the_input_of_a_random_record_is_told(real_data):
         assert find_roles(bare(drive, answer, clock)).columns == {"time": 3, "input": 1, "x1": 2}
 
 
-def test_hands_are_no_inputs(real_data):
+def test_a_record_moved_by_hand_has_no_certain_input(real_data):
     """If a hand plucks carts, cartlab asks before it calls one the input."""
     for day in ("07-Feb-2025_11_28_21", "14-Feb-2025_09_44_21"):
         table, _ = read_table(real_data / "ecp210-2025", f"{day}.txt")

@@ -117,7 +117,7 @@ def test_every_sheet_gives_the_same_numbers(fill):
     assert got.cut is None
 
 
-def test_what_is_not_read_is_said():
+def test_what_is_not_read_is_reported():
     """Rows and columns beside the recording, numbers in text and their comma are in the notes."""
     got = table(sheet(titled))
     assert got.names == ("time [s]", "input [V]", "x1 [cm]")
@@ -171,7 +171,7 @@ def test_dates_and_times_of_day_become_seconds():
     assert_array_equal(table(sheet(times)).values[0], 43_200 + TIME)
 
 
-def test_percent_is_read_as_kept_and_said():
+def test_percent_is_read_and_reported():
     """50 % is the number 0.5 in a workbook."""
 
     def fill(ws) -> None:

@@ -28,7 +28,7 @@ def test_catalogue_has_the_agreed_names():
 
 
 @pytest.mark.parametrize("effect", CATALOGUE, ids=lambda e: e.key)
-def test_entry_says_all_a_student_needs(effect):
+def test_an_entry_has_all_texts_a_student_needs(effect):
     """Every entry has its sentence, equation, fingerprint, deciding run and reference."""
     for text in (effect.sentence, to_tex(effect.formula), effect.fingerprint, effect.deciding_run):
         assert len(text) >= len("f = F")

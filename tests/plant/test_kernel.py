@@ -229,7 +229,7 @@ def test_batch_gives_what_single_runs_give():
         assert np.array_equal(y, simulate(tables, t, u))
 
 
-def test_a_hidden_mass_starts_where_it_is_told_to():
+def test_a_hidden_mass_starts_at_the_given_position():
     """A cart with a hidden mass, started away from it, is the first cart of a chain of two."""
     chain = Chain(m=np.array([1.7e-4]), c=np.array([4e-4]), k=np.array([0.034, 0.0]))
     mass, stiffness = 2e-5, 0.004

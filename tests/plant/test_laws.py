@@ -209,7 +209,7 @@ WEAK_ZONE = replace(
 )
 
 
-def test_a_new_effect_is_its_file_alone(tmp_path, monkeypatch):
+def test_a_new_effect_needs_only_its_own_file(tmp_path, monkeypatch):
     """For a new law, columns, force, slopes and follower are generated."""
     catalogue = (*CATALOGUE, CUBIC_DRAG, WEAK_ZONE)
     load(columns_source(catalogue), "new_columns", tmp_path)

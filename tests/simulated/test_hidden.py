@@ -495,7 +495,7 @@ def test_one_place_has_one_dry_friction():
     assert len(prepare_bench(preset="throne-2dof", hide=hide).effects) == 2
 
 
-def test_defaults_are_told():
+def test_defaults_are_reported():
     """Omitted sizes get clearly visible defaults, and a note says so."""
     prepared = prepare_bench(preset="throne-3dof", hide=["presliding_friction:force=0.002"])
 
@@ -514,7 +514,7 @@ def test_a_bench_needs_one_source(tmp_path):
         prepare_bench(preset="throne-1dof", model=tmp_path)
 
 
-def test_what_the_linear_chain_can_do_is_said():
+def test_an_effect_the_linear_chain_can_replace_is_reported():
     """An effect that no data of this bench can tell from the chain is hidden, and said so."""
     prepared = prepare_bench(preset="throne-1dof", hide=["coupling_damper"])
 

@@ -46,7 +46,7 @@ def hand_in(folder: Path, *, hide: tuple[str, ...] = (), late: int = 0) -> Path:
     return folder
 
 
-def test_a_late_channel_is_told_with_its_delay(tmp_path):
+def test_a_late_channel_is_reported_with_its_delay(tmp_path):
     """In the report's checks, within a fifth of a sample, and in the grade of the data."""
     submission = load_submission(hand_in(tmp_path / "team", late=LATE))
     graded = grade_submission(
@@ -65,7 +65,7 @@ def test_a_late_channel_is_told_with_its_delay(tmp_path):
 
 @pytest.mark.parametrize("kinds", [("step",), ("sweep",), ("decay",)])
 @pytest.mark.parametrize("cart", [1, 2, 3])
-def test_a_late_channel_is_told_without_dwells(kinds, cart):
+def test_a_late_channel_is_found_without_dwells(kinds, cart):
     """For three carts, with steps, a sweep or one decay of all carts alone, to half a sample."""
     late = find_late_channels(motions(kinds, late=cart), carts=3)
     told = {one.cart: one.delay / SAMPLE for one in late}
@@ -76,7 +76,7 @@ def test_a_late_channel_is_told_without_dwells(kinds, cart):
     assert {one.kind for one in late} == set(kinds)
 
 
-def test_a_channel_that_is_late_in_the_sweep_alone_is_told_of_it_alone():
+def test_a_channel_late_only_in_the_sweep_is_reported_only_for_it():
     """One kind of experiment may have been logged differently; the others are not accused."""
     sound, late = motions(("step", "sweep")), motions(("sweep",), late=2)
     records = [record for record in sound if record.kind != "sweep"] + late

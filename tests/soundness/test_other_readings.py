@@ -72,6 +72,6 @@ def test_one_record_with_another_clock_is_sampled_otherwise():
     assert without_lone_factors({"sine-1": SLOW}, [slow, *others], fits=fits) == {"sine-1": SLOW}
 
 
-def test_a_turned_channel_is_one_record_s_own():
+def test_an_inverted_channel_belongs_to_one_record():
     """Neither a limit nor friction reverses a channel."""
     assert kept({"step-1": TURNED}, record("step-2"), sizes={"step-1": 1.0}) == {"step-1"}

@@ -50,7 +50,7 @@ def test_repeats_that_agree_pass():
     assert found.undecided == ()
 
 
-def test_of_two_nobody_knows_which_is_wrong():
+def test_two_different_numbers_do_not_show_which_is_wrong():
     """Two repeats a factor 1000 apart: the check fails, no run is blamed, and neither is used."""
     found = compared([decay("a", 20.0), decay("b", 0.02)])
     assert [c.outcome for c in found.checks if c.id == "repeats.omega_1"] == ["fail"]
@@ -58,7 +58,7 @@ def test_of_two_nobody_knows_which_is_wrong():
     assert found.undecided == ("omega_1",)
 
 
-def test_the_fit_tells_which_of_two_is_wrong():
+def test_the_fit_shows_which_of_two_numbers_is_wrong():
     """If the other records give 20.3 rad/s, the run at 0.02 is odd: its time is in milliseconds."""
     found = compared([decay("a", 20.0), decay("b", 0.02)], omega_1=20.3)
     assert list(found.odd) == ["b"]
@@ -67,7 +67,7 @@ def test_the_fit_tells_which_of_two_is_wrong():
     assert found.undecided == ()
 
 
-def test_most_repeats_tell_where_no_fit_does():
+def test_without_a_fit_the_majority_of_repeats_decides():
     """One of three gains is off by a quarter, for no known reason."""
     found = compared(steps=[step("a", 2.0), step("b", 2.5), step("c", 2.01)])
     assert list(found.odd) == ["b"]

@@ -52,7 +52,7 @@ def test_one_of_two_is_never_named():
     assert find_outlier_repeats([records[0], strange(records[1], rng)], unit="cm") == {}
 
 
-def test_repeats_that_differ_by_noise_alone_are_left_alone():
+def test_repeats_that_differ_only_by_noise_are_accepted():
     """In 200 sets of 3 to 6 honest repeats nothing is named."""
     rng = np.random.default_rng(1)
     for _ in range(200):

@@ -177,7 +177,7 @@ def test_notes_are_the_discussion(folder):
     assert load_submission(folder).discussion == "Friction *matters*.\n"
 
 
-def test_every_problem_is_told(folder):
+def test_every_problem_is_listed(folder):
     """Three mistakes in one file are three lines, each with file and key."""
     text = FULL.replace("K_1 = 25", "K_7 = 25\nzeta_q = 1").replace(
         "cart = 2\nref", "cart = 9\nref"

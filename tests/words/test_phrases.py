@@ -91,7 +91,7 @@ def test_a_catalogue_is_plain_toml(subject):
         ('b = "x"\na = "off by {share}', "gap.toml line 2"),
     ],
 )
-def test_a_slip_in_a_sentence_is_told_in_one_line(tmp_path, text, named):
+def test_a_mistake_in_a_sentence_is_reported_in_one_line(tmp_path, text, named):
     """The message names the file, the key and the values allowed there, with and without markup."""
     words = written(tmp_path, text)
     for say in (words.text, words.spans):

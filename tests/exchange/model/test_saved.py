@@ -50,7 +50,7 @@ def test_a_drive_that_leads_its_log_is_refused_in_a_sentence(analysis, tmp_path)
     assert not [*tmp_path.iterdir()]
 
 
-def test_the_recordings_sign_is_told(analysis, tmp_path):
+def test_the_sign_of_the_recordings_is_reported(analysis, tmp_path):
     """Each file says so if the recordings count the input the other way."""
     other_way = {
         turned: [replace(r, input_scale=-1.0 if turned else 1.0) for r in analysis.records]

@@ -38,12 +38,12 @@ from tests.helpers.virtual import VirtualBench, VirtualSession, new_folder
         ("omega_1 0.05 %", ErrorGoal(prefix="omega_1", error=0.0005)),
     ],
 )
-def test_wishes_are_read_as_one_says_them(text, wish):
+def test_error_goals_are_read_from_text(text, wish):
     """A name or none, and a percentage."""
     assert read_error_goal(text) == wish
 
 
-def test_durations_are_read_as_one_says_them():
+def test_durations_are_read_in_seconds_minutes_or_hours():
     """In seconds, minutes or hours."""
     assert [read_time(t) for t in ("90s", "20min", "20 min", "1.5h")] == [90, 1200, 1200, 5400]
 
@@ -302,7 +302,7 @@ def test_what_is_added_counts_whatever_it_is_called(tmp_path):
     assert offered == [step]
 
 
-def test_where_all_that_tells_more_was_refused_the_large_step_is_left(tmp_path):
+def test_the_large_step_remains_after_all_better_proposals_were_refused(tmp_path):
     """Carts that were driven only gently may hide effects far out."""
     submission = load_submission(a_recorded_cart(tmp_path / "work"))
     analysis = analyse(submission)

@@ -71,7 +71,7 @@ def test_a_gap_file_of_before_is_still_read(analysis):
     assert read_gap(json.dumps(document)).left_out == ()
 
 
-def test_a_cart_that_waits_for_a_hand_is_no_run():
+def test_a_cart_at_rest_before_a_release_is_not_a_run():
     """A cart creeps by some steps, a hand pulls it: only the decay after the hand is a run."""
     decay = decay_record(CHAIN, free=(1,), rng=np.random.default_rng(6))
     wait = np.arange(int(2.0 / decay.sample_time)) * decay.sample_time

@@ -37,7 +37,7 @@ def test_a_richer_law_that_explains_no_more_gives_way():
 
 
 @pytest.mark.parametrize(("value", "nothing"), [(0.015, False), (1e-4, True)])
-def test_what_is_nothing_within_its_error_is_told(value, nothing):
+def test_an_effect_of_zero_within_its_error_is_reported(value, nothing):
     """A delay is named if it is three standard errors from zero."""
     fit, study = begun(Hidden(effect="input_delay", parameters={"delay": 0.015}))
     chain = fit.structure.chain(fit.theta)

@@ -57,7 +57,7 @@ def test_without_time_the_linear_model_is_the_answer():
     assert search.verdict == "unexplained"
 
 
-def test_noise_that_was_taken_for_too_much_is_measured_anew():
+def test_overestimated_noise_is_measured_again():
     """With an assumed noise three times too large, friction and noise are still found."""
     fit, study = begun(FRICTION)
     loud = study.with_noise([replace(run, sigma=3.0 * run.sigma) for run in study.training])

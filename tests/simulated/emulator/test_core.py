@@ -152,7 +152,7 @@ def test_a_reset_forgets_and_a_stop_does_not():
     assert {line.duty for line in lines} == {0}
 
 
-def test_a_start_in_mid_run_begins_anew():
+def test_a_start_during_a_run_restarts_it():
     """Stamps start again at zero, and so do the sums of the PID."""
     core = make_core()
     first = run(core, b"g;0;1;0;d;q;c;o;10;500;9;", lambda k: (-100, 0), ticks=80)

@@ -196,7 +196,7 @@ def test_what_is_injected_is_what_a_host_finds():
     assert injected["late"] == pytest.approx(50 * injected["delay"], rel=0.05)
 
 
-def test_faults_come_when_they_are_told_to():
+def test_faults_come_at_the_requested_time():
     """An encoder sticks 1 s into the stream, for good; the cable is pulled 1 s later, once."""
     options = ("--speed", "5", "--fault", "stuck=2@1", "--fault", "disconnect@2")
     with emulator(*options) as bench:
@@ -305,7 +305,7 @@ def test_a_stock_bench_knows_no_query_and_no_stop():
         ("drop:0.1", "write KIND=RATE"),
     ],
 )
-def test_a_fault_that_is_none_is_said(fault, message):
+def test_an_unknown_fault_is_reported(fault, message):
     """A fault that does not exist gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         read_fault(fault)
@@ -320,13 +320,13 @@ def test_a_fault_that_is_none_is_said(fault, message):
         ("socket://0.0.0.0:0", "anyone who reaches this port"),
     ],
 )
-def test_a_port_that_will_not_do_is_said(port, message):
+def test_an_invalid_port_is_reported(port, message):
     """A malformed port, or one open to others, gives one clear message."""
     with pytest.raises(ConfigError, match=message):
         open_link(port)
 
 
-def test_a_port_that_is_taken_is_said():
+def test_a_port_in_use_is_reported():
     """Two benches cannot share one port; a remote port must be requested explicitly."""
     first = open_link("socket://127.0.0.1:0")
     with pytest.raises(ConfigError, match=r"in use|normally permitted"):
