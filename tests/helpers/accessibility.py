@@ -1,12 +1,12 @@
-"""Faults that axe finds on a page for readers with poor or no sight."""
+"""Find the faults of a page for readers with poor or no sight, with the program axe."""
 
 from typing import Any, NamedTuple
 
 from axe_playwright_python.sync_playwright import Axe
 
-# Figures are images with their own text, and the rows of a table are similar, as are formulas.
-# Without the drawings, the rows after the fourth and the formulas after the tenth, axe takes
-# a tenth of the time. All are put back.
+# Figures are images with their own text, and the rows of a table are alike, as are formulas.
+# Without the drawings, the rows after the fourth and the formulas after the tenth, axe takes a
+# tenth of the time. All are put back afterwards.
 _THIN = """() => {
   const spare = document.querySelectorAll('figure svg > *, tbody tr:nth-child(n + 5)');
   const formulas = [...document.querySelectorAll('math')].slice(10);
@@ -21,7 +21,7 @@ _RUN = "rules => axe.run({resultTypes: ['violations'], ...rules}).then(found => 
 
 
 class Violation(NamedTuple):
-    """A rule that a page breaks, by day or by night, and the first elements that do."""
+    """A rule that a page breaks, in light or dark colours, and the first elements that break it."""
 
     scheme: str
     rule: str
@@ -30,7 +30,7 @@ class Violation(NamedTuple):
 
 
 def violations(page: Any) -> list[Violation]:
-    """Return the faults that axe finds by day; at night only the colours, as only they differ."""
+    """Return the faults that axe finds in light mode, and faults of colours in dark mode."""
     page.evaluate(Axe().axe_script)
     page.evaluate(_THIN)
     found = []

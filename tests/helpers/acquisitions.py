@@ -1,4 +1,4 @@
-"""Submissions with a plan to carry out, and an observer that takes notes."""
+"""Submissions with a plan to carry out, and an observer that notes each call."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from pipeline.submission import load_submission
 from pipeline.submission.load import NAME
 from tests.helpers.waiting import started, until
 
-LIMITS = PlanLimits(input=0.5, travel=2.5)  # V, cm: the scales that the virtual benches state
+LIMITS = PlanLimits(input=0.5, travel=2.5)  # V and cm, the scales that the virtual benches state
 
 
 def sine(name: str, *, seconds: float, frequency: float = 2.0, settle: float = 0.0) -> Recording:
@@ -43,7 +43,7 @@ def write_work(
 
 
 class Notes:
-    """Records every call, and confirms everything."""
+    """An observer that notes every call and confirms everything."""
 
     def __init__(self) -> None:
         self.confirmed: list[str] = []
@@ -88,7 +88,7 @@ class Notes:
 
 
 def host(folder: Path, port: str, *options: str) -> AbstractContextManager[subprocess.Popen[str]]:
-    """Run `cartlab acquire` in a process of its own beside a block."""
+    """Run `cartlab acquire` in a process of its own while the block runs."""
     command = [sys.executable, "-m", "pipeline", "acquire", folder, "--port", port, *options]
     return started(command, stderr=subprocess.PIPE, encoding="utf-8")
 

@@ -1,6 +1,6 @@
 """Build complete analyses from known chains, without running any stage.
 
-The numbers are what the stages would plausibly find: truth plus a small, seeded error.
+The numbers are what the stages would plausibly find: the truth plus a small, seeded error.
 """
 
 from functools import cache
@@ -33,8 +33,8 @@ from pipeline.results import (
 from pipeline.set_up import PAPER_UNITS, Bench
 
 NOTES = "## What we saw\n\nThe *dampings* differ, as `zeta_a` shows:\n\n- friction\n- play\n"
-_SAMPLE_TIME = 0.00884  # s, the ECP controller's
-_COUNT = 0.00227  # cm, the encoder step
+_SAMPLE_TIME = 0.00884  # s, the controller of the ECP bench
+_COUNT = 0.00227  # cm, one encoder step
 _AMPLITUDE = 0.1  # V
 _PRESET = {1: "throne-1dof", 2: "throne-2dof", 3: "throne-3dof"}
 

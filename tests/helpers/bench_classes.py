@@ -1,4 +1,4 @@
-"""Whole classes on one bench, in memory: motion common to all teams is simulated once."""
+"""Whole classes on one bench, in memory; motion common to all teams is simulated once."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from pipeline.simulated.hidden import prepare_bench
 from pipeline.stages.state_feedback import design_feedback
 from pipeline.submission import Design
 
-USUAL_NOISE = 0.2  # counts, as `cartlab simulate` has it
+USUAL_NOISE = 0.2  # counts, as in `cartlab simulate`
 
 BENCHES = [
     (preset, effect.key)
@@ -35,7 +35,7 @@ class Moved:
 def move_class(
     preset: str, hide: str = "", *, seeds: range, count: float = COUNT, dwells: int = 12
 ) -> Moved:
-    """Return the motion of the carts for as many teams as there are seeds, on one bench."""
+    """Return the motion of the carts on one bench for a team per seed."""
     bench = prepare_bench(preset=preset, hide=(hide,) if hide else ())
     bench = replace(bench, count=count)
     session = runs.SimulatedSession(bench=bench, repeats=2, n_dwells=dwells)
@@ -50,7 +50,7 @@ def move_class(
         rng = np.random.default_rng(seed)
         controller = _controller(claims.believed_chain(bench.chain, rng), bench)
         own = [
-            *runs.plan_decays(session, rng),  # no two hands let go in the same way
+            *runs.plan_decays(session, rng),  # since no two hands release a cart in the same way
             runs.plan_closed_loop(session, cart=min(2, bench.chain.n), controller=controller),
         ]
         moved = [(run, bench.move(run)) for run in own]
@@ -61,7 +61,7 @@ def move_class(
 def read_class(
     moved: Moved, *, seed: int, count: float | None = None, noise: float = USUAL_NOISE
 ) -> list[tuple[Record, ...]]:
-    """Return the readings of each team's encoders, with noise in counts, as in its files."""
+    """Return the readings of each team's encoders as in its files, with noise in counts."""
     count = moved.bench.count if count is None else count
     bench = replace(moved.bench, count=count, noise_counts=noise)
     decimals = max(0, math.ceil(-math.log10(count)) + 1)

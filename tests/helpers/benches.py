@@ -22,9 +22,9 @@ class Emulator:
     Attributes
     ----------
     address : what pyserial's `serial_for_url` opens.
-    said : the lines on stderr so far, but for the events.
-    pid : its process.
-    runs : how many have ended so far.
+    said : the lines on stderr so far, without the events.
+    pid : the process id.
+    runs : number of runs that have ended so far.
     """
 
     address: str
@@ -34,11 +34,11 @@ class Emulator:
     _events: "queue.Queue[dict[str, Any]]" = field(default_factory=queue.Queue)
 
     def event(self, name: str, *, timeout: float = PATIENCE) -> dict[str, Any]:
-        """Wait for the next event of that name; others before it are passed over.
+        """Wait for the next event of that name, and drop events of other names before it.
 
         Raises
         ------
-        queue.Empty : none came in `timeout` s.
+        queue.Empty : no such event came within `timeout` s.
         """
         while True:
             event = self._events.get(timeout=timeout)
@@ -50,9 +50,9 @@ class Emulator:
 def emulator(
     *options: str, preset: str = "throne-2dof", watchdog: float = PATIENCE
 ) -> Iterator[Emulator]:
-    """Run `cartlab emulate` with these options for as long as the block lasts.
+    """Run `cartlab emulate` with these options while the block runs.
 
-    Its watchdog waits longer (s) than a bench's, for a host on a machine that may be busy.
+    Its watchdog waits longer (s) than that of a real bench, since the machine may be busy.
     """
     words = ["cartlab", "emulate", *options]
     if "--model" not in options:

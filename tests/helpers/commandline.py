@@ -1,4 +1,4 @@
-"""The command line in a process of its own, or faster in this one."""
+"""Run the command line in a process of its own or, faster, in this process."""
 
 import subprocess
 import sys
@@ -29,7 +29,7 @@ def cartlab(*arguments: object, cwd: Path | None = None) -> Done:
 
 
 def cartlab_here(*arguments: object, cwd: Path | None = None) -> Done:
-    """Run a command in this process, which saves the start of another; errors come through."""
+    """Run a command in this process, which saves the start of another; exceptions are raised."""
     words = ["cartlab", *map(str, arguments)]
     out, err = StringIO(), StringIO()
     with (

@@ -1,4 +1,4 @@
-"""Compile the tests' simulators once, before they begin, instead of in each process."""
+"""Compile the tests' simulators once before the tests begin, instead of in each process."""
 
 import os
 import subprocess
@@ -9,11 +9,11 @@ import psutil
 from tests.helpers.places import ROOT
 from tests.helpers.waiting import until
 
-_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for processes that wait for it
+_COMPILER = "CARTLAB_TESTS_COMPILER"  # its process, for other processes that wait until it ends
 
 
 def start_compiler() -> "subprocess.Popen[bytes]":
-    """Start to compile in another process; later child processes wait for it."""
+    """Start to compile in another process, for which later child processes wait."""
     script = "from tests.helpers.compiled import compile_all; compile_all()"
     compiler = subprocess.Popen([sys.executable, "-c", script], stdin=subprocess.DEVNULL, cwd=ROOT)
     os.environ[_COMPILER] = str(compiler.pid)

@@ -1,4 +1,4 @@
-"""A desk, and a visitor who uses it as a browser without scripts does."""
+"""A desk, and a visitor who uses it like a browser without scripts."""
 
 import http.client
 import json
@@ -114,9 +114,9 @@ class Visitor:
 
 
 class WorkerHere:
-    """A desk's worker in this process, as another takes a second to start.
+    """A desk's worker in this process, since another process takes a second to start.
 
-    One task at a time; it is waited for, not killed.
+    It does one task at a time, which cannot be killed.
     """
 
     runs = True
@@ -139,7 +139,7 @@ class WorkerHere:
 
 
 def through_proxy(port: int, name: str, **given: str) -> Visitor:
-    """Return a visitor behind the proxy of a lab server, which names them; "" for no name."""
+    """Return a visitor named by a lab server's proxy; "" stands for no name."""
     headers = {"X-Proxy-Secret": "the-proxy-and-the-desk-know-it"}
     if name:
         headers["X-Remote-User"] = name
@@ -152,7 +152,7 @@ def wrongs(page: str) -> list[str]:
 
 
 def write_users(folder: Path, text: str) -> Path:
-    """Write the file of users of a lab server, readable by the desk only."""
+    """Write the file of users of a lab server so that only the desk can read it."""
     path = folder / "users.toml"
     path.write_text(PROXY + text, encoding="utf-8")
     path.chmod(0o600)

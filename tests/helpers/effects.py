@@ -1,4 +1,4 @@
-"""A size for every effect on `throne-2dof`: clearly visible and safe to simulate."""
+"""A size for every effect on `throne-2dof` that is clearly visible and safe to simulate."""
 
 from collections.abc import Mapping
 
@@ -32,7 +32,7 @@ SIZES = {
 def make_term(
     effect: Effect, *, place: int, values: Mapping[str, float], chain: Chain
 ) -> EffectTerm:
-    """Return an effect with named values; contact details that are not given are usual ones."""
+    """Return an effect with named values; details of its contacts have usual values by default."""
     scales = chain_scales(chain, place=effect.place, at=place)
     light = {"motor_mass": 0.1}
     details = [p for p in effect.parameters if not p.reported]

@@ -1,4 +1,4 @@
-"""The shipped examples, analysed once in each process, for tests that only read results."""
+"""The shipped examples, analysed once per process for tests that only read results."""
 
 from functools import cache
 

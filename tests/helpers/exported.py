@@ -1,4 +1,4 @@
-"""Exported models at work: the C compiled here, the MATLAB function in Octave."""
+"""Run exported models: the C code compiled here, the MATLAB function in Octave."""
 
 import ctypes
 import shutil
@@ -21,7 +21,7 @@ _RUN = Path(__file__).with_name("run_model.c")
 
 
 class CompiledModel:
-    """`model.c`, compiled as strictly as the compiler can, in a folder of its own."""
+    """`model.c` in a folder of its own, compiled with all of the compiler's warnings."""
 
     def __init__(self, description: Description, folder: Path) -> None:
         assert COMPILER is not None
@@ -36,7 +36,7 @@ class CompiledModel:
         self._run.restype = ctypes.c_int
 
     def simulate(self, t: Array, u: Array, *, x0: Array | None = None, step: float = 0.0) -> Array:
-        """Return the readings (carts, samples), from rest at `x0` or where the carts rest."""
+        """Return the readings (carts, samples), starting at rest at `x0` or at equilibrium."""
         y = np.zeros((self._n, t.size))
         given = [np.ascontiguousarray(a, dtype=np.float64) for a in (t, u)]
         start = None if x0 is None else np.asarray(x0, dtype=np.float64)

@@ -62,19 +62,19 @@ class FirmwareCore:
 
     def __init__(self, library: ctypes.CDLL, description: Description) -> None:
         self._library, self._encoders = library, description.encoders
-        self._settings = _Settings(  # which the bench points into
+        self._settings = _Settings(  # this memory is used by the bench
             description.encoders, description.period, format_description(description)
         )
         self._bench = ctypes.create_string_buffer(library.bench_size())
         library.bench_init(self._bench, ctypes.byref(self._settings))
 
     def receive(self, data: bytes) -> None:
-        """Take bytes from the line; they act at the next tick."""
+        """Take bytes from the line; they take effect at the next tick."""
         for byte in data:
             self._library.bench_receive(self._bench, byte)
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
-        """Return the duty that acts from now on."""
+        """Return the duty that is applied from now on."""
         array = (ctypes.c_int32 * self._encoders)(*counts)
         return self._library.bench_tick(self._bench, array, stamp, now & 0xFFFFFFFF)
 
@@ -85,7 +85,7 @@ class FirmwareCore:
 
 @contextmanager
 def kept_going(serve: Callable[[Callable[[], bool]], None]) -> Iterator[None]:
-    """Run `serve` beside the block, until the block ends and its event says so."""
+    """Run `serve` beside the block until the block ends and its event is set."""
     done = threading.Event()
     beside = threading.Thread(target=serve, args=(done.is_set,))
     beside.start()
@@ -104,7 +104,7 @@ _PATIENT = (
 
 
 def acquire(folder: Path, *, port: str, only: Sequence[str]) -> None:
-    """Run `cartlab acquire` in a process of its own; hands are assumed to do as asked."""
+    """Run `cartlab acquire` in its own process; it assumes that people do what it asks."""
     chosen = [word for name in only for word in ("--only", name)]
     command = [
         sys.executable,

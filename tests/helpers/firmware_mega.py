@@ -1,4 +1,4 @@
-"""The firmware's sketch, built for an Arduino Mega and run on a simulated one."""
+"""Build the firmware's sketch for an Arduino Mega and run it on a simulated one."""
 
 import ctypes
 import re
@@ -8,9 +8,9 @@ from pathlib import Path
 
 from tests.helpers.firmware_host import COMPILER, FIRMWARE, SOURCES, STRICT
 
-_ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")  # as Debian's arduino-core-avr has it
+_ARDUINO = Path("/usr/share/arduino/hardware/arduino/avr")  # of Debian's arduino-core-avr
 _SIMAVR = Path("/usr/include/simavr/sim_avr.h")  # libsimavr-dev
-_LEFT_OUT = ("WString",)  # strings of the Arduino core: avr-gcc 5 lacks a constant they need
+_LEFT_OUT = ("WString",)  # strings of the Arduino core: avr-gcc 5 lacks a constant that they need
 _COMMON = (
     "-Os", "-mmcu=atmega2560", "-ffunction-sections", "-fdata-sections",
     "-DF_CPU=16000000L", "-DARDUINO=10819", "-DARDUINO_ARCH_AVR", "-DARDUINO_AVR_MEGA2560",
@@ -19,7 +19,7 @@ _CPP = ("-std=gnu++11", "-fno-exceptions", "-fno-threadsafe-statics")
 
 
 def missing() -> str:
-    """Return what a simulated Mega lacks here; "": nothing."""
+    """Return what a simulated Mega lacks here, or "" if nothing is missing."""
     if COMPILER is None:
         return "a C compiler"
     if not shutil.which("avr-g++"):
@@ -36,7 +36,7 @@ def _run(*command: str | Path) -> str:
 
 
 def build_sketch(folder: Path, *, encoders: int = 2) -> Path:
-    """Build the sketch as arduino-cli does; warnings in our own files are errors."""
+    """Build the sketch as arduino-cli does; a warning in our own files is an error."""
     sketch = Path(shutil.copytree(FIRMWARE / "cartlab_bench", folder / "cartlab_bench"))
     board = (sketch / "board.h").read_text(encoding="utf-8")
     board = board.replace("#define ENCODERS 2 ", f"#define ENCODERS {encoders} ")
@@ -64,16 +64,16 @@ def build_sketch(folder: Path, *, encoders: int = 2) -> Path:
 
 
 def memory(program: Path) -> tuple[int, int]:
-    """Return the bytes of flash and RAM that a program takes, without the stack."""
+    """Return the bytes of flash and RAM that a program needs, without the stack."""
     report = _run("avr-size", "-C", "--mcu=atmega2560", program)
     flash, ram = (int(size) for size in re.findall(r"(\d+) bytes", report))
     return flash, ram
 
 
 class Mega:
-    """A board with power, whose time passes only in the calls that say so.
+    """A simulated board with power; time passes only in the methods that say so.
 
-    Its pins are those of firmware/cartlab_bench/board.h.
+    The pins are those of firmware/cartlab_bench/board.h.
     """
 
     def __init__(self, program: Path, folder: Path) -> None:
@@ -91,11 +91,11 @@ class Mega:
         assert self._board.mega_run(round(1e6 * seconds)) == 0
 
     def turn(self, encoder: int, counts: int) -> None:
-        """Turn an encoder, 20 µs an edge."""
+        """Turn an encoder at 20 µs per edge."""
         assert self._board.mega_turn(encoder, counts) == 0
 
     def flicker(self, encoder: int, seconds: float, *, every: float) -> None:
-        """Toggle a channel of an encoder this often, as a broken wire does."""
+        """Toggle an encoder's channel at intervals of `every` s, as a broken wire does."""
         assert self._board.mega_flicker(encoder, round(1e6 * seconds), round(1e6 * every)) == 0
 
     @property
@@ -109,7 +109,7 @@ class Mega:
         return self._board.mega_duty()
 
     def send(self, data: bytes) -> None:
-        """Put bytes on the line, which takes 87 µs for each."""
+        """Put bytes on the line, which takes 87 µs per byte."""
         for byte in data:
             self._board.mega_send(byte)
 

@@ -2,10 +2,11 @@
 
 python -m tests.helpers.gradebook_kills PLACE KILLS [answers]
 
-A child stores outcomes and confirms each through a pipe once `put` has returned. Confirmed outcomes
-must be there afterwards, whole, and beside them at most one that it could not confirm any more.
+A child process stores outcomes and confirms each through a pipe once `put` has returned. Afterwards
+all confirmed outcomes must be there, whole, and at most one more, which it could not confirm in
+time.
 
-With `answers` it answers requests instead, each with other points: answer and points must both be
+With `answers` it answers requests instead, each with new points. Answer and points must both be
 there, or neither.
 """
 
@@ -21,8 +22,8 @@ from pipeline.grading.gradebook.request_book import RequestBook
 from pipeline.grading.gradings import Batch
 from tests.helpers.grades import hertz_flag, make_grade, make_outcome, two_cart_rubric
 
-_MOST_PUTS = 4  # that are waited for
-_LONGEST = 0.03  # s after that: a put takes some milliseconds
+_MOST_PUTS = 4  # number of outcomes that are waited for
+_LONGEST = 0.03  # s after that, since a put takes some milliseconds
 _FIGURE = ("step.svg", "<svg>" + "0.123 " * 4000 + "</svg>")
 
 
@@ -75,7 +76,7 @@ def kill_once(child_does: Callable[[int], None], rng: random.Random) -> list[byt
 
 
 def kill_answers(place: str, kills: int) -> None:
-    """Kill a process that answers requests; every answer must be there with its points."""
+    """Kill a process that answers requests; each stored answer must have its points."""
     outcome = make_outcome(make_grade("team", share=0.5))
     with RequestBook(place, assignment="lab", create=True) as book:
         book.put(outcome)

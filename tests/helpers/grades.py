@@ -35,7 +35,7 @@ def two_cart_rubric() -> Rubric:
 
 
 def in_this_process(tasks: Sequence[Task], setup: Setup) -> Iterator[Grading]:
-    """Run tasks without a worker, which takes longer to start than a small class to grade."""
+    """Run tasks without a worker process, whose start takes longer than grading a small class."""
     how = {"rubric": setup.rubric, "scratch": setup.scratch, "figures": setup.figures}
     for task in tasks:
         yield grade_task(task, **how)
@@ -86,7 +86,7 @@ def hertz_flag() -> Flag:
 
 
 def shared_flag(other: str) -> Flag:
-    """Return the flag of a recording that is in another submission too."""
+    """Return the flag of a recording that is also in another submission."""
     return Flag(
         code="shared_data",
         parameters=("step-1",),
@@ -129,9 +129,9 @@ def write_class(folder: Path, *, anonymous: bool = False) -> Path:
 
 
 def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
-    """Grade a class called `lab`: a perfect team, and one that is late with a wrong gain.
+    """Grade a class called `lab` of two teams: a perfect one, and a late one with a wrong gain.
 
-    As after a real grading, the gradebook has the findings of the checks.
+    The gradebook has the findings of the checks, as after a real grading.
     """
     from pipeline.grading.judge.reweigh import findings_text
     from tests.helpers.grading_students import student  # simulates a bench and analyses it
@@ -151,7 +151,7 @@ def write_class_of_two(folder: Path, *, anonymous: bool = False) -> None:
 
 @cache
 def _class_files(*, anonymous: bool) -> dict[str, bytes]:
-    """Return the files of such a folder by name, made once in each process."""
+    """Return the files of such a folder by name; they are made once per process."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         fill_book(folder, anonymous=anonymous)
@@ -204,7 +204,7 @@ def _figure(name: str) -> tuple[tuple[str, str], ...]:
 
 
 def n_graded(out: Path) -> int:
-    """Return the number of gradings in a class's gradebook, which may be in use or missing."""
+    """Return the number of gradings in a gradebook, which may be in use or missing."""
     try:
         with closing(sqlite3.connect(f"file:{out / FILE}?mode=ro", uri=True)) as book:
             return book.execute("SELECT count(*) FROM gradings").fetchone()[0]

@@ -1,7 +1,7 @@
-"""A class of honest teams: benches of every kind, numbers as a textbook teaches them.
+"""A class of honest teams on benches of every kind, with numbers found by textbook methods.
 
-A number is the textbook student's own reading if that is near the truth. If the method cannot reach
-that on this bench, it is the number of a more careful student.
+Each number is what a student reads by the textbook, if that is near the truth. If the method cannot
+get near the truth on this bench, a more careful student's number is used.
 """
 
 import tempfile
@@ -41,10 +41,10 @@ from tests.helpers.textbook_student import by_eye, final_table, initial_table
 
 ZETAS = (0.003, 0.15)
 DWELLS = (6, 22)
-COUNTS = (5.0, 500.0)  # encoder counts a centimetre
+COUNTS = (5.0, 500.0)  # encoder counts per centimetre
 DIGITS = (2, 4)
-FRICTION = 0.02  # at most, of the force of the small step
-LEAST_COUNTS = 25.0  # that carts are made to move, by who can choose how far
+FRICTION = 0.02  # largest share of the force of the small step
+LEAST_COUNTS = 25.0  # counts that the carts move, if the team can choose
 
 # The largest relative error of an honest number: gains and frequencies, dampings.
 HONEST_FIRST, HONEST_FIRST_DAMPING = 0.06, 0.4
@@ -54,13 +54,13 @@ HONEST_FINAL, HONEST_FINAL_DAMPING = 0.03, 0.3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Bench:
-    """What a team measures on, and how.
+    """The bench of a team and its settings.
 
     Attributes
     ----------
-    count : cm; travel : cm that the carts are meant to move.
-    friction : dry, on every cart, as share of the force of the small step.
-    digits : that the team types.
+    count : encoder step in cm; travel : cm that the carts should move.
+    friction : dry friction of each cart, as a share of the force of the small step.
+    digits : number of digits that the team types.
     """
 
     chain: Chain
@@ -72,11 +72,11 @@ class Bench:
 
     @property
     def springs(self) -> tuple[bool, ...]:
-        """Which springs there are."""
+        """Return which springs the bench has."""
         return tuple(bool(k > 0) for k in self.chain.k)
 
     def effects(self) -> list[EffectTerm]:
-        """Return the dry friction."""
+        """Return the dry friction as effects."""
         if not self.friction:
             return []
         effect = find_effect("coulomb_friction")
@@ -88,7 +88,7 @@ class Bench:
 
 
 def make_bench(rng: np.random.Generator, *, carts: int) -> Bench:
-    """Draw a bench from the whole range; every second one has dry friction."""
+    """Draw a bench from the whole range; half of the benches have dry friction."""
     preset = preset_bench(f"throne-{carts}dof").chain
     m = preset.m * rng.uniform(0.7, 1.4, carts)
     k = preset.k * rng.uniform(0.7, 1.4, carts + 1)
@@ -126,7 +126,7 @@ def rubric_of(bench: Bench) -> Rubric:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Team(Student):
-    """An honest team; `bench` is known to the test only."""
+    """An honest team; only the test knows `bench`."""
 
     bench: Bench
     rng: np.random.Generator
@@ -137,8 +137,8 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
 
     Parameters
     ----------
-    folder : where its files stay; default: nowhere.
-    bench : fields of `Bench` that are not drawn.
+    folder : where its files stay; by default they are removed.
+    bench : fields of `Bench` that are given instead of drawn.
     """
     rng = np.random.default_rng([2005, seed])
     drawn = replace(make_bench(rng, carts=1 + seed % 3), **bench)
@@ -149,7 +149,7 @@ def make_team(seed: int, *, folder: Path | None = None, **bench: Any) -> Team:
 
 
 def with_spoilt_data(seed: int) -> Team:
-    """Return the team of a seed with one file spoilt before anything is read."""
+    """Return the team of a seed, one of whose files was spoilt before anything was read."""
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     with tempfile.TemporaryDirectory() as folder:
@@ -157,7 +157,10 @@ def with_spoilt_data(seed: int) -> Team:
 
 
 def with_wrong_rubric(seed: int) -> Team | None:
-    """Return the team of a seed whose rubric lacks its near spring; None if there is no spring."""
+    """Return the team of a seed with a rubric that lacks its near spring.
+
+    If the team has no near spring, return None.
+    """
     rng = np.random.default_rng([2005, seed])
     bench = make_bench(rng, carts=1 + seed % 3)
     if bench.chain.n == 1 or not bench.springs[0]:
@@ -205,13 +208,13 @@ def _team(
 
 
 def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
-    """Spoil one file: an encoder that sticks, a copy in its place, the end cut off."""
+    """Spoil one file: its encoder sticks, it becomes a copy of another, or its end is cut off."""
     runs = [e for e in submission.experiments if e.kind in ("decay", "step", "sine")]
     run = runs[int(rng.integers(len(runs)))]
     path = submission.folder / run.file
     lines = path.read_text(encoding="utf-8").splitlines()
     kind = int(rng.integers(3))
-    if kind == 0:  # it sticks while it moves
+    if kind == 0:  # while the cart moves
         column = lines[0].split(",").index(f"x{run.carts[0] if run.carts else 1}")
         rows = [line.split(",") for line in lines[1:]]
         x = np.array([float(row[column]) for row in rows])
@@ -230,7 +233,7 @@ def spoil_data(submission: Submission, rng: np.random.Generator) -> None:
 
 
 def _fewer_dwells(submission: Submission, count: int) -> Submission:
-    """Return the submission with that many of its dwells, evenly chosen."""
+    """Return the submission with this number of its dwells, evenly chosen."""
     sines = [e.id for e in submission.experiments if e.kind == "sine"]
     chosen = {sines[i] for i in np.linspace(0, len(sines) - 1, count).round().astype(int)}
     kept = tuple(e for e in submission.experiments if e.kind != "sine" or e.id in chosen)
@@ -241,13 +244,13 @@ def _fewer_dwells(submission: Submission, count: int) -> Submission:
 
 
 def report(team: Team) -> Team:
-    """Return the team with the results of its own recordings."""
+    """Return the team with its report, computed from its own recordings."""
     n, records, rng = team.bench.chain.n, team.analysis.records, team.rng
     truth, digits = team.bench.chain.parameters(), team.bench.digits
     read = initial_table(records, n)
     try:
         read |= by_eye(records, n) if n > 1 else {}
-    except ValueError:  # no dwell moves every cart by enough
+    except ValueError:  # no dwell moves every cart far enough
         pass
     first = {x: _first(team, x, read.get(x, np.nan), right) for x, right in truth.items()}
     believed = {x: float(v) for x, v in team.reported.final.items()}
@@ -257,7 +260,7 @@ def report(team: Team) -> Team:
     table = {x: written(v, digits) for x, v in final.items()}
     space, feedback = team.reported.state_space, team.reported.feedback
     if final is not believed:
-        # From the results, or from the typed numbers, in one way or the other.
+        # Compute it from the results or from the typed numbers.
         values = final if rng.random() < 0.5 else {x: float(v) for x, v in table.items()}
         own = own_chain(values, n=n)
         if own is not None and is_real(own):
@@ -282,7 +285,7 @@ def _error(rng: np.random.Generator) -> float:
 
 
 def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
-    """Return A and B with couplings from the rest positions, not from the polynomials alone."""
+    """Return A and B with couplings from rest positions instead of only from the polynomials."""
     if n == 1:
         return np.array([[0, 1], [-(p["omega_n"] ** 2), -2 * p["zeta"] * p["omega_n"]]]), np.array(
             [[0], [p["K"] * p["omega_n"] ** 2]]
@@ -310,12 +313,12 @@ def from_statics(p: Mapping[str, float], n: int) -> tuple[Array, Array]:
 
 
 def is_real(chain: Chain) -> bool:
-    """Return whether real carts could form the chain."""
+    """Return whether a chain of real carts could have these values."""
     return bool(np.all(chain.c > 0) and np.all(np.linalg.eigvalsh(chain.stiffness) > 0))
 
 
 def _first(team: Team, name: str, read: float, right: float) -> float:
-    """Return an initial estimate: as read if that is honest, else as a careful student reads."""
+    """Return an initial estimate: as read if it is honest, else a careful student's."""
     guessed = team.bench.chain.n > 1 and read_name(name).is_damping and not name[-1].isdigit()
     if guessed:
         return 0.1
@@ -332,7 +335,7 @@ def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
     n = team.bench.chain.n
     try:
         found = final_table(team.analysis.records, n, dict(first))
-    except (ValueError, FloatingPointError):  # too few points to fit to
+    except (ValueError, FloatingPointError):  # too few points for a fit
         return None
     truth = team.bench.chain.parameters()
     near = all(
@@ -345,7 +348,7 @@ def _fitted(team: Team, first: Mapping[str, float]) -> dict[str, float] | None:
 
 
 def written(value: float, digits: int) -> Decimal:
-    """Return a number as typed to that many digits."""
+    """Return a number typed with this many digits."""
     return Decimal(f"{value:#.{digits}g}".removesuffix("."))
 
 

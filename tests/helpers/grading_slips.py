@@ -1,6 +1,6 @@
-"""Planted mistakes: the slip of each code, made by an honest team with its own data.
+"""Mistakes for tests: each code's mistake, made by an honest team with its own data.
 
-They use the recordings and the true bench, never the grader's own catalogue.
+They use the recordings and the true bench, but never the grader's own catalogue.
 """
 
 from collections.abc import Callable, Mapping
@@ -18,11 +18,11 @@ from tests.helpers.grading_class import Team, written
 
 TURN = 2 * np.pi
 OFF = (1.2, 1.6)  # factor of an error that no known mistake explains
-SEEN_SWAPPED = 0.15  # of ln ω: a swap of more similar carts cannot be seen
+SEEN_SWAPPED = 0.15  # difference in ln ω below which a swap of two carts cannot be seen
 
 
 def change(team: Team, **tables: Mapping[str, float]) -> Team:
-    """Return the team with other numbers in its tables, typed with its digits."""
+    """Return the team with other numbers in its tables, typed with the team's digits."""
     update = {
         label: {
             **getattr(team.reported, label),
@@ -60,19 +60,19 @@ def some_tables(team: Team) -> list[str]:
 
 
 def hz(team: Team) -> Team:
-    """All frequencies divided by 2π."""
+    """Divide all frequencies by 2π."""
     names = [n for n in team.reported.final if n.startswith("omega")]
     return scaled(team, names, 1 / TURN, some_tables(team))
 
 
 def hz_of_one(team: Team) -> Team:
-    """One frequency, which was not converted, divided by 2π."""
+    """Divide one frequency by 2π, as if it alone was not converted."""
     names = [n for n in team.reported.final if n.startswith("omega")]
     return scaled(team, [str(team.rng.choice(names))], 1 / TURN, some_tables(team))
 
 
 def peak_count(team: Team) -> Team:
-    """One period too many or too few in every decay."""
+    """Count one period too many or too few in every decay."""
     k = int(team.rng.integers(1, 7))
     ratio = (k + 1) / k if team.rng.random() < 0.7 else k / (k + 1)
     numbers = {name: team.value("initial", name) * ratio for name in own(team, "omega")}
@@ -81,7 +81,7 @@ def peak_count(team: Team) -> Team:
 
 
 def peak_for_steady_state(team: Team) -> Team:
-    """Every gain from the largest excursion after the first edge of the first step."""
+    """Read every gain at the largest excursion after the first edge of the first step."""
     step = next(r for r in team.analysis.records if r.kind == "step" and len(r.carts) > 0)
     assert step.u is not None
     on = np.flatnonzero(step.u)
@@ -91,22 +91,22 @@ def peak_for_steady_state(team: Team) -> Team:
 
 
 def peak_to_peak(team: Team) -> Team:
-    """Every gain doubled."""
+    """Double every gain."""
     return scaled(team, own(team, "K"), 2.0, some_tables(team))
 
 
 def counts_for_length(team: Team) -> Team:
-    """Every gain in encoder counts."""
+    """Give every gain in encoder counts."""
     return scaled(team, own(team, "K"), 1 / team.bench.count, some_tables(team))
 
 
 def log10_for_ln(team: Team) -> Team:
-    """Every decrement with the wrong logarithm."""
+    """Compute every decrement with the wrong logarithm."""
     return scaled(team, own(team, "zeta"), np.log10(np.e), ["initial"])
 
 
 def carts_swapped(team: Team) -> Team:
-    """The gains, the frequencies with their dampings, or all, of two carts swapped."""
+    """Swap the gains, the frequencies with their dampings, or all numbers of two carts."""
     i, j = team.rng.choice(np.arange(1, team.bench.chain.n + 1), 2, replace=False)
     groups = [["K"], ["omega", "zeta"], ["K", "omega", "zeta"]][int(team.rng.integers(3))]
     truth = team.bench.chain.parameters()
@@ -116,7 +116,7 @@ def carts_swapped(team: Team) -> Team:
 
     groups = [g for g in groups if g == "zeta" or not alike(g)]
     groups = [g for g in groups if g != "zeta" or "omega" in groups]
-    if not groups:  # nobody could see it
+    if not groups:  # since nobody could see it
         return team
     exchanged = {
         t: {f"{g}_{a}": team.value(t, f"{g}_{b}") for g in groups for a, b in ((i, j), (j, i))}
@@ -126,7 +126,7 @@ def carts_swapped(team: Team) -> Team:
 
 
 def no_fit_done(team: Team) -> Team:
-    """The initial table copied as the final one."""
+    """Copy the initial table as the final one."""
     return reporting(team, team.reported.model_copy(update={"final": team.reported.initial}))
 
 
@@ -139,22 +139,22 @@ def _one_off(team: Team, table: str) -> Team:
         factor = team.rng.uniform(*OFF) ** float(team.rng.choice([-1, 1]))
         moved = scaled(team, [name], factor, [table])
         gains = [moved.value(table, other) for other in own(team, "K")]
-        if gains == sorted(gains, reverse=True):  # else it is an impossible one
+        if gains == sorted(gains, reverse=True):  # otherwise the number is impossible
             return moved
 
 
 def final_off(team: Team) -> Team:
-    """One gain or frequency of the final table off, without an explanation."""
+    """Change one gain or frequency of the final table by a factor without an explanation."""
     return _one_off(team, "final")
 
 
 def initial_off(team: Team) -> Team:
-    """One gain or frequency of a cart in the initial table off, without an explanation."""
+    """Change one gain or frequency of a cart in the initial table without an explanation."""
     return _one_off(team, "initial")
 
 
 def initial_final_disagree(team: Team) -> Team:
-    """Without recordings only the team's own tables show that one of them is wrong."""
+    """Make the team's own tables disagree where no recording shows which one is wrong."""
     runs = tuple(e for e in team.submission.experiments if e.kind == "closed_loop")
     moved = scaled(team, own(team, "K")[:1], 1.6, ["initial"])
     analysis = replace(
@@ -173,7 +173,7 @@ def initial_final_disagree(team: Team) -> Team:
 
 
 def physically_impossible(team: Team) -> Team:
-    """A negative number, or a far cart that moves more than the near one."""
+    """Report a negative number, or a far cart that moves more than a near one."""
     if team.bench.chain.n == 1 or team.rng.random() < 0.5:
         names = [n for n in team.reported.final if not n.startswith("omega")]
         return scaled(team, [str(team.rng.choice(names))], -1.0, ["final"])
@@ -181,9 +181,9 @@ def physically_impossible(team: Team) -> Team:
 
 
 def transient_used(team: Team) -> Team:
-    """Amplitudes of the first cycles of every dwell, and a fit to them if there is one."""
+    """Read amplitudes from the first cycles of every dwell, and fit them if possible."""
     if any(e.note for e in team.submission.experiments if e.kind == "sine"):
-        return team  # recorded after the transient, so nobody can use it
+        return team  # the dwell was recorded after the transient, so nobody can use it
     truth = team.bench.chain.parameters()
     for cycles in team.rng.permutation([2.0, 3.0]):
         try:
@@ -192,7 +192,7 @@ def transient_used(team: Team) -> Team:
                 bench=Bench(springs=team.bench.springs),
                 initial=truth,
             )
-        except DataError:  # nothing fits such amplitudes; the student would try others
+        except DataError:  # no fit succeeds with such amplitudes; a student would try others
             continue
         if min(e.value for e in fit.parameters.values()) > 0:
             return change(team, final={name: e.value for name, e in fit.parameters.items()})
@@ -226,7 +226,7 @@ def _early(team: Team, cycles: float) -> list[FrequencyResponse]:
 
 
 def wrong_state_space(team: Team) -> Team:
-    """A sign, swapped or missing couplings, another order of the states, ω for ω²."""
+    """Report a wrong sign, wrong couplings, another order of the states, or ω for ω²."""
     space, n = team.reported.state_space, team.bench.chain.n
     assert space is not None
     A = [list(row) for row in space.A]
@@ -260,7 +260,7 @@ def _controlling(team: Team, **update: object) -> Team:
 
 
 def wrong_gains(team: Team) -> Team:
-    """Reversed signs, another order, or gains that were never tried."""
+    """Reverse the gains' signs, change their order, or report gains that were never tried."""
     gains = [float(g) for g in _feedback(team).gains]
     kind = int(team.rng.integers(3))
     if kind == 0:
@@ -270,7 +270,7 @@ def wrong_gains(team: Team) -> Team:
     else:
         gains = [2.5 * g for g in gains]
     team = _controlling(team, gains=tuple(written(g, 4) for g in gains))
-    if team.rng.random() < 0.5:  # … and did not say what ran
+    if team.rng.random() < 0.5:  # … without stating the gains that ran
         return _with_runs(team, {"controller": None})
     return team
 
@@ -281,7 +281,7 @@ def _with_runs(team: Team, update: Mapping[str, object]) -> Team:
 
 
 def wrong_prefilter(team: Team) -> Team:
-    """The static gain itself, no prefilter, or another number."""
+    """Report the static gain as prefilter, no prefilter, or another number."""
     right = float(_feedback(team).prefilter or 1)
     wrong = [1 / right, 1.0, right * 1.3, right * 0.7]
     wrong = [w for w in wrong if abs(np.log(w / right)) > np.log(1.25)]
@@ -289,7 +289,7 @@ def wrong_prefilter(team: Team) -> Team:
 
 
 def missing(team: Team) -> Team:
-    """A parameter, the state model or the closed loop is missing."""
+    """Leave out a parameter, the state model or the closed loop."""
     kind = int(team.rng.integers(3))
     if kind == 0:
         final = dict(team.reported.final)
@@ -330,4 +330,4 @@ DOUBLE = (
     ("wrong_state_space", "wrong_prefilter"),
     ("hz_for_rad_s", "peak_to_peak"),
 )
-OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # with one cart nothing shows it
+OF_SEVERAL_CARTS = {"carts_swapped", "no_fit_done"}  # with one cart no number shows it

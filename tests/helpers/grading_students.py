@@ -1,4 +1,4 @@
-"""Simulated students, honest until a test changes their report; analysed once."""
+"""Simulated students, honest until a test changes their report; each is analysed once."""
 
 import tempfile
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ from pipeline.workflow import analyse
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Student:
-    """A submission and the analysis of its recordings, under the rubric of its carts."""
+    """A submission and the analysis of its recordings, under the rubric for its carts."""
 
     submission: Submission
     analysis: Analysis
@@ -72,7 +72,7 @@ class Student:
         return self.graded(days_late=days_late).grade
 
     def graded(self, *, days_late: float = 0.0) -> Graded:
-        """Grade the report, with the findings of the checks."""
+        """Grade the report and return the grade with the findings of the checks."""
         return grade_analysis(
             self.submission, self.analysis, rubric=self.rubric, name="team-07", days_late=days_late
         )
@@ -87,7 +87,7 @@ def typed(value: float | Decimal) -> Decimal:
 
 @cache
 def student(carts: int, *, hide: tuple[str, ...] = ()) -> Student:
-    """Return an honest student of a preset's bench, with effects hidden in it."""
+    """Return an honest student of a preset's bench in which effects are hidden."""
     preset = f"throne-{carts}dof"
     bench = prepare_bench(preset=preset, hide=hide)
     rubric = load_rubric(Path(preset))

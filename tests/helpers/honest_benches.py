@@ -1,7 +1,7 @@
-"""Honest teams on benches with one effect of the catalogue, up to three times its usual size.
+"""Honest teams on benches with one effect each, up to three times its usual size.
 
-They report readings of their own recordings by the textbook. Numbers that cannot be read that way
-are those of a more careful student, here the pipeline.
+They report what they read from their own recordings by textbook methods. Numbers that cannot be
+read that way are those of the pipeline.
 """
 
 from collections.abc import Mapping
@@ -26,10 +26,10 @@ from pipeline.workflow import analyse
 from tests.helpers.grading_class import designed, is_real, state_space, written
 from tests.helpers.textbook_student import by_eye, final_table, initial_table
 
-LEAST, MOST = 0.5, 3.0  # times the usual size
+LEAST, MOST = 0.5, 3.0  # times the usual size, at least and at most
 DIGITS = 3
 
-# The parameter that makes an effect larger; by default the first one.
+# The parameter that makes an effect larger, if it is not the first one.
 _GROWS = {
     "stiction": ("force", "static_force"),
     "backlash": ("gap",),
@@ -39,7 +39,7 @@ _SHRINKS = {"saturation": "limit", "end_stop": "position"}
 
 
 def draw_effect(chain: Chain, seed: int) -> EffectTerm:
-    """Return the effect of a seed: nineteen seeds in a row cover the catalogue."""
+    """Return the effect of a seed; nineteen seeds in a row use the whole catalogue."""
     rng = np.random.default_rng([16, seed, chain.n])
     turn, place = divmod(seed, len(CATALOGUE))
     effect = CATALOGUE[int(np.random.default_rng([16, turn]).permutation(len(CATALOGUE))[place])]
@@ -56,7 +56,7 @@ def draw_effect(chain: Chain, seed: int) -> EffectTerm:
 
 def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str, float]:
     values = dict(usual)
-    if effect.key == "sensor_gain":  # one of which is not an effect
+    if effect.key == "sensor_gain":  # one kind is not an effect
         values["gain"] = 1 + (values["gain"] - 1) * size
     elif effect.key in _SHRINKS:
         values[_SHRINKS[effect.key]] /= size
@@ -69,7 +69,7 @@ def _sized(effect: Effect, usual: Mapping[str, float], size: float) -> dict[str,
 def grade_honest_team(
     folder: Path, *, preset: str, seed: int
 ) -> tuple[Grade, Analysis, EffectTerm]:
-    """Return the grade of the honest team of a seed, the analysis, and the hidden effect."""
+    """Grade the honest team of a seed; return grade, analysis and hidden effect."""
     chain, rubric = preset_bench(preset).chain, load_rubric(Path(preset))
     term = draw_effect(chain, seed)
     write_submission(
@@ -87,7 +87,7 @@ def grade_honest_team(
 
 
 def textbook_report(submission: Submission, analysis: Analysis) -> Reported:
-    """Return a student's readings of these recordings in place of the true numbers."""
+    """Return what a student reads from these recordings, instead of the true numbers."""
     claimed, n = submission.reported, analysis.bench.n
     assert claimed is not None
     rows = {row.name: row for row in analysis.rows}
@@ -127,7 +127,7 @@ def _read(analysis: Analysis, n: int, *, known: Mapping[str, float]) -> dict[str
     read = initial_table(analysis.records, n)
     try:
         read |= by_eye(analysis.records, n) if n > 1 else {}
-    except ValueError:  # no dwell moves every cart by enough
+    except ValueError:  # no dwell moves every cart far enough
         pass
     return _possible(read, known=known)
 

@@ -1,7 +1,7 @@
-"""A class of a hundred submissions that are malicious, or look so: one entry each.
+"""A class of a hundred submissions that are malicious or look so, each as one entry.
 
-Every one is a folder or an archive in the class's folder. Sizes, depths and the spoilt file come
-from the seed.
+Every entry is a folder or an archive in the class's folder. Sizes, depths and the spoilt file
+depend on the seed.
 """
 
 import io
@@ -23,7 +23,7 @@ import scipy.io
 from tests.helpers.poison import poisoned, zipped
 from tests.helpers.recordings import package, sheet_xml, tdms_of
 
-SECRET = "root:x:0:0:the-secret-outside"  # of a file beside the class: must be nowhere
+SECRET = "root:x:0:0:the-secret-outside"  # of a file beside the class; must not appear
 Files = Mapping[str, bytes]
 
 _SCRIPT = "<script>alert(1)</script>"
@@ -40,8 +40,8 @@ def write_hostile(
 ) -> list[str]:
     """Write the hostile submissions beside existing ones; return the names of the entries.
 
-    Of the good submissions with one thing spoilt, which take the longest, one in `every`; beside
-    these as many as `drawn` at random, a third of them archives.
+    Good submissions with one thing spoilt take the longest to grade, so only one in `every` is
+    written. `drawn` more submissions are spoilt at random, a third of them as archives.
     """
     rng = random.Random(seed)
     outside = school.parent / "outside"
@@ -265,7 +265,7 @@ def _spoilt(good: Files, rng: random.Random) -> dict[str, Files]:
 
 
 def _marked(toml: str, text: str) -> str:
-    """Return a submission with this text wherever a student may write."""
+    """Return a submission with this text in every place where a student may write."""
     quoted = '"' + "".join(
         c if c.isprintable() and c not in '"\\' else f"\\u{ord(c):04x}" for c in text
     ) + '"'  # fmt: skip
@@ -290,7 +290,7 @@ _LAUGHS = (
 
 
 class _Evil:
-    """Code that a careless reader would run."""
+    """An object that runs code if a careless reader unpickles it."""
 
     def __reduce__(self) -> tuple[Callable, tuple]:
         return os.system, ("touch /tmp/escaped",)
@@ -317,7 +317,7 @@ def _mat_bomb() -> bytes:
 
 
 def _names(rng: random.Random) -> list[str]:
-    """Return names of folders that are markup, formulas, reserved, similar or very long."""
+    """Return folder names that are markup, formulas, reserved, similar or very long."""
     names = [
         "<b>bold<", '" onload=alert(1) x="', "&lt;script&gt;", _FORMULA.replace("/", ""),
         "@SUM(A1)", "-1+1", "#include $x$ *b*", "CON", "aux.txt", "com1", "...", "a.", "a ", " a",
@@ -333,7 +333,7 @@ def _names(rng: random.Random) -> list[str]:
 
 
 def _places(outside: Path) -> dict[str, Callable[[Path], object]]:
-    """Return changes to a good submission by which a file is not what it seems."""
+    """Return changes to a good submission after which a file is not what it seems."""
 
     def instead(name: str, make: Callable[[Path], object]) -> Callable[[Path], None]:
         def build(folder: Path) -> None:
@@ -370,7 +370,7 @@ def _places(outside: Path) -> dict[str, Callable[[Path], object]]:
 
 def _socket(path: Path) -> None:
     here = Path.cwd()
-    os.chdir(path.parent)  # the address of a socket is short
+    os.chdir(path.parent)  # since the address of a socket must be short
     try:
         with socket.socket(socket.AF_UNIX) as opened:
             opened.bind(path.name)

@@ -1,7 +1,7 @@
-"""Virtual benches are forked from a process that has loaded everything they need.
+"""Virtual benches are forked from a process that has already loaded all they need.
 
-Loading takes two seconds of a processor, once. Where fork is missing, each bench loads everything
-again.
+Loading takes two seconds of processor time and happens only once. On systems without fork each
+bench loads everything itself.
 """
 
 import json
@@ -18,7 +18,7 @@ from tests.helpers.places import ROOT
 
 
 def order(**bench: Any) -> None:
-    """Request a bench; it connects to `port`, as `be` says."""
+    """Request a bench that connects to `port`; the arguments are those of `be`."""
     if sys.platform == "win32":
         script = f"from tests.helpers.nursery import be; be(**{bench!r})"
         subprocess.Popen([sys.executable, "-c", script], cwd=ROOT)
@@ -29,7 +29,7 @@ def order(**bench: Any) -> None:
 
 
 def be(*, words: list[str], watchdog: float, port: int) -> None:
-    """Become the bench of these words, with its stderr sent to that port after its pid."""
+    """Become the bench with these options; send the pid and then stderr to that port."""
     from pipeline.cli import main
     from pipeline.simulated.emulator import core
 
@@ -47,7 +47,7 @@ def be(*, words: list[str], watchdog: float, port: int) -> None:
 
 @cache
 def _nursery() -> "subprocess.Popen[str]":
-    """Start the process, which ends with this one, when its stdin closes."""
+    """Start the process; it ends when this process ends and so closes its stdin."""
     script = "from tests.helpers.nursery import fork_benches; fork_benches()"
     return subprocess.Popen(
         [sys.executable, "-c", script], stdin=subprocess.PIPE, text=True, cwd=ROOT
@@ -57,7 +57,7 @@ def _nursery() -> "subprocess.Popen[str]":
 def fork_benches() -> None:
     """Fork a bench for each line of stdin."""
     load_bench()
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for ended children
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # so that ended children leave no zombies
     for line in sys.stdin:
         if os.fork() == 0:
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -65,7 +65,7 @@ def fork_benches() -> None:
 
 
 def load_bench() -> None:
-    """Import all that a bench needs, and compile its simulator unless that is done."""
+    """Import all that a bench needs, and compile its simulator if that is not done."""
     from pipeline.simulated.emulator.server import EmulatorOptions, Server
     from pipeline.simulated.hidden import prepare_bench
 

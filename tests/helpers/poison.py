@@ -1,6 +1,6 @@
-"""Random damage to sound files, for readers that must trust nothing.
+"""Random damage to good files, for tests of readers that must not trust their input.
 
-All randomness comes from a `random.Random`, so that a seed is a case.
+All randomness comes from a `random.Random`, so a seed always gives the same case.
 """
 
 import io
@@ -26,7 +26,7 @@ _OTHER = ("true", "[]", "{}", "[[]]", "[1, 2, 3]", "2024-01-01", "''", "[" * 500
 
 
 def damaged(raw: bytes, rng: Random, *, hits: int = 3) -> bytes:
-    """Cut, flip, insert, remove or repeat bytes, up to that many times."""
+    """Cut, flip, insert, remove or repeat bytes up to this many times."""
     for _ in range(rng.randint(1, hits)):
         at, n = rng.randrange(len(raw) + 1), rng.randint(1, 60)
         junk = rng.choice([*map(str.encode, (*_MARKS, *_NUMBERS[:20])), rng.randbytes(n)])
@@ -46,7 +46,7 @@ def text(rng: Random) -> str:
 
 
 def toml_value(rng: Random) -> str:
-    """Return a TOML value, mostly one that a parser accepts."""
+    """Return a TOML value that a parser accepts in most cases."""
     kind = rng.randrange(4)
     return (
         json.dumps(text(rng)) if kind == 0
@@ -56,7 +56,7 @@ def toml_value(rng: Random) -> str:
 
 
 def poisoned_toml(toml: str, rng: Random) -> str:
-    """Give a key another value, or drop, double or rename it."""
+    """Give a key another value, or remove, double or rename it."""
     lines = toml.split("\n")
     keys = [i for i, line in enumerate(lines) if re.match(r"\s*\w+ = ", line)]
     for i in rng.sample(keys, k=min(len(keys), rng.choice([1, 1, 2, 4]))):
@@ -72,7 +72,7 @@ def poisoned_toml(toml: str, rng: Random) -> str:
 
 
 def poisoned_table(table: str, rng: Random) -> str:
-    """Change numbers of a column of a CSV, its rows or its headings."""
+    """Change numbers in a column of a CSV file, its rows or its headings."""
     head, *rows = [line.split(",") for line in table.splitlines()]
     column, scale = rng.randrange(len(head)), rng.choice(_SCALES)
     at, what = rng.randrange(1, len(rows)), rng.randrange(8)
@@ -97,7 +97,7 @@ def poisoned_table(table: str, rng: Random) -> str:
 
 
 def poisoned_json(document: Any, rng: Random) -> Any:
-    """Replace a few values at any depth; the document is changed."""
+    """Replace a few values at any depth of the document in place."""
     for _ in range(rng.choice([1, 1, 2, 5])):
         here: Any = document
         while True:
@@ -152,7 +152,7 @@ def _damage(files: dict[str, bytes], name: str, rng: Random) -> None:
 
 
 def zipped(files: Files, rng: Random) -> bytes:
-    """Return the files as an archive, which may itself be damaged."""
+    """Return the files as an archive that may itself be damaged."""
     buffer = io.BytesIO()
     method = rng.choice([zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA])
     with zipfile.ZipFile(buffer, "w", method) as archive:

@@ -1,4 +1,4 @@
-"""A PostgreSQL server for the tests: its own folder and socket, no network."""
+"""A PostgreSQL server for the tests, with its own folder and socket and without a network."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ NEEDED = "CARTLAB_TESTS_NEED_POSTGRESQL"  # set if a missing server is a failure
 
 
 def missing() -> str:
-    """Return why no server can be started here, or ""."""
+    """Return why no server can be started here, or "" if one can."""
     if os.name != "posix":
         return "PostgreSQL is started on POSIX only"
     if _binaries() is None:
@@ -31,10 +31,10 @@ def _binaries() -> Path | None:
 
 @contextmanager
 def running() -> Iterator[str]:
-    """Start a server and yield the URL of its database; it is removed afterwards."""
+    """Start a server, yield the URL of its database, and remove both afterwards."""
     binaries = _binaries()
     assert binaries is not None
-    # Not in pytest's folder: only its owner can enter that, and a server never runs as root.
+    # Pytest's folder does not do: only its owner can enter it, and the server never runs as root.
     folder = Path(tempfile.mkdtemp(prefix="pg-"))
     data = folder / "data"
     user = {}

@@ -1,4 +1,4 @@
-"""One recording as each program would save it: Excel, LabVIEW, National Instruments."""
+"""Write one recording as other programs save it: Excel, LabVIEW, National Instruments."""
 
 import zipfile
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ _TYPES = (
 
 
 def xlsx(columns: Mapping[str, np.ndarray]) -> bytes:
-    """Return a workbook of one sheet: headings, then a row a sample."""
+    """Return a workbook of one sheet with headings and one row per sample."""
     book = openpyxl.Workbook()
     assert book.active is not None
     book.active.append([*columns])
@@ -37,12 +37,12 @@ def saved(book: openpyxl.Workbook) -> bytes:
 def package(
     sheet: str | bytes, *, texts: str | bytes | None = None, more: Mapping[str, bytes] = {}
 ) -> bytes:
-    """Return a workbook with this part as its only sheet, whatever is in it.
+    """Return a workbook with this part as its only sheet, valid or not.
 
     Parameters
     ----------
-    texts : the part of the texts that cells share.
-    more : further parts, or others in place of those made here.
+    texts : the part with the texts that cells share.
+    more : further parts, or replacements for those made here.
     """
     related = f'<Relationships xmlns="{_RELATED}">{{}}</Relationships>'
     to = f'<Relationship Id="{{}}" Type="{_OFFICE}/{{}}" Target="{{}}"/>'
@@ -67,7 +67,7 @@ def package(
 
 
 def sheet_xml(rows: Sequence[Sequence[str | float]]) -> str:
-    """Return the part of a sheet: texts in place, numbers as they are."""
+    """Return the part of a sheet with texts in place and numbers unchanged."""
     cells = [
         "<row>"
         + "".join(
@@ -81,7 +81,7 @@ def sheet_xml(rows: Sequence[Sequence[str | float]]) -> str:
 
 
 def lvm(columns: Mapping[str, np.ndarray], *, separator: str = "\t", decimal: str = ".") -> bytes:
-    """Return LabVIEW's text, version 2: the first column is its X, each segment has a header."""
+    """Return LabVIEW's text format, version 2: the first column is X, each segment has a header."""
     about = {
         "Writer_Version": "2", "Reader_Version": "2",
         "Separator": {"\t": "Tab", ",": "Comma"}[separator], "Decimal_Separator": decimal,
@@ -103,7 +103,7 @@ def lvm_segment(
     decimal: str = ".",
     tags: Mapping[str, Sequence[str]] = {},
 ) -> str:
-    """Return a segment with its header; `tags` are further ones."""
+    """Return a segment with its header; `tags` are additional ones."""
     _, *channels = columns
     n = len(next(iter(columns.values())))
     header: dict[str, Sequence[str]] = {

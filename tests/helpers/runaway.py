@@ -1,8 +1,8 @@
-"""A bench on a pseudo-terminal that does in one state of a session what nothing told it to.
+"""A bench on a pseudo-terminal that misbehaves in one state of a session.
 
-Its clock is its own: it goes on by a millisecond at a time, and waits while the host has a few
-lines still to read, which are counted where the host reads them. So how long the host takes to
-react is measured in ms of the bench, on any machine.
+The bench has its own clock, which advances by one millisecond at a time. It waits while the host
+still has a few lines to read; these are counted where the host reads them. So the host's reaction
+is measured in ms of the bench on any machine.
 """
 
 import os
@@ -39,32 +39,32 @@ BENCH = Description(
     position_unit="cm",
     position_per_count=PER_COUNT,
 )
-_MOST_UNREAD = 64  # bytes: four lines, as many as come between two looks of a host
+_MOST_UNREAD = 64  # bytes of four lines, as many as arrive between two reads of a host
 _PAUSE = 0.001  # s
 
 
 class RunawayBench(threading.Thread):
     """A bench that keeps to the protocol except while `wrong` holds; a context manager.
 
-    Its carts are where the present duty holds them: 5 and 2 duty counts a count.
+    Each cart is where the present duty holds it: 5 and 2 counts per duty count.
 
     Parameters
     ----------
-    wrong : called each ms; whether the bench misbehaves now.
+    wrong : called each ms; returns whether the bench misbehaves now.
     duty : the duty of a misbehaving motor; None: as commanded.
     out : error of cart 1 in counts while the bench misbehaves.
-    mute : called each ms; whether its lines are lost.
+    mute : called each ms; returns whether its lines are lost.
 
     Attributes
     ----------
     run_on : the start of the present run; None: no run.
     starts : all starts, except those that only stop a stock bench.
     resets, lines : numbers of resets received and of lines sent.
-    is_stopped : the last command was a stop.
-    is_pulled : a virtual hand is pulling a cart out.
+    is_stopped : whether the last command was a stop.
+    is_pulled : whether a virtual hand is pulling a cart out.
     offence : time in ms of the first line that shows the fault; None: no such line yet.
-    told : time in ms of the first stop after that.
-    started_after : starts received after that.
+    told : time in ms of the first stop after `offence`.
+    started_after : number of starts received after `offence`.
     """
 
     def __init__(
@@ -82,8 +82,8 @@ class RunawayBench(threading.Thread):
         self._core = ReferenceCore(self._description)
         self._reader = CommandReader(encoders=2, extensions=commands)
         self._over = threading.Event()
-        self._held = 0  # duty that acts
-        self._unread = 0  # bytes that the host has still to read
+        self._held = 0  # the duty that is applied now
+        self._unread = 0  # bytes that the host has not read yet
         self.ms = 0
         self.run_on: Start | None = None
         self.starts: list[Start] = []
@@ -94,7 +94,7 @@ class RunawayBench(threading.Thread):
         self.started_after: list[Start] = []
 
     def __enter__(self) -> "RunawayBench":
-        import tty  # not on Windows
+        import tty  # which does not exist on Windows
 
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -106,7 +106,7 @@ class RunawayBench(threading.Thread):
         return self
 
     def _metered(self, receive: Callable[[SerialLine], bytes]) -> Callable[[SerialLine], bytes]:
-        """Return what reads as the host does, and counts what it has read."""
+        """Return a reader for the host that counts what has been read."""
 
         def metered(line: SerialLine) -> bytes:
             data = receive(line)
@@ -123,7 +123,7 @@ class RunawayBench(threading.Thread):
         os.close(self._slave)
 
     def run(self) -> None:
-        """Go on by one ms after the other until the block is over."""
+        """Advance by one ms at a time until the block ends."""
         while not self._over.wait(_PAUSE):
             self._listen()
             if self._unread < _MOST_UNREAD:
@@ -144,7 +144,7 @@ class RunawayBench(threading.Thread):
         self.is_pulled |= isinstance(command, Hands) and command.released > 0
         if isinstance(command, Start):
             self.run_on = command
-            if command == STOCK_STOP[0]:  # of a line just opened: what was unread is gone
+            if command == STOCK_STOP[0]:  # the line was just opened, so what was unread is gone
                 self._unread = 0
             else:
                 self.starts.append(command)
@@ -172,7 +172,7 @@ class RunawayBench(threading.Thread):
         self.ms += 1
 
     def _spoilt(self, readings: Sequence[Reading]) -> list[Reading]:
-        """Return lines as the bench that misbehaves sends them; without a run it sends some too."""
+        """Return the lines that the misbehaving bench sends; it sends some even without a run."""
         if not readings and (self._duty is not None):
             readings = [Reading(counts=(0, 0), target=0, duty=0, ms=self.ms)]
         if readings and self.offence is None:

@@ -1,6 +1,6 @@
-"""A careful student with a textbook, a ruler and a curve fit, without the pipeline's methods.
+"""A careful student with a textbook, a ruler and a curve fit, but not the pipeline's methods.
 
-Levels are means over the last part of a step; periods and decrements are read off the peaks;
+Levels are means over the last part of a step. Periods and decrements are read off the peaks, and
 amplitudes are half the swing of the last cycles. Bode magnitudes are fitted in dB, last cart first,
 as in Throne (2005); the other numbers follow from the coefficients.
 """
@@ -23,7 +23,7 @@ def settled(y: Array) -> float:
 
 
 def gain(record: Record, cart: int) -> float | None:
-    """Return the change of level over that of the input, of the first edge."""
+    """Return the change of level divided by that of the input, at the first edge."""
     assert record.u is not None
     edges = np.flatnonzero(np.diff(record.u)) + 1
     if not edges.size:
@@ -34,7 +34,7 @@ def gain(record: Record, cart: int) -> float | None:
 
 
 def decay(record: Record, cart: int) -> tuple[float, float] | None:
-    """Return (omega_n, zeta) from the first peaks after the hand or the edge."""
+    """Return (omega_n, zeta) from the first peaks after the release or the edge."""
     y = record.position(cart) - settled(record.position(cart))
     if record.u is not None and np.any(record.u):
         y = y[np.flatnonzero(np.diff(record.u))[-1] + 1 :]
@@ -52,7 +52,7 @@ def decay(record: Record, cart: int) -> tuple[float, float] | None:
 
 
 def bode(records: Sequence[Record], cart: int) -> tuple[Array, Array]:
-    """Return (omega, amplitude ratio) over the dwells: half the swing of the last three cycles."""
+    """Return (omega, amplitude ratio) of each dwell, from half the swing of its last cycles."""
     points = []
     for record in records:
         if record.kind == "sine" and record.omega and record.u is not None:
@@ -90,7 +90,7 @@ def initial_table(records: Sequence[Record], n: int) -> dict[str, float]:
 
 
 def by_eye(records: Sequence[Record], n: int) -> dict[str, float]:
-    """Return resonances (of the last cart) and nulls (of the first) at the nearest dwells."""
+    """Return resonances (of the last cart) and nulls (of the first) read at the nearest dwells."""
     omega, last = bode(records, n)
     _, first = bode(records, 1)
     slope = np.log(np.concatenate([last[:1] * 0.9, last, last[-1:] * 0.5]))
@@ -127,7 +127,7 @@ def _fit(omega: Array, ratio: Array, start: list[float], shape) -> list[float]:
 
 
 def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) -> dict[str, float]:
-    """Return the fitted parameters, last cart first with the common denominator."""
+    """Return the table fitted to the last cart first, with its denominator for all carts."""
     omega, last = bode(records, n)
     if n == 1:
         start = [initial.get("K", float(last[0])), initial["omega_n"], initial["zeta"]]
@@ -167,7 +167,7 @@ def final_table(records: Sequence[Record], n: int, initial: dict[str, float]) ->
 
 
 def _recomputed(p: dict[str, float], n: int) -> dict[str, float]:
-    """Return the carts' numbers that follow from the coefficients; none if no carts fit."""
+    """Return the numbers of the carts from the coefficients, or none if no carts fit."""
 
     def quadratic(x: str) -> Array:
         return np.array([1.0, 2 * p[f"zeta_{x}"] * p[f"omega_{x}"], p[f"omega_{x}"] ** 2])

@@ -8,7 +8,7 @@ from pipeline.plant.linear.simulate import simulate_linear
 from pipeline.results import Hold, Kind, Record
 
 COUNT = 0.00227  # cm, an ECP 210 encoder count
-RATE = 113.0  # Hz, the ECP's usual
+RATE = 113.0  # Hz, the usual rate of the ECP 210
 
 
 def measure(
@@ -24,7 +24,7 @@ def measure(
     hold: Hold = "zero_order",
     id: str = "run",
 ) -> Record:
-    """Return positions read by an encoder, with white noise before the rounding."""
+    """Return positions read by an encoder, with white noise added before the rounding."""
     read = y + noise * rng.standard_normal(y.shape)
     if count:
         read = np.round(read / count) * count
@@ -55,7 +55,7 @@ def step_record(
     x0: Array | None = None,
     id: str = "step",
 ) -> Record:
-    """Return a step on after 0.1 s and off at half time that moves cart 1 by `swing` cm."""
+    """Return a step on at 0.1 s and off at half time that moves cart 1 by `swing` cm."""
     carts = free or tuple(range(1, chain.n + 1))
     t = np.arange(int(duration * rate)) / rate
     t = t + jitter / rate * rng.uniform(-0.5, 0.5, t.size)
@@ -67,7 +67,7 @@ def step_record(
 def decay_record(
     chain: Chain, *, free: tuple[int, ...], rng: np.random.Generator, id: str = "decay"
 ) -> Record:
-    """Return carts pulled aside in 0.5 s, held for 1 s and released; the encoder zero is off."""
+    """Return a decay: pulled aside in 0.5 s, held for 1 s, released; the encoder zero is off."""
     t = np.arange(int(7.0 * RATE)) / RATE
     x0 = np.zeros(2 * len(free))
     x0[0::2] = rng.uniform(1.0, 2.0, len(free))  # cm
@@ -85,10 +85,10 @@ def decay_record(
 
 
 def random_chain(n: int, rng: np.random.Generator) -> tuple[Chain, tuple[bool, ...]]:
-    """Return a random chain of n carts (cm, V), and the springs that it has.
+    """Return a random chain of n carts (cm, V), and which springs it has.
 
-    Carts alone swing at some 6 to 60 rad/s with damping ratios from 0.01 to 0.3; about half have no
-    spring to one of the walls.
+    Each cart alone swings at about 6 to 60 rad/s with a damping ratio from 0.01 to 0.3. About half
+    of the chains lack a spring to one of the walls.
     """
     omega = np.exp(rng.uniform(np.log(6), np.log(40)))
     m = 2e-4 * np.exp(rng.uniform(-0.7, 0.7, n))

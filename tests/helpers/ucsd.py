@@ -1,4 +1,4 @@
-"""The real ECP 210 recordings: single ones, and whole submissions in a temporary folder."""
+"""The real ECP 210 recordings, single or as whole submissions in a temporary folder."""
 
 import shutil
 from pathlib import Path
@@ -11,10 +11,10 @@ PID = '{ type = "pid", kp = 0.5, ki = 0.5, kd = 0.03, scale = 0.009765625, cart 
 
 
 def ecp_record(path: Path, *, column: int, kind: str) -> Record:
-    """Read one encoder of a raw ECP export; positions in counts, input sign reversed."""
+    """Read one encoder of a raw ECP export, in counts, with the input's sign reversed."""
     lines = [line.strip(" [];\n") for line in path.read_text().splitlines()]
     rows = np.array([line.split() for line in lines if line and line[0].isdigit()], dtype=float)
-    # Stamps are rounded to a millisecond: the clock itself is even.
+    # Stamps are rounded to a millisecond; the clock itself is even.
     t = np.asarray(np.polyval(np.polyfit(rows[:, 0], rows[:, 1], 1), rows[:, 0]), dtype=np.float64)
     return Record(
         id=path.stem,
@@ -29,7 +29,7 @@ def ecp_record(path: Path, *, column: int, kind: str) -> Record:
 
 
 def write_two_cart_submission(folder: Path, data: Path, *, steps: tuple[int, ...]) -> Path:
-    """Write a two-cart submission: single-cart runs, the given two-cart steps, the PID run."""
+    """Write a two-cart submission: runs of single carts, the given two-cart steps, the PID run."""
     experiments = [
         _experiment(f"alone-1-{i}", "step", f"DOF1_en1_input1_test{i}.csv", "carts = [1]")
         for i in range(1, 6)
@@ -60,7 +60,7 @@ input_limit = 4.884
 
 
 def write_one_cart_submission(folder: Path, data: Path) -> Path:
-    """Write a one-cart submission: the five steps of cart 1, cart 2 held."""
+    """Write a one-cart submission: the five steps of cart 1 with cart 2 held."""
     experiments = [
         _experiment(f"step-{i}", "step", f"DOF1_en1_input1_test{i}.csv") for i in range(1, 6)
     ]

@@ -1,4 +1,4 @@
-"""Recordings on a virtual bench without a line or a clock, as fast as it computes."""
+"""Recordings on a virtual bench without line and clock, as fast as they can be computed."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -33,15 +33,15 @@ from pipeline.simulated.emulator.core import ReferenceCore
 from pipeline.submission import Submission, load_submission
 from pipeline.submission.load import NAME
 
-_PULL_OUT = 1700  # ticks a hand takes
+_PULL_OUT = 1700  # ticks that a virtual hand takes
 
 
 class LimitPassed(AssertionError):
-    """A recording passed a limit of its plan; no proposal may do that."""
+    """A recording passed a limit of its plan, which no proposal may do."""
 
 
 class VirtualBench:
-    """A bench whose host never waits: ticks run one after the other."""
+    """A bench whose host never waits: ticks are computed one after the other."""
 
     def __init__(self, bench: SimulatedBench, *, seed: int) -> None:
         self.carts = VirtualCarts(bench, seed=seed)
@@ -57,7 +57,7 @@ class VirtualBench:
         )
         self.scales = CountScales(input=input_per_count(bench), position=bench.count)
         self._core, self._ticks = ReferenceCore(self.description), 0
-        self.seconds = 0.0  # of the bench's clock, in total
+        self.seconds = 0.0  # s of the bench's clock, in total
 
     def _tick(self) -> list[Reading]:
         duty = self._core.tick(
@@ -68,9 +68,9 @@ class VirtualBench:
         return [r for line in self._core.take().splitlines() if (r := parse_reading(line))]
 
     def _driven(self, *, held: Sequence[int], ticks: int) -> list[Reading]:
-        """Return the lines of that many ticks from rest, with all motion computed at once.
+        """Return the lines of this many ticks from rest, with all motion computed at once.
 
-        Without feedback the controller never reads the counts, which are inserted afterwards.
+        Without feedback the controller never reads the counts, so they are inserted afterwards.
         """
         duties, lines, spare = np.zeros(ticks), [], (0,) * self.description.encoders
         for tick in range(ticks):
@@ -94,7 +94,7 @@ class VirtualBench:
             bench=self.description,
         )
         held = tuple(cart for cart in range(1, n + 1) if cart not in recording.carts)
-        # A person who holds the carts brings them to rest: nothing happens meanwhile.
+        # A person who holds the carts brings them to rest, so nothing happens meanwhile.
         self.carts.take_in_hand(Hands(held=held, released=recording.release or 0))
         self._ticks += round(recording.settle / TRUE_PERIOD)
         self.seconds += recording.settle
@@ -118,7 +118,7 @@ class VirtualBench:
         return lines
 
     def record(self, folder: Path, recordings: Sequence[Recording], *, limits: PlanLimits) -> None:
-        """Carry out recordings into a submission, as `acquire` does."""
+        """Make recordings and add them to a submission, as `cartlab acquire` does."""
         submission = load_submission(folder)
         for recording in recordings:
             lines = self.carry_out(recording, submission=submission, limits=limits)
@@ -134,7 +134,7 @@ class VirtualBench:
 def _counts(
     carts: VirtualCarts, duties: NDArray[np.float64], *, held: Sequence[int]
 ) -> NDArray[np.int64]:
-    """Return the encoder counts at each tick under these duties, the first being zero."""
+    """Return the encoder counts at each tick for these duties, starting at zero."""
     hidden = carts._bench
     free = [cart for cart in range(1, hidden.chain.n + 1) if cart not in held]
     t = np.asarray(TRUE_PERIOD * np.arange(duties.size), dtype=np.float64)
@@ -163,17 +163,17 @@ def new_folder(folder: Path, bench: VirtualBench, *, springs: Sequence[bool]) ->
 
 
 class VirtualSession:
-    """Records for an exploration: the bench, and the folder that the first call makes."""
+    """A recorder for an exploration, with its bench and the folder that the first call makes."""
 
     def __init__(
         self, folder: Path, bench: VirtualBench, *, springs: Sequence[bool] | None = None
     ) -> None:
-        """Assume all springs, unless they are given."""
+        """Assume that all springs exist, unless they are given."""
         self.folder, self.bench = folder, bench
         self.springs = springs or [True] * (bench.description.carts + 1)
 
     def __call__(self, ids: Sequence[str]) -> Recorded:
-        """Carry out recordings of the plan; make submission and plan if they are missing."""
+        """Make recordings of the plan; write submission and plan first if they are missing."""
         if not (self.folder / NAME).exists():
             new_folder(self.folder, self.bench, springs=self.springs)
         submission = load_submission(self.folder)

@@ -1,4 +1,4 @@
-"""Waiting for an event on a machine of any load: a deadline only ends a hang."""
+"""Wait for an event on a machine of any load; a deadline only ends a hang."""
 
 import subprocess
 import time
@@ -8,7 +8,7 @@ from typing import Any
 
 import psutil
 
-PATIENCE = 120.0  # s after which an event is taken never to come
+PATIENCE = 120.0  # s after which an event is assumed never to come
 # Each check takes processor time from the awaited process, so checks become less frequent.
 _OFTEN, _SELDOM = 0.01, 0.1  # s between two checks, at first and at most, …
 _LATER = 0.1  # … and as a share of the time waited so far
@@ -19,7 +19,7 @@ def until(happened: Callable[[], object], what: str = "it") -> None:
 
     Raises
     ------
-    AssertionError : it never did.
+    AssertionError : `happened()` never held.
     """
     begin = time.monotonic()
     while not happened():
@@ -30,7 +30,7 @@ def until(happened: Callable[[], object], what: str = "it") -> None:
 
 @contextmanager
 def started(command: Sequence[object], **options: Any) -> Iterator[subprocess.Popen[Any]]:
-    """Run a program beside a block; afterwards it and all its children have ended."""
+    """Run a program while the block runs; afterwards it and all its children have ended."""
     with subprocess.Popen(list(map(str, command)), **options) as process:
         try:
             yield process
