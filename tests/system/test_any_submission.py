@@ -1,4 +1,4 @@
-"""Random broken student data give a result or one line of error, and nothing else."""
+"""Whatever is wrong in a student's data, analysis ends in a result or in one line of error."""
 
 import csv
 import json
@@ -20,7 +20,7 @@ from pipeline.submission import Experiment, Submission, load_submission
 from pipeline.workflow import analyse
 
 KINDS = ("decay", "step", "sine", "sweep", "closed_loop")
-MOST_RUNS = 6  # of a kind: more only cost time
+MOST_RUNS = 6  # at most so many runs of each kind: more would only cost time
 
 
 def stuck(y: Array) -> Array:
@@ -29,22 +29,22 @@ def stuck(y: Array) -> Array:
 
 
 def jumping(y: Array) -> Array:
-    """Jump by a thousand units halfway."""
+    """Add a jump of a thousand units halfway through the record."""
     return y + 1e3 * (np.arange(y.size) >= y.size // 2)
 
 
 def spiked(y: Array) -> Array:
-    """Stand still except for one sample."""
+    """Keep the channel constant except for one sample."""
     return np.eye(1, y.size, y.size // 2)[0]
 
 
 def clipped(y: Array) -> Array:
-    """Cut off a tenth of the largest value."""
+    """Clip the channel at nine tenths of its largest value."""
     return np.clip(y, -0.1 * np.abs(y).max(), 0.1 * np.abs(y).max())
 
 
 def noisy(y: Array) -> Array:
-    """Measure nothing but noise."""
+    """Replace the channel by noise."""
     return np.random.default_rng(y.size).standard_normal(y.size)
 
 
@@ -137,7 +137,7 @@ def spoil(draw: st.DrawFn, header: list[str], values: Array) -> tuple[Array, lis
 
 
 def mislabelled(draw: st.DrawFn, run: Experiment, n: int) -> Experiment:
-    """State another kind or other free carts than those recorded."""
+    """Declare another kind of experiment, or other free carts, than the recording really has."""
     if draw(st.booleans()):
         return run.model_copy(update={"kind": draw(st.sampled_from(KINDS))})
     carts = draw(st.sets(st.integers(1, n), min_size=1))
@@ -149,7 +149,7 @@ def refuse(constant: str) -> None:
 
 
 def check(case: Case) -> None:
-    """Analyse: expect valid JSON or a one-line PipelineError."""
+    """Analyse the case, and expect valid JSON or a PipelineError of one line."""
     with tempfile.TemporaryDirectory() as folder:
         for name, (header, values) in case.files.items():
             path = Path(folder) / name

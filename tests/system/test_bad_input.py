@@ -1,4 +1,4 @@
-"""Broken submissions: each gives one clear line that names the file and the mistake."""
+"""Each broken submission gives one clear line that names the file and the mistake."""
 
 import gzip
 import io
@@ -45,7 +45,7 @@ def good_rows(n: int = 40) -> list[str]:
 
 
 def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
-    """Write a submission; data files that are not given are good ones."""
+    """Write a submission, with good data files for those that are not given."""
     (folder / "data").mkdir(parents=True)
     raw = toml if isinstance(toml, bytes) else toml.encode()
     (folder / "submission.toml").write_bytes(raw)
@@ -57,12 +57,12 @@ def write(folder: Path, toml: str | bytes = GOOD, **files: str | bytes) -> Path:
 
 
 def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
-    """Load and read, and expect a few matching lines; the command prints them with status 2."""
+    """Load a submission; expect at most `most` matching lines, which the command prints too."""
     with pytest.raises(SubmissionError, match=pattern) as caught:
         read_data(load_submission(folder))
     message = str(caught.value)
     assert 1 <= len(message.splitlines()) <= most
-    assert str(folder) not in message  # a report does not tell where it was made
+    assert str(folder) not in message  # a message must not say in which folder the submission was
     said = io.StringIO()
     with (
         mock.patch.object(sys, "argv", ["cartlab", "report", str(folder)]),
@@ -71,11 +71,11 @@ def one_line(folder: Path, pattern: str, *, most: int = 1) -> None:
     ):
         main()
     assert (left.value.code, said.getvalue()) == (2, f"cartlab: {message}\n")
-    assert not (folder / "report").exists()  # nothing half-made is left behind
+    assert not (folder / "report").exists()  # no half-written report is left
 
 
 def test_the_good_one_is_read(tmp_path):
-    """The submission that the broken ones are made from is itself sound."""
+    """The good submission, from which the broken ones are made, is read without a complaint."""
     assert read_data(load_submission(write(tmp_path / "team-01"))).records[0].carts == (1, 2)
 
 
@@ -249,7 +249,7 @@ BAD_TOML = {
 
 @pytest.mark.parametrize(("toml", "pattern"), BAD_TOML.values(), ids=BAD_TOML.keys())
 def test_a_broken_submission_file_is_a_line_each(toml, pattern, tmp_path):
-    """Whatever is wrong in submission.toml is named by key or line, one line for each mistake."""
+    """Each mistake in submission.toml gives one line, which names its key or line."""
     one_line(write(tmp_path / "team-01", toml), pattern, most=MOST_LISTED)
 
 
@@ -393,7 +393,7 @@ BAD_DATA = {
 
 @pytest.mark.parametrize(("content", "pattern"), BAD_DATA.values(), ids=BAD_DATA.keys())
 def test_a_broken_data_file_is_one_line(content, pattern, tmp_path):
-    """Whatever is wrong in a data file is one line that names the line."""
+    """A mistake in a data file gives one line of error, which names the line of the file."""
     one_line(write(tmp_path / "team-01", **{"step.csv": content}), pattern)
 
 
@@ -408,13 +408,13 @@ BAD_TABLES = {
 
 @pytest.mark.parametrize(("content", "pattern"), BAD_TABLES.values(), ids=BAD_TABLES.keys())
 def test_a_broken_bode_table_is_one_line(content, pattern, tmp_path):
-    """A reduced table needs positive frequencies and amplitude ratios."""
+    """A `bode` table without positive frequencies and amplitude ratios gives one line of error."""
     toml = GOOD.replace('kind = "step"', 'kind = "bode"')
     one_line(write(tmp_path / "team-01", toml, **{"step.csv": content}), pattern)
 
 
 def test_only_the_wrong_cart_in_the_file_is_one_line(tmp_path):
-    """A record that measures none of the free carts is the wrong file."""
+    """If a file measures only carts that were held, one line names the free and measured carts."""
     folder = write(tmp_path / "team-01", GOOD + "carts = [2]\n")
     (folder / "data" / "step.csv").write_text(
         "\n".join(",".join(row.split(",")[:3]) for row in good_rows())
@@ -425,7 +425,7 @@ def test_only_the_wrong_cart_in_the_file_is_one_line(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 @pytest.mark.parametrize("place", ["file", "folder", "toml", "notes", "loop", "chain"])
 def test_no_link_leads_out_of_the_submission(place, tmp_path):
-    """A link out of the folder is refused wherever it is, and so is a loop of links."""
+    """A link that leads out of the submission, or in a loop, is refused wherever it is."""
     folder = write(tmp_path / "team-01")
     outside = write(tmp_path / "other")
     target, pattern = (
@@ -459,7 +459,7 @@ def test_no_link_leads_out_of_the_submission(place, tmp_path):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes here")
 @pytest.mark.parametrize("name", ["submission.toml", "data/step.csv", "notes.md"])
 def test_a_named_pipe_does_not_hang_the_reader(name, tmp_path):
-    """A pipe with nobody at its other end is refused before it is opened."""
+    """A named pipe that nobody writes to is refused before it is opened."""
     folder = write(tmp_path / "team-01")
     (folder / name).unlink(missing_ok=True)
     os.mkfifo(folder / name)
@@ -481,7 +481,7 @@ SLIPS = {
     "K = −1.5": ("dash", "K = -1.5"),
     "kind\N{NO-BREAK SPACE}= 'step'": ("space", "kind = 'step'"),
     "K = 1.13 cm/V": ("unit", "K = 1.13"),
-    "zeta = 5%": ("unit", ""),  # which is 0.05
+    "zeta = 5%": ("unit", ""),  # that is, 0.05
     "K = 1.2*10^-3": ("unit", "K = 1.2e-3"),
     "K = 1.2 * 3": ("unit", ""),
     "K = .5": ("point", "K = 0.5"),
@@ -500,7 +500,7 @@ SLIPS = {
 
 @pytest.mark.parametrize("typed", SLIPS)
 def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
-    """TOML refuses it; the message has the line, the reason, and the corrected line."""
+    """A typing slip that TOML refuses gives one line with the reason."""
     write(tmp_path / "team-01", "version = 1\n" + typed + "\n")
     words, mended = SLIPS[typed]
     with pytest.raises(SubmissionError, match=rf"toml line [234]: .*{words}") as caught:
@@ -512,7 +512,7 @@ def test_a_slip_of_the_keyboard_is_told_by_what_to_type(typed, tmp_path):
 
 
 def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
-    """A similar file that another experiment already uses is not proposed."""
+    """If a file is missing, a similar file that another experiment already uses is not proposed."""
     second = STEP.replace("step-a", "step-b").replace("step.csv", "step2.csv")
     folder = write(tmp_path / "team-01", GOOD + second)
     assert read_data(load_submission(folder)).unreadable == {
@@ -529,9 +529,9 @@ def test_no_file_is_proposed_that_is_another_experiments(tmp_path):
 
 @pytest.mark.parametrize("path", ["nowhere", "team-01/data", "team-01/data/step.csv"])
 def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
-    """Each gets its own message.
+    """A path that is no submission gives one line of error that says why.
 
-    A missing folder, one without submission.toml, a file of another kind.
+    The paths are a missing folder, a folder without submission.toml, and a file of another kind.
     """
     write(tmp_path / "team-01")
     one_line_patterns = {
@@ -542,11 +542,11 @@ def test_a_path_that_is_no_submission_is_one_line(path, tmp_path):
     with pytest.raises(SubmissionError, match=one_line_patterns[path]) as caught:
         load_submission(tmp_path / path)
     assert "\n" not in str(caught.value)
-    assert str(tmp_path)[:12] in str(caught.value)  # as it was typed, from the root
+    assert str(tmp_path)[:12] in str(caught.value)  # the full path is shown, as it was typed
 
 
 def test_notes_must_be_short_text(tmp_path):
-    """`notes.md` is read as UTF-8 text of at most a megabyte."""
+    """`notes.md` is refused unless it is UTF-8 text of at most a megabyte."""
     folder = write(tmp_path / "team-01")
     (folder / "notes.md").write_bytes(b"# \xff\xfe")
     one_line(folder, r"team-01/notes\.md line 1: not UTF-8 text")
@@ -555,7 +555,7 @@ def test_notes_must_be_short_text(tmp_path):
 
 
 def test_a_huge_data_file_is_refused_before_it_is_read(tmp_path):
-    """The size is looked at first; a sparse file of 1 GB costs nothing."""
+    """A data file that is too large is refused by its size, before any of it is read."""
     folder = write(tmp_path / "team-01")
     with (folder / "data" / "step.csv").open("wb") as stream:
         stream.truncate(10**9)

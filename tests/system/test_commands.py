@@ -1,4 +1,4 @@
-"""The command line as people use it: exit codes, one clear line, files in the right place."""
+"""The commands as people use them: exit status, one clear line, files in the right place."""
 
 import html
 import json
@@ -25,11 +25,11 @@ def _commands():
 
 @pytest.mark.parametrize("command", _commands())
 def test_every_command_has_help_and_is_in_the_readme(command):
-    """`--help` works and says something; the README names the command."""
+    """Each command has a `--help` text, and the README names the command."""
     done = cartlab_here(command, "--help")
     assert done.returncode == 0
     assert "Usage" in done.stdout
-    if README.exists():  # absent only if the tests run against an installed wheel
+    if README.exists():  # the README is absent only if the tests run against an installed wheel
         assert f"`cartlab {command}" in README.read_text(encoding="utf-8")
 
 
@@ -48,14 +48,14 @@ def test_help_imports_nothing_heavy():
     ],
 )
 def test_a_command_loads_only_what_it_needs(module, unneeded):
-    """A report loads the effects only for a gap; grading leaves the analysis to its workers."""
+    """`report` loads no effects, and `grade` leaves loading the analysis to its workers."""
     code = f"import sys, pipeline.{module}; print({set(unneeded)} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 
 
 def test_report_writes_everything_and_ends_well(tmp_path):
-    """A consistent submission gives all files and exit status 0; --json prints results.json."""
+    """For a consistent submission `report --json` writes all files and ends with status 0."""
     out = tmp_path / "out"
     done = cartlab("report", EXAMPLES / "one-cart", "--out", out, "--json")
     assert done.returncode == 0
@@ -85,7 +85,7 @@ def test_report_writes_everything_and_ends_well(tmp_path):
     ],
 )
 def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expected):
-    """A wrong name or a blocked path ends in one line on stderr that names it."""
+    """A wrong name or a blocked path gives one line on stderr that names it, and exit status 2."""
     (tmp_path / "blocked").write_text("in the way")
     done = cartlab_here(*arguments, cwd=tmp_path)
     assert done.returncode == 2
@@ -96,7 +96,7 @@ def test_what_cannot_run_is_one_line_and_status_two(tmp_path, arguments, expecte
 
 
 def test_failed_checks_are_status_one(tmp_path):
-    """A submission whose steps have a wrong scale is reported, and the exit status says so."""
+    """If the steps have a wrong scale, the report is still written, but the exit status is 1."""
     folder = tmp_path / "scaled"
     shutil.copytree(EXAMPLES / "one-cart", folder)
     for file in (folder / "data").glob("step-*.csv"):
@@ -114,10 +114,10 @@ def test_failed_checks_are_status_one(tmp_path):
 
 
 def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
-    """One missing, one broken: reported on stderr and in results.json, status 1, the rest computed.
+    """If one file is missing and one is broken, both are reported and everything else is computed.
 
-    A solution made from them is doubtful, with each reason given once. Without a single readable
-    file there is nothing to report.
+    The exit status is 1. A solution from these files is doubtful, and gives each reason once. If no
+    file can be read, there is no report and the status is 2.
     """
     folder = tmp_path / "team"
     shutil.copytree(EXAMPLES / "one-cart", folder)
@@ -160,9 +160,9 @@ def test_a_file_that_cannot_be_read_is_its_own_run_s_problem(tmp_path):
 
 
 def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
-    """Points beside a sharp peak give no final ζ, with its reason; the figures are still drawn.
+    """Without a point near the peak the final ζ is missing, with its reason; figures are drawn.
 
-    One of the points of the fitted curve lies on the pole.
+    The fitted ζ is 0, and one point of the fitted curve lies on the pole.
     """
     hertz = [0.5, 1.0, 1.5, 2.5, 3.0, 4.0]  # resonance at 2 Hz, K = 20 cm/V
     rows = [f"{f},{20 / abs(1 - (f / 2) ** 2):.6g}" for f in hertz]
@@ -183,7 +183,7 @@ def test_a_damping_at_its_bound_is_reported_as_unknown(tmp_path):
 
 
 def test_new_then_report_tells_what_to_do_next(tmp_path):
-    """A fresh folder cannot be reported yet; the message says what is missing."""
+    """For a folder fresh from `new`, `report` says that experiments are missing."""
     assert cartlab_here("new", tmp_path / "team", "--carts", "2").returncode == 0
     done = cartlab_here("report", tmp_path / "team")
     assert done.returncode == 2
@@ -191,7 +191,7 @@ def test_new_then_report_tells_what_to_do_next(tmp_path):
 
 
 def test_simulate_makes_a_submission_that_report_takes(tmp_path):
-    """A simulated bench goes through the whole pipeline, reported values included."""
+    """`report` reads a simulated submission, with its reported values, without any complaint."""
     folder = tmp_path / "bench"
     done = cartlab_here(
         "simulate", "--preset", "throne-1dof", "--seed", 5, "--reported", "--out", folder
@@ -206,9 +206,9 @@ def test_simulate_makes_a_submission_that_report_takes(tmp_path):
 
 
 def test_one_broken_file_does_not_make_a_folder_unreadable(tmp_path):
-    """The other files get their table and the status is that of a failed check.
+    """If `inspect` meets one broken file, it still shows the other files and ends with status 1.
 
-    Without any, it is 2.
+    If no file can be read, the status is 2.
     """
     broken = tmp_path / "broken.csv"
     broken.write_text("time,x1\n0,oops\n1,2\n", encoding="utf-8")

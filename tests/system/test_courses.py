@@ -1,4 +1,4 @@
-"""The example assignments of notebook courses, from the teacher's notebook to the points."""
+"""The example assignments for notebook courses, from the teacher's notebook to the points."""
 
 import csv
 import json
@@ -30,7 +30,7 @@ initial = {"K": 29.0, "omega_n": 2.12}
 final = {"K": 28.9, "omega_n": 2.1, "zeta": 0.101}
 """,
 }
-# One for each number: a frequency is wrong in both tables, and a damping is missing.
+# One point for each number: one answer has a wrong frequency in both tables, and no damping.
 POINTS = {"right": 6.0, "in-hertz": 3.0}
 # The text that the tools put in place of a solution.
 _PLACE = re.compile(
@@ -46,7 +46,7 @@ def need(tool: str) -> None:
 
 @pytest.fixture(scope="module")
 def recordings(tmp_path_factory) -> Path:
-    """A student's recordings, of which the numbers above are right."""
+    """A student's recordings, for which the answers "right" are correct."""
     folder = tmp_path_factory.mktemp("bench") / "recordings"
     write_submission(folder, "throne-1dof", seed=7, compact=True)
     return folder
@@ -54,7 +54,7 @@ def recordings(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def run(tmp_path, monkeypatch) -> Callable[..., str]:
-    """A function that runs a program of this environment, settings in a home of its own."""
+    """A function that runs a program of this environment with a home folder of its own."""
     jupyter = (f"JUPYTER_{what}_DIR" for what in ("CONFIG", "DATA", "RUNTIME"))
     for name in ("HOME", "IPYTHONDIR", *jupyter):
         monkeypatch.setenv(name, str(tmp_path / "home"))
@@ -78,7 +78,7 @@ def run(tmp_path, monkeypatch) -> Callable[..., str]:
 
 
 def fill_in(released: Path, handed_in: Path, answers: str) -> None:
-    """Write the notebook that a student hands in: the released one with answers in its place."""
+    """Write the notebook that a student hands in: the released one, with answers filled in."""
     notebook = json.loads(released.read_text(encoding="utf-8"))
     (own,) = [one for one in notebook["cells"] if _PLACE.search("".join(one["source"]))]
     own["source"] = _PLACE.sub(answers, "".join(own["source"]))
@@ -87,7 +87,7 @@ def fill_in(released: Path, handed_in: Path, answers: str) -> None:
 
 
 def test_nbgrader_gives_a_point_for_each_number_that_agrees(recordings, run, tmp_path):
-    """Released without the solution; graded in part, from the student's own recordings."""
+    """Nbgrader hides the solution and scores each number against the student's own recordings."""
     need("nbgrader")
     course = tmp_path / "course"
     (course / "source" / "lab").mkdir(parents=True)
@@ -112,14 +112,14 @@ def test_nbgrader_gives_a_point_for_each_number_that_agrees(recordings, run, tmp
     graded = course / "autograded" / "in-hertz" / "lab"
     shown = (graded / "lab.ipynb").read_text(encoding="utf-8")
     assert "2 of 5 numbers disagree with your own recordings" in shown
-    assert "13.3" not in shown  # what they should have found
+    assert "13.3" not in shown  # the value that the student should have found
     assert [answer.disagree for answer in read_answers(graded / "recordings")] == [
         ("initial.omega_n", "final.omega_n")
     ]
 
 
 def test_otter_gives_a_point_for_each_number_that_agrees(recordings, run, tmp_path):
-    """Assigned, filled in, exported by the student's own last cell, then graded."""
+    """Otter hides the solution and scores each number of the zip that a notebook exports."""
     need("otter")
     shutil.copy(ROOT / "docs" / "course-otter.ipynb", tmp_path / "lab.ipynb")
     run("otter", "assign", "lab.ipynb", "dist", cwd=tmp_path)

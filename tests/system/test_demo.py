@@ -1,4 +1,4 @@
-"""The demo's second process ends with the first and hides no failure."""
+"""The demo's second process ends together with the first, and its errors are shown."""
 
 import subprocess
 import sys
@@ -11,7 +11,7 @@ from pipeline.errors import SubmissionError
 
 
 def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path, capsys):
-    """A spoilt bench of an earlier run is named, as the command alone would name it."""
+    """If the demo's second process fails, the demo shows its error and its exit status."""
     (tmp_path / "bench").mkdir()
     (tmp_path / "bench" / "submission.toml").write_text("version = 1\n", encoding="utf-8")
 
@@ -23,7 +23,7 @@ def test_what_the_other_process_could_not_do_is_said_by_this_one(tmp_path, capsy
 
 
 def test_an_interrupted_demonstration_leaves_no_process_behind(tmp_path):
-    """The search would take ten seconds; it is ended before it has written anything."""
+    """Ctrl-C during the demo ends the second process before it has written anything."""
     with pytest.raises(KeyboardInterrupt), search_beside(tmp_path) as beside:
         raise KeyboardInterrupt
     assert beside.returncode
@@ -31,7 +31,7 @@ def test_an_interrupted_demonstration_leaves_no_process_behind(tmp_path):
 
 
 def test_a_killed_demonstration_leaves_no_process_behind(tmp_path):
-    """If the first process is killed, the second notices and ends."""
+    """If the demo's first process is killed, the second notices it and ends."""
     first = (
         "import sys, time; from pathlib import Path; from pipeline.cli.demo import search_beside\n"
         "with search_beside(Path(sys.argv[1])) as beside:\n"

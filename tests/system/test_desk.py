@@ -51,7 +51,8 @@ def show(browser):
     for context in contexts:
         context.close()
     said = "the server responded with a status of (422|409)"  # on the page
-    # A page may be asking something when its test ends the desk; both the browser and htmx say so.
+    # A page may have a request open when its test ends the desk; browser and htmx then report
+    # errors.
     ended = r"net::ERR_(CONNECTION_\w+|INCOMPLETE_CHUNKED_ENCODING|EMPTY_RESPONSE)"
     ended += "|htmx:(afterRequest|sendError|sendAbort)"
     assert [error for error in errors if not re.search(f"{said}|{ended}", error)] == []
@@ -60,7 +61,7 @@ def show(browser):
 def fits(window) -> bool:
     """Return whether nothing is wider than the screen, and axe finds no fault by day or night.
 
-    Axe looks at the phone's page, which needs the most scrolling and touching.
+    Axe checks the page at a phone's size, which needs the most scrolling and touching.
     """
     own, overhang = window.viewport_size, []
     for width, height in (WIDE, PHONE):
@@ -78,13 +79,13 @@ def unfold(window) -> None:
 
 
 def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
-    """Files dropped, a doubt answered, a mistake fixed, the form, the report, the zip."""
+    """A student drops files, answers, corrects a mistake, reads the report, downloads the zip."""
     folder = tmp_path / "team"
     with DeskServer() as server:
         window = show(server.url)
         window.get_by_text("Type a path").click()
         window.get_by_label("Folder on this computer").fill(str(folder))
-        with window.expect_navigation():  # to a page that has its scripts, which take the files
+        with window.expect_navigation():  # to a page whose scripts can take the files
             window.get_by_role("button", name="Open").click()
         expect(window.get_by_role("heading", level=1)).to_have_text("team")
         stands = window.get_by_label("Current state")
@@ -116,12 +117,12 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         row.get_by_label("Note").fill("the cart was bumped")
         row.get_by_role("button", name="Save").click()
         until(lambda: "bumped" in (folder / NAME).read_text(encoding="utf-8"))
-        expect(row).to_be_visible()  # what was unfolded stays so
+        expect(row).to_be_visible()  # a row that was opened stays open
         expect(window.locator("#files").get_by_text("Saved.")).to_be_visible()
         window.get_by_text("What controller ran?").click()
         window.get_by_label("Controller", exact=True).select_option("state_feedback")
         expect(window.locator("#kind-closed_loop .chip")).to_have_text("understood")
-        expect(window.get_by_label("Prefilter").first).to_be_visible()  # nothing folds over it
+        expect(window.get_by_label("Prefilter").first).to_be_visible()  # is not folded
         assert fits(window)
 
         window.get_by_role("button", name="Make the report").click()
@@ -130,9 +131,9 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
         window.get_by_role("link", name="Read the report").click()
         report = window.frame_locator("iframe")
         expect(report.get_by_role("heading", level=1)).to_have_text("One <b>cart</b>")
-        expect(report.locator("figure .tools").first).to_be_attached()  # its own script runs
+        expect(report.locator("figure .tools").first).to_be_attached()  # its script works
         own = "document.documentElement.scrollHeight - innerHeight"
-        assert window.evaluate(own) <= 0  # the report alone scrolls
+        assert window.evaluate(own) <= 0  # only the report scrolls, not the page around it
         assert fits(window)
         window.get_by_role("link", name="Back to the files").click()
         window.locator("#group-who > summary").click()
@@ -159,11 +160,11 @@ def test_a_student_goes_from_an_empty_folder_to_the_zip(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
-    """From the doubt about a unit to the zip with Tab, letters, Enter and the space bar."""
+    """With keys alone, on a phone, a student gets from the doubt about a unit to the zip."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
     for file in FILES:
-        if "control" not in file.name:  # of that one it asks what ran
+        if "control" not in file.name:  # for that recording the page asks which controller ran
             (folder / "data" / file.name).write_bytes(file.read_bytes())
     fill(folder)
     with DeskServer(folder=folder) as server:
@@ -190,7 +191,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
         window.keyboard.press("Enter")
         until(lambda: load_submission(folder).reported is not None)
         button = window.get_by_role("button", name="Make the report")
-        expect(button).to_have_class("main")  # it is what comes next
+        expect(button).to_have_class("main")  # the focus is on the next step
         go_to(button)
         window.keyboard.press("Space")
         stands = window.get_by_label("Current state")
@@ -221,7 +222,7 @@ def test_the_way_is_gone_with_the_keyboard_alone_on_a_phone(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
-    """It survives when another form is saved, a row removed, or a form refused as outdated."""
+    """Typed text stays if another form is saved, a row is removed or a save is refused."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -257,7 +258,7 @@ def test_what_is_typed_stays_until_it_is_saved(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
-    """On a phone; what is settled folds, and what is left comes first."""
+    """One key answers the same question for several recordings; answered rows fold away."""
     folder = tmp_path / "team"
     (folder / "data").mkdir(parents=True)
     for name, n in (("a", 400), ("b", 420), ("c", 440)):
@@ -272,7 +273,7 @@ def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
         row.get_by_role("button", name="It was free").press("Enter")
         for name in ("a.csv", "b.csv", "c.csv"):
             shown = window.locator("tr").filter(has_text=name)
-            expect(shown).to_be_visible(visible=name != "a.csv")  # that one is understood
+            expect(shown).to_be_visible(visible=name != "a.csv")  # that recording is understood
         window.get_by_role("button", name="It was held in all 2").press("Enter")
         expect(window.locator("#files details.kind[open]")).to_have_count(0)
         assert fits(window)
@@ -281,7 +282,7 @@ def test_one_key_answers_what_several_recordings_ask(show, tmp_path):
 
 
 def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
-    """Zip and report wait and say so; they go on after saving, or on request without it."""
+    """While typed text is unsaved, zip and report wait and say so."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -332,13 +333,13 @@ def test_what_is_made_of_the_file_waits_for_what_is_not_saved(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_everybody_can_use_it(show, tmp_path):
-    """Axe finds no fault by day or night; nothing is wider than the screen; all keys work."""
+    """The desk passes axe by day and night, is never wider than the screen and works by keys."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url, size=PHONE)
         unfold(window)
         table = window.locator(".wide").filter(has=window.locator("table.files")).first
-        assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # nor sideways in it
+        assert table.evaluate("it => it.scrollWidth <= it.clientWidth")  # nor is it wide
         window.get_by_label("Position of one encoder count").fill("0")
         window.get_by_label("Position of one encoder count").press("Enter")
         expect(window.locator("#system-position-per_count-wrong")).to_be_visible()
@@ -354,7 +355,7 @@ def test_everybody_can_use_it(show, tmp_path):
 
 @pytest.mark.usefixtures("work_here")
 def test_without_scripts_it_works_too(show, tmp_path):
-    """Every change is a plain form."""
+    """Without scripts every change can be made with a plain form."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url, java_script_enabled=False)
@@ -369,7 +370,7 @@ def test_without_scripts_it_works_too(show, tmp_path):
 
 
 def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
-    """One line when ready, one if the port is taken; a signal ends it by name, with status 0."""
+    """The desk prints one line when ready or if the port is taken, and ends with 0 on a signal."""
     command = [sys.executable, "-m", "pipeline", "desk", str(tmp_path / "team"), "--no-browser"]
     with started(command, stderr=subprocess.PIPE, encoding="utf-8") as desk:
         assert desk.stderr is not None
@@ -389,14 +390,14 @@ def test_the_command_says_its_address_and_ends_with_a_signal(tmp_path):
 
 
 def test_a_row_is_typed_through_without_waiting(show, tmp_path):
-    """While one field is saved the next is typed: no letter, field or message is lost."""
+    """While one field is saved, a user can type in the next without losing letters or messages."""
     folder = a_submission(tmp_path / "team")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
         window.locator("#kind-decay > summary").press("Enter")
         window.locator("#more-0 > summary").press("Enter")
         window.locator("[name='experiments.0.window']").focus()
-        for text in ("0.1, 5", "my note", "", "100", ""):  # … and out of the row
+        for text in ("0.1, 5", "my note", "", "100", ""):  # … and then leaves the row
             window.keyboard.type(text, delay=15)
             window.keyboard.press("Tab")
 

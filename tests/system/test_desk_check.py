@@ -1,4 +1,4 @@
-"""Checking one's own numbers in a real browser, from the files to the zip, by keyboard."""
+"""A student checks reported numbers in a real browser, from the files to the zip, by keyboard."""
 
 import re
 
@@ -16,7 +16,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def test_a_student_finds_a_wrong_number_and_mends_it(show, tmp_path):
-    """Which number, then where to look, on a phone with keys alone; the new number agrees."""
+    """The check shows which number is wrong and where to look; the corrected number agrees."""
     folder = a_submission(tmp_path / "team")
     path = folder / "submission.toml"
     text = path.read_text(encoding="utf-8").replace("omega_n = 13.1", "omega_n = 2.085", 1)

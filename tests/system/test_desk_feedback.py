@@ -1,4 +1,4 @@
-"""From a student's request to the answer, in a real browser, with the keyboard alone."""
+"""The way from a student's request to the TA's answer, in a real browser, by keyboard alone."""
 
 import socket
 from pathlib import Path
@@ -32,7 +32,7 @@ gradebooks = ["grades"]
 
 @pytest.fixture
 def lab(tmp_path):
-    """A lab server that browsers reach as through its proxy."""
+    """A lab server that browsers reach through a proxy."""
     write_class(tmp_path / "grades")
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
@@ -50,7 +50,7 @@ def named(name: str) -> dict[str, str]:
 
 
 def walk_to(window, control, *, most: int = 60) -> None:
-    """Press Tab until a control has the focus."""
+    """Press Tab until the control has the focus."""
     for _ in range(most):
         if control.evaluate("one => one === document.activeElement"):
             return
@@ -59,7 +59,7 @@ def walk_to(window, control, *, most: int = 60) -> None:
 
 
 def press(window, control, key: str = "Enter") -> None:
-    """Walk to what leads to another page, and press it."""
+    """Walk to a control that leads to another page, and press it."""
     walk_to(window, control)
     with window.expect_navigation():
         window.keyboard.press(key)
@@ -67,7 +67,7 @@ def press(window, control, key: str = "Enter") -> None:
 
 @pytest.mark.usefixtures("work_here")
 def test_from_the_request_to_the_answer_by_keyboard(show, lab, tmp_path: Path):
-    """Released, asked on a phone, answered with points, read; in dark mode, checked by axe."""
+    """A student asks about a grade on a phone, and reads the TA's answer with its points."""
     prof = show(f"{lab}/", extra_http_headers=named("prof"))
     press(prof, prof.get_by_role("button", name="Let students read their feedback"))
     expect(prof.get_by_role("status")).to_contain_text("Students can read their feedback.")

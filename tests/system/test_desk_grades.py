@@ -1,4 +1,4 @@
-"""The TA's pages in a real browser: a class graded by keys, two TAs at once, anonymous names."""
+"""The TA's pages in a real browser: grading a class by keys, two TAs at once, anonymous names."""
 
 import re
 from urllib.parse import quote
@@ -33,7 +33,7 @@ def press(window, key: str) -> None:
 
 
 def test_everybody_can_grade(show, tmp_path):
-    """Class, team with figures and refusal: axe finds no fault, and nothing is too wide."""
+    """Class page, team page and a refused change pass axe, and nothing exceeds the screen."""
     with DeskServer(folder=write_class(tmp_path / "grades")) as server:
         window = show(server.url)
         expect(window.locator("#teams tbody tr")).to_have_count(16)
@@ -47,7 +47,7 @@ def test_everybody_can_grade(show, tmp_path):
             window.get_by_role("link", name="Frequencies from the Bode fit").click()
         expect(window.locator("img.drawing").first).to_be_visible()
         assert fits(window)
-        # Moving from field to field with Tab finds the same without the letter keys.
+        # Tab reaches the same fields without the letter keys.
         window.get_by_label("Another number of points").fill("99")
         window.get_by_label("Reason").fill("far too many")
         with window.expect_navigation():
@@ -58,7 +58,7 @@ def test_everybody_can_grade(show, tmp_path):
 
 
 def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
-    """A right team takes one key; a change, and the same for all with the flag, can be undone."""
+    """Each key that changes points, for one team or for all with a flag, can be undone."""
     grades = write_class(tmp_path / "grades")
     with DeskServer(folder=grades) as server:
         window = show(server.url, size=LAPTOP)
@@ -88,25 +88,25 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
         while "ound recordings" not in chosen.inner_text():
             press(window, "j")
         window.keyboard.press("3")
-        window.keyboard.type("the plot is cleara1n")  # a letter in a field is a letter
+        window.keyboard.type("the plot is cleara1n")  # a letter typed in a field is no command
         for _ in range(3):
             window.keyboard.press("Backspace")
         for needed in ("#chosen-title", ".points :checked + span", ".decide .main", "#why"):
             expect(window.locator(needed)).to_be_in_viewport(ratio=1)
         press(window, "Enter")
         said = window.locator("#chosen").get_by_role("status")
-        expect(said).to_have_text("Saved.")  # where it was done
+        expect(said).to_have_text("Saved.")  # at the place of the change
         expect(said).to_be_in_viewport()
         expect(chosen).to_contain_text("0.5 / 1")
 
         press(window, "e")
         rows = window.locator("#list tbody tr")
-        expect(rows).to_have_count(5 - 1)  # one has all points there
+        expect(rows).to_have_count(5 - 1)  # one team has all points there
         expect(window.get_by_label("Comment, which the teams read")).to_have_value(REASON)
         expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.5")
         assert fits(window)
         window.keyboard.press("4")
-        expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.75")  # before it is applied
+        expect(rows.nth(1).locator("td").nth(1)).to_have_text("0.75")  # not yet applied
         rows.nth(0).get_by_role("checkbox").press("Space")
         window.get_by_label("Comment, which the teams read").focus()
         press(window, "Enter")
@@ -151,7 +151,7 @@ def test_a_class_is_gone_through_by_its_keys(show, tmp_path):
 
 
 def test_two_at_once_see_what_the_other_did(show):
-    """On one database, the other's change is announced; a change over it is refused."""
+    """If two TAs change one class, each sees the other's change, and none is overwritten."""
     if why := postgres.missing():
         pytest.skip(why)
     with postgres.running() as place:
@@ -191,7 +191,7 @@ def test_two_at_once_see_what_the_other_did(show):
 
 
 def test_an_anonymous_class_shows_no_name(show, tmp_path):
-    """Neither on a page that a browser shows, nor in any address that it requests."""
+    """An anonymous class shows no name on any page or in any address that the browser requests."""
     grades = write_class(tmp_path / "g", anonymous=True)
     with Gradebook(grades) as book:
         real = {entry.submission for entry in book.entries()} - {"broken"}

@@ -1,6 +1,6 @@
-"""The desk's server is killed at random: confirmed changes survive, and nothing is half done.
+"""If the desk's server is killed at random, confirmed changes survive and none is half done.
 
-A change is confirmed by the answer to its form; a regrade, by the page that says it is done.
+A change is confirmed by the answer to its form; grading again, by the page that says it is done.
 """
 
 import http.client
@@ -34,11 +34,11 @@ _RECORD = some_files(most=1)[0][1]
 
 @dataclass(kw_only=True)
 class _Save:
-    """Saves of new titles of a submission, one after the other."""
+    """Save new titles of a submission, one after the other."""
 
     folder: Path
     page: str = "/student/0/"
-    longest: float = 1.5  # s within which the server is killed
+    longest: float = 1.5  # longest time before the kill, in s
     sent: int = 0
     confirmed: list[int] = field(default_factory=list)
 
@@ -60,9 +60,9 @@ class _Save:
 
 @dataclass(kw_only=True)
 class _Upload(_Save):
-    """Uploads of recordings of different lengths.
+    """Upload recordings of different lengths.
 
-    The answer comes when the table is written too.
+    The desk answers an upload only after it has written the recording's table in the file too.
     """
 
     longest: float = 4.0
@@ -87,7 +87,7 @@ class _Upload(_Save):
 
 @dataclass(kw_only=True)
 class _Override(_Save):
-    """Points by hand, each with its number as the reason."""
+    """Give points by hand, each time with the number of the change as the reason."""
 
     page: str = "/grades/0/"
     longest: float = 0.8
@@ -120,7 +120,7 @@ class _Override(_Save):
 
 @dataclass(kw_only=True)
 class _Regrade(_Save):
-    """Grading again with a changed submission, beside one with points by hand."""
+    """Grade a changed submission again, in a class where another has points by hand."""
 
     page: str = "/grades/0/"
     longest: float = 20.0
@@ -135,7 +135,7 @@ class _Regrade(_Save):
             book.finish(Batch(keys=(outcome.key,), shared={}), rubric=two_cart_rubric())
             book.override("team-04", "laws", 0.5, why="as told", by="Ada")
         self.team = a_submission(self.folder.with_name("team-x"), "two-cart")
-        self.rubric = self.folder.with_name("lab.toml")  # its name is that of the class
+        self.rubric = self.folder.with_name("lab.toml")  # the class has the name of this file
         shutil.copy(RUBRICS / "throne-2dof.toml", self.rubric)
 
     def act(self, who: Visitor) -> None:
@@ -163,7 +163,10 @@ def _whole(folder: Path) -> None:
 
 
 def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
-    """Kill the server many times, check its data each time; return what was confirmed."""
+    """Kill the server many times and check its data after each;
+
+    return how many changes were confirmed.
+    """
     draw = random.Random(seed)
     work.prepare()
     command = [sys.executable, "-m", "pipeline", "desk", work.folder, "--no-browser"]
@@ -175,10 +178,13 @@ def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
 
 
 def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
-    """Make one change after the other; the desk's own processes end with it."""
+    """Make one change after another until the desk is killed;
+
+    its own processes must end with it.
+    """
     assert desk.stderr is not None
     who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []
-    assert who.get(work.page).status == 200  # the processes that it needs are running
+    assert who.get(work.page).status == 200  # the processes that the page needs are running
 
     def end() -> None:
         started_by_it.extend(psutil.Process(desk.pid).children(recursive=True))
@@ -202,7 +208,7 @@ def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> N
 
 @pytest.mark.parametrize("work", [_Override, _Upload, _Regrade])
 def test_a_kill_loses_nothing(work, tmp_path):
-    """Once of each."""
+    """A confirmed override, upload or regrade is not lost if the server is killed."""
     kill_again_and_again(work(folder=tmp_path / "it"), kills=1, seed=1)
 
 
@@ -211,5 +217,5 @@ def test_a_kill_loses_nothing(work, tmp_path):
     ("work", "kills"), [(_Override, 18), (_Upload, 16), (_Regrade, 16), (_Save, 5)]
 )
 def test_fifty_kills_lose_nothing(work, kills, tmp_path):
-    """At random moments of overrides, uploads and regrades, and five of saves."""
+    """After 50 kills of the server during changes, and 5 during saves, nothing is lost."""
     assert kill_again_and_again(work(folder=tmp_path / "it"), kills=kills, seed=2) > 0

@@ -1,4 +1,4 @@
-"""The pages of bench and instructor in a real browser, from the start to the end."""
+"""The desk's pages for the bench and for instructors, in a real browser."""
 
 import re
 
@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("work_here")
 
 
 def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeypatch):
-    """From the first page to a session: keep a run, record the next, end another, then the rest."""
+    """In a session one run is kept, the next recorded, another ended, then all others recorded."""
     monkeypatch.chdir(tmp_path)
     work = write_work(
         tmp_path / "team",
@@ -84,9 +84,9 @@ def test_a_session_is_begun_watched_and_decided_on(show, tmp_path, real, monkeyp
 
 
 def test_an_exploration_is_watched_and_steered(show, tmp_path):
-    """After a veto another is chosen, your own experiment comes next, Esc ends.
+    """In an exploration you can veto an experiment, add your own, and end with Esc.
 
-    The diary shows it.
+    The diary shows each of these decisions.
     """
     work = a_recorded_cart(tmp_path / "team")
     with emulator("--speed", "8", preset="throne-1dof") as bench, DeskServer(folder=work) as server:
@@ -128,7 +128,7 @@ def test_an_exploration_is_watched_and_steered(show, tmp_path):
 
 
 def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
-    """Tick an effect, move its slider, see the picture change; the exercise opens."""
+    """An instructor makes an exercise by ticking an effect and moving its slider."""
     out = tmp_path / "exercise"
     with DeskServer() as server:
         window = show(server.url, size=WIDE)
@@ -144,7 +144,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
         until(lambda: window.locator("#hidden img").get_attribute("src") != before)
         expect(window.locator("#hidden li")).to_contain_text("coulomb_friction on cart 1")
         expect(window.locator("#result")).to_have_text("1 effect is hidden in throne-2dof.")
-        expect(window.get_by_label("Masses")).to_be_hidden()  # of an own chain
+        expect(window.get_by_label("Masses")).to_be_hidden()  # of a chain of one's own
         assert fits(window)
         window.get_by_label("Folder").fill(str(out))
         window.get_by_role("button", name="Make it").click()
@@ -161,7 +161,7 @@ def test_an_exercise_is_made_of_what_is_seen(show, tmp_path):
 
 
 def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_path, monkeypatch):
-    """From a shipped one; errors appear and disappear while typing; no mouse is needed."""
+    """A rubric is copied from a shipped one, changed, checked and saved by keyboard."""
     monkeypatch.chdir(tmp_path)
     write_class_of_two(tmp_path / "graded")
     path = tmp_path / "lab.toml"
@@ -207,7 +207,7 @@ def test_a_rubric_is_begun_changed_previewed_and_saved_by_keyboard(show, tmp_pat
 
 
 def test_a_picture_of_an_effect_is_drawn_on_a_phone(show):
-    """Once its row is opened."""
+    """On a phone an effect's picture is drawn once its row is opened."""
     with DeskServer() as server:
         window = show(server.url)
         window.goto(f"{window.url}effects/")

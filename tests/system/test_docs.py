@@ -19,7 +19,7 @@ COMMANDS = get_command(app).commands  # pyright: ignore[reportAttributeAccessIss
 
 
 def examples(page: Path) -> Iterator[tuple[list[str], int, bool]]:
-    """Yield arguments, stated exit status, and whether it is slow, for every command."""
+    """Yield each command of a page: arguments, stated exit status, and whether it is slow."""
     for block in _BLOCK.findall(page.read_text(encoding="utf-8")):
         for line in block.splitlines():
             command, _, remark = line.partition("#")
@@ -51,9 +51,9 @@ TUTORIALS = [page for page in PAGES if page.name.startswith(("tutorial", "comman
 @pytest.mark.sample
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
-    """From an empty folder, every command ends with the stated exit status.
+    """Each command of a page, typed in an empty folder, ends with the stated exit status.
 
-    A quoted line about open questions is what the page's own commands print.
+    If the page quotes a line about open questions, its own commands print that line.
     """
     assert run_page(page, monkeypatch, tmp_path, slow=False) >= 4
     text, printed = page.read_text(encoding="utf-8"), capsys.readouterr().err
@@ -64,7 +64,7 @@ def test_what_a_page_says_to_type_works(page, monkeypatch, tmp_path, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_the_slow_commands_of_a_page_work_too(page, monkeypatch, tmp_path):
-    """The same for the slow commands, such as the gap workflow."""
+    """The slow commands of a page also end with the exit status that the page states."""
     run_page(page, monkeypatch, tmp_path, slow=True)
 
 
@@ -82,7 +82,7 @@ def test_every_command_and_option_is_documented(command):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_somewhere(page):
-    """Every linked or shown file exists, and so does the heading that a link names."""
+    """Every linked or shown file exists, and so does every heading that a link names."""
     for target in _LINK.findall(page.read_text(encoding="utf-8")):
         if target.startswith(("http://", "https://")):
             continue
@@ -96,7 +96,7 @@ def test_links_lead_somewhere(page):
 
 
 def test_every_picture_is_shown_somewhere():
-    """Every picture is shown on some page."""
+    """Every picture in docs is shown on at least one page."""
     shown = {
         (page.parent / target).resolve()
         for page in PAGES
@@ -107,7 +107,7 @@ def test_every_picture_is_shown_somewhere():
 
 
 def test_the_files_that_contributors_are_sent_to_are_there():
-    """Every path in CONTRIBUTING.md exists, unless the reader should create it."""
+    """Every path in CONTRIBUTING.md exists, unless the reader is asked to create it."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     paths = re.findall(r"`((?:pipeline|tests|docs|templates|rubrics)/[\w./-]+)`", text)
     assert len(paths) > 30
@@ -116,7 +116,7 @@ def test_the_files_that_contributors_are_sent_to_are_there():
 
 
 def test_the_hooks_before_a_commit_are_the_checks_of_ci():
-    """Each call of ruff, pyright and mkdocs in `.ci/run` has a hook that is as strict."""
+    """For each call of ruff, pyright and mkdocs in `.ci/run` there is a hook that is as strict."""
     checked = re.findall(
         r"^(?:\w+=\S+ )?((?:ruff|pyright|mkdocs)\b.*)", (ROOT / ".ci/run").read_text(), re.MULTILINE
     )

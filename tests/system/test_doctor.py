@@ -1,4 +1,4 @@
-"""`cartlab doctor` says what is true of this installation."""
+"""`cartlab doctor` describes this installation truly."""
 
 import json
 import os
@@ -8,7 +8,7 @@ from tests.helpers.commandline import cartlab, cartlab_here
 
 
 def test_all_that_is_needed_works_here():
-    """Each needed package has its installed version; the text and the JSON agree."""
+    """`doctor` shows the installed version of each needed package; its text and JSON agree."""
     told, text = cartlab_here("doctor", "--json"), cartlab_here("doctor")
 
     assert (told.returncode, text.returncode) == (0, 0), told.stdout
@@ -24,7 +24,7 @@ def test_all_that_is_needed_works_here():
 
 
 def test_a_package_that_does_not_load_is_named(tmp_path, monkeypatch):
-    """Exit status 1, the package, and what it raised."""
+    """If a package cannot be loaded, `doctor` names it with its error and ends with status 1."""
     (tmp_path / "yaml.py").write_text("raise ImportError('its library is gone')")
     path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
     monkeypatch.setenv("PYTHONPATH", path)

@@ -58,7 +58,7 @@ def _both(library, encoders=2):
     return FirmwareCore(library, description), ReferenceCore(description)
 
 
-# ----------------------------------------------------------------- equal to the reference
+# ------------------------------------------------------------- equal to the reference
 
 FREQUENCIES = st.floats(1e-3, 1e3) | st.floats(0.1, 10.0)
 GAINS = st.floats(-1e3, 1e3) | st.sampled_from([0.0, 1e9, -1e9, 1e-9])
@@ -93,7 +93,7 @@ def _damaged(draw):
 BYTES = COMMANDS | _damaged() | st.text("dgfczskh?;qtwo01.+-e \n", max_size=40).map(str.encode)
 TICKS = st.tuples(
     st.lists(st.integers(-3000, 3000), min_size=3, max_size=3),
-    st.integers(0, 60),  # ms to the next
+    st.integers(0, 60),  # ms until the next tick
 )
 
 
@@ -127,7 +127,7 @@ def test_any_session_is_that_of_the_reference(library, encoders, session):
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave != Wave.MULTISINE])
 def test_whole_runs_are_those_of_the_reference(library, wave):
-    """Ten seconds of each wave at an odd frequency agree line by line, to the last one."""
+    """For ten seconds of each wave at an odd frequency, firmware and reference send equal lines."""
     firmware, reference = _both(library)
     start = Start(wave=wave, frequency=3.7, amplitude=4321, cycles=37)
     for core in (firmware, reference):
@@ -144,7 +144,10 @@ def test_whole_runs_are_those_of_the_reference(library, wave):
 
 @pytest.mark.parametrize("end", [0.5, 2.0, 30.0])
 def test_chirps_end_where_they_are_told(library, end):
-    """Below their start frequency, at it (a sine), and above."""
+    """A chirp ends at the frequency asked for, be it below, above or equal to its start (a sine).
+
+    below its start, equal to it (a sine), or above it.
+    """
     firmware, reference = _both(library)
     start = Start(wave=Wave.CHIRP, frequency=2.0, amplitude=1500, cycles=8)
     for core in (firmware, reference):
@@ -160,7 +163,7 @@ def test_chirps_end_where_they_are_told(library, end):
     [PidGains(kp=2.0, ki=3.0, kd=0.05), StateGains(gains=(3.0, 0.2, -1.0, 0.1), prefilter=2.0)],
 )
 def test_loops_are_those_of_the_reference(library, gains):
-    """Both laws on a bench that answers: a mass pushed by the duty, rounded to counts."""
+    """With both control laws, firmware and reference agree on a bench that moves."""
     firmware, reference = _both(library)
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=1.0, amplitude=700, cycles=3)
     for core in (firmware, reference):
@@ -173,10 +176,10 @@ def test_loops_are_those_of_the_reference(library, gains):
         assert firmware.take() == reference.take()
         v += 1e-3 * (30.0 * duty - 2.0 * v)
         x += 1e-3 * v
-    assert abs(x) > 100  # the loop did something
+    assert abs(x) > 100  # the loop moved the mass
 
 
-# ------------------------------------------------------------------- a whole bench
+# ----------------------------------------------------------------- a whole bench
 
 SUBMISSION = """
 version = 1
@@ -218,7 +221,7 @@ class SlowToBite(FirmwareCore):
     """A controller whose watchdog waits 10 s for a host on a busy machine."""
 
     def tick(self, counts: Sequence[int], *, stamp: int, now: int) -> int:
-        """Return the duty that acts from now on."""
+        """Advance by one tick, and return the duty count that acts from now on."""
         return super().tick(counts, stamp=stamp, now=now // 100)
 
 
@@ -226,7 +229,7 @@ class SlowToBite(FirmwareCore):
 @pytest.mark.sample
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals")
 def test_acquire_records_with_the_firmware(library, tmp_path):
-    """Behind a pty with simulated carts it records a step, then the loop designed from it."""
+    """`acquire` records a step from firmware on a pty with simulated carts, then a closed loop."""
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
@@ -235,18 +238,18 @@ def test_acquire_records_with_the_firmware(library, tmp_path):
         acquire(tmp_path, port=server.address, only=["step", "control"])
     analysis = analyse(load_submission(tmp_path))
     loop = next(check for check in analysis.hardware if check.loop == "closed")
-    # Noise and rounding are 0.2 % of the motion and the model is accurate to about 1 %; gains in
-    # wrong units, or at the wrong encoder, would leave tens of percent.
+    # Noise and rounding are 0.2 % of the motion, and the model is accurate to about 1 %. Gains in
+    # wrong units, or for the wrong encoder, would be off by tens of percent.
     assert loop.nrmse < 0.02
     assert loop.settling_measured is not None
-    assert loop.settling_measured < 0.8  # s, as designed
+    assert loop.settling_measured < 0.8  # s, the settling time of the design
 
 
 # ------------------------------------------------------------------- guards
 
 
 def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
-    """The first heartbeat arms the watchdog; it cuts at 100 ms, not at 99; a reset disarms it."""
+    """The first heartbeat arms the watchdog, which cuts the motor at 100 ms; a reset disarms it."""
     core, _ = _both(library)
     start = encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=-900))
     core.receive(start)
@@ -258,7 +261,7 @@ def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
     core.receive(b"k;")
     assert (duty(5010), duty(5109), duty(5110)) == (-900, -900, 0)
     core.receive(b"k;")
-    assert duty(5111) == 0  # a heartbeat alone starts nothing
+    assert duty(5111) == 0  # a heartbeat alone does not start the motor
     core.receive(b"z;" + start)
     assert core.tick((0, 0), stamp=0, now=9000) == 0
     assert core.tick((0, 0), stamp=600_000, now=9900) == -900
@@ -267,7 +270,7 @@ def test_the_motor_is_cut_100_ms_after_the_last_heartbeat(library):
 STOPPING = [
     b"s;", b";s;", b"z;", b"\r\n s\t;", b"d;q;o;s;", b"d;s;k;", b"d;s;;", b"g;1;s;",
     b"noises;", b"noisez;", b"9" * 50 + b"s;",
-    b"\r\nd; q;o\r;\no;\t1 ;5;1;",  # a start, whose first half is zero
+    b"\r\nd; q;o\r;\no;\t1 ;5;1;",  # a start command; the first half period of its wave is zero
 ]  # fmt: skip
 NOT_STOPPING = [
     b"s", b"d;s;", b"k;", b"?;", b"noise;", b"ss k;", b"s\x00;", b"d;s;o;o;1;5;0;",
@@ -281,7 +284,7 @@ NOT_STOPPING = [
     [(data, True) for data in STOPPING] + [(data, False) for data in NOT_STOPPING],
 )
 def test_no_lost_byte_swallows_a_stop(library, data, stops):
-    """A stop after any bytes stops; other bytes let the run go on; the reference agrees."""
+    """A stop command works after any damaged bytes, and without one the run goes on."""
     duties = []
     for core in _both(library):
         core.receive(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=70)))
@@ -305,7 +308,7 @@ def test_a_reset_forgets_gains_and_chirp_end(library):
 
 
 def test_the_clock_may_go_round(library):
-    """A run and the watchdog go on when the 32-bit milliseconds wrap around."""
+    """A run and the watchdog continue when the 32-bit counter of milliseconds overflows."""
     core, _ = _both(library)
     core.receive(b"k;" + encode(Start(wave=Wave.SQUARE, frequency=0.1, amplitude=50)))
     turn = 2**32
@@ -319,7 +322,7 @@ def test_the_clock_may_go_round(library):
 
 
 def test_a_host_that_does_not_read_loses_whole_lines(library):
-    """Output without room is dropped line by line, so that every line is whole."""
+    """If the host does not read, the firmware drops whole lines and never part of one."""
     core, _ = _both(library)
     core.receive(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=4000, cycles=9)))
     for stamp in range(500):
@@ -327,12 +330,12 @@ def test_a_host_that_does_not_read_loses_whole_lines(library):
     sent = core.take()
     readings = [parse_reading(line) for line in sent.splitlines()]
     assert sent.endswith(b"\n")
-    assert 200 < len(sent) < 256  # the ring's room, minus a line
+    assert 200 < len(sent) < 256  # the room of the ring buffer, less one line
     assert [reading.ms for reading in readings if reading] == list(range(len(readings)))
 
 
 def test_the_answer_to_a_query_is_a_description(library):
-    """The firmware hands out the description it was built with."""
+    """The firmware answers the query `?` with the description that it was built with."""
     core, _ = _both(library)
     core.receive(b"?;")
     assert parse_description(core.take()) == _description()
@@ -353,8 +356,8 @@ def test_noise_breaks_nothing(tmp_path):
         assert done.returncode == 0, done.stderr
 
 
-# The functions that the sketch needs of a 32-bit board and of Teensy's additions to Arduino,
-# without bodies.
+# The functions of a 32-bit board, and of Teensy's additions to Arduino, that the sketch needs. They
+# have no bodies.
 ARDUINO = """
 #include <stdint.h>
 #include <stdlib.h>
@@ -373,7 +376,7 @@ extern Line Serial;
 
 @pytest.mark.parametrize("options", [[], ["-DTEENSYDUINO"], ["-DMOTOR_DAC=40"]])
 def test_the_sketch_compiles_for_other_boards(tmp_path, options):
-    """The parts of the sketch that no simulated board runs fit together, without a warning."""
+    """The parts of the sketch for boards that are not simulated compile without a warning."""
     compiler = shutil.which("c++")
     if compiler is None:
         pytest.skip("no C++ compiler is here")
@@ -406,7 +409,7 @@ def test_numbers_are_read_as_python_reads_them(library, size, sign, form):
     "text", ["12345678901234567890123", "0.1234567890123456789012", "98765432109876543210.5e-3"]
 )
 def test_more_digits_than_fit_keep_their_place(library, text):
-    """Beyond 18 digits only the magnitude counts: a double cannot hold more."""
+    """Of a number with more than 18 digits, as many are kept as a double can hold."""
     read = ctypes.c_double()
     assert library.read_number(text.encode(), False, ctypes.byref(read))
     assert read.value == pytest.approx(float(text), rel=1e-15)
@@ -417,13 +420,13 @@ def test_more_digits_than_fit_keep_their_place(library, text):
     ["", "+", ".", "e5", "1e", "1e+", "--1", "1.2.3", "0x10", "inf", "nan", "1_0", "1 ", "1e999"],
 )
 def test_what_is_no_number_is_refused(library, text):
-    """Neither words nor halves of numbers nor infinities are taken for a number."""
+    """Words, incomplete numbers and infinities are refused as numbers."""
     assert not library.read_number(text.encode(), False, ctypes.byref(ctypes.c_double()))
 
 
 @given(value=st.integers(-(2**31), 2**31 - 1))
 def test_integers_are_written_as_python_writes_them(library, value):
-    """All 32 bits of them."""
+    """Every 32-bit integer is written as Python writes it."""
     text = ctypes.create_string_buffer(12)
     length = library.write_integer(text, value)
     assert text.raw[:length] == str(value).encode()
@@ -437,12 +440,12 @@ class _Quadrature(ctypes.Structure):
     )
 
 
-RING = (0b00, 0b10, 0b11, 0b01)  # the channels A and B, one forward step after the other
+RING = (0b00, 0b10, 0b11, 0b01)  # states of channels A and B, in the order of forward steps
 
 
 @given(steps=st.lists(st.integers(-1, 1), max_size=60))
 def test_every_edge_of_an_encoder_counts(library, steps):
-    """Counts are the steps around the ring of states, forwards minus backwards, all of them."""
+    """An encoder's count is the number of forward edges minus the number of backward edges."""
     encoder, at = _Quadrature(), 0
     for step in steps:
         at += step
@@ -452,7 +455,7 @@ def test_every_edge_of_an_encoder_counts(library, steps):
 
 @pytest.mark.parametrize("at", range(4))
 def test_a_transition_that_cannot_be_is_counted_as_missed(library, at):
-    """If both channels change at once, the count stays and goes on from the new state."""
+    """If both channels change at once, the count stays and counting goes on from the new state."""
     encoder = _Quadrature(state=RING[at])
     for state in (RING[(at + 2) % 4], RING[(at + 3) % 4]):
         library.quadrature_update(ctypes.byref(encoder), state)

@@ -31,7 +31,7 @@ from tests.helpers.firmware_mega import Mega, build_sketch, memory, missing
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=f"{missing()} is not here")
 
-PERIOD = 0.004  # s, of the Mega's ticks at 115200 baud
+PERIOD = 0.004  # s of the Mega's time, at 115200 baud
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +41,7 @@ def program(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def board(program, tmp_path_factory):
-    """One board for all tests; each resets it."""
+    """One simulated board for all tests; each test resets it."""
     return Mega(program, tmp_path_factory.mktemp("board"))
 
 
@@ -54,14 +54,14 @@ def mega(board):
 
 
 def _readings(mega: Mega) -> list[Reading]:
-    *lines, _ = mega.take().split(b"\n")  # the last one may still be on its way
+    *lines, _ = mega.take().split(b"\n")  # the last line may still be on its way
     readings = [parse_reading(line) for line in lines]
     assert None not in readings
     return [reading for reading in readings if reading]
 
 
 def test_the_sketch_leaves_room(program):
-    """It uses less than a quarter of the Mega's flash and RAM; the rest is for the stack."""
+    """The sketch uses less than a quarter of the Mega's flash and RAM."""
     flash, ram = memory(program)
     assert flash < 64 * 1024
     assert ram < 2 * 1024
@@ -77,14 +77,14 @@ def _describe(mega: Mega) -> Description:
 
 
 def test_it_says_what_it_is(mega):
-    """Its answer to a query is a description in the protocol's own form."""
+    """The board answers a query with a description in the form of the protocol."""
     description = _describe(mega)
     assert (description.encoders, description.period) == (2, PERIOD)
     assert description.commands == frozenset("cfks")
 
 
 def test_every_edge_at_the_pins_counts(mega):
-    """Thousands of edges back and forth, on two encoders at 50,000 a second, are all counted."""
+    """Thousands of edges back and forth, on two encoders at 50,000 per second, are all counted."""
     rng = np.random.default_rng(5)
     turns = rng.integers(-60, 61, size=(50, 2))
     mega.send(encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=1000)))
@@ -97,7 +97,7 @@ def test_every_edge_at_the_pins_counts(mega):
 
 
 def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
-    """Built for three encoders, the sketch also counts at pins 20 and 21, and says so."""
+    """If it is built for three encoders, the sketch also counts at pins 20 and 21, and says so."""
     mega = Mega(build_sketch(tmp_path, encoders=3), tmp_path)
     mega.run(0.05)
     assert _describe(mega).encoders == 3
@@ -110,7 +110,7 @@ def test_a_third_encoder_is_a_change_of_one_line(tmp_path):
 
 
 def test_a_run_lasts_and_ticks_as_told(mega):
-    """A tenth of a second gives 25 lines, 4 ms apart, and then the motor is off."""
+    """A run of a tenth of a second sends 25 lines, 4 ms apart, and then the motor is off."""
     mega.send(encode(Start(wave=Wave.DELTA, frequency=10.0, amplitude=-4096)))
     mega.run(0.03)
     assert mega.duty == -4096
@@ -121,9 +121,9 @@ def test_a_run_lasts_and_ticks_as_told(mega):
 
 @pytest.mark.parametrize("wave", [wave for wave in Wave if wave not in "dqm"])
 def test_waves_are_those_of_the_reference(mega, wave):
-    """Numbers of 32 bits differ by at most one count.
+    """Each wave of the board differs from that of the reference by at most one duty count.
 
-    2000 counts are exact to a thousandth of one.
+    The board's floats have 32 bits, which hold 2000 counts to a thousandth of a count.
     """
     start = Start(wave=wave, frequency=2.0, amplitude=2000)
     mega.send(encode(start))
@@ -146,10 +146,10 @@ def test_waves_are_those_of_the_reference(mega, wave):
     [PidGains(kp=0.8, ki=1.0, kd=0.04), StateGains(gains=(0.9, 0.05, 0.2, 0.01), prefilter=1.5)],
 )
 def test_it_closes_the_loop_over_its_pins(mega, gains):
-    """A simulated cart with encoder edges and PWM follows; duties agree to the count.
+    """A closed loop over the board's pins holds a simulated cart, with the duties of the reference.
 
-    The reference gets each line as it is, so only rounding to 24 bits is left. A duty of some
-    thousand counts is exact to a thousandth, and may round either way.
+    The reference gets the board's own lines, so only rounding to 24 bits differs. A duty of some
+    thousand counts is exact to a thousandth, but may round up or down.
     """
     start = Start(wave=Wave.SQUARE, encoder=1, frequency=0.5, amplitude=800)
     mega.send(encode(gains) + encode(start))
@@ -174,7 +174,7 @@ def test_it_closes_the_loop_over_its_pins(mega, gains):
 
 
 def test_a_silent_host_stops_the_motor(mega):
-    """The motor's pins go off 100 ms after the last heartbeat, at the next tick."""
+    """The motor's pins go off at the first tick after 100 ms without a heartbeat."""
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=1e-3, amplitude=0)))
     mega.send(b"k;" + encode(Start(wave=Wave.SINE, frequency=1.0, amplitude=3000)))
     before = mega.clock
@@ -183,12 +183,12 @@ def test_a_silent_host_stops_the_motor(mega):
         assert mega.clock - before < 0.1
     while mega.duty:
         mega.run(0.0005)
-    # The heartbeat came up to 3 ms before the run began, at most a tick before the motor moved.
+    # The heartbeat came up to 3 ms before the run began; the motor moved at most a tick after that.
     assert 0.095 < mega.clock - before < 0.115
 
 
 def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
-    """A wire that flickers 250,000 times a second leaves no time for a tick: the board resets."""
+    """If a loose wire sends 250,000 edges per second, the board resets and the motor stops."""
     mega = Mega(program, tmp_path)
     mega.run(0.05)
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
@@ -198,14 +198,14 @@ def test_a_storm_of_edges_does_not_keep_the_motor_on(program, tmp_path):
     assert mega.duty == 0
     mega.flicker(1, 0.3, every=4e-6)
     assert mega.duty == 0
-    mega.run(0.3)  # the wire is whole again: the board answers, and rests
+    mega.run(0.3)  # the wire no longer flickers: the board answers, and the motor is off
     mega.take()
     assert _describe(mega).encoders == 2
     assert mega.duty == 0
 
 
 def test_a_stop_stops_the_motor_at_the_next_tick(mega):
-    """Three bytes on the line and one tick after the stop is sent, the motor is off."""
+    """The motor is off one tick after the three bytes of a stop have arrived."""
     mega.send(encode(Start(wave=Wave.SQUARE, frequency=10.0, amplitude=2000, cycles=9)))
     mega.run(0.08)
     assert mega.duty == 2000
@@ -235,13 +235,13 @@ amplitude = 0.03
 frequency = 0.1
 settle = 0.1
 """
-STEP = 1e-3  # s between exchanges of data between carts and board
+STEP = 1e-3  # s between two exchanges of data between carts and board
 
 
 def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool]) -> None:
-    """Let board and carts drive each other in real time, or as fast as possible."""
+    """Connect board and simulated carts, in real time or as fast as possible."""
     at, ahead = carts.counts(), mega.clock - time.monotonic()
-    volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in the carts' own
+    volts = 5 / 4096 / carts.input_per_count  # the sketch's duty counts in those of the carts
     while not until():
         time.sleep(max(0.0, mega.clock - time.monotonic() - ahead))
         mega.send(link.receive())
@@ -256,7 +256,10 @@ def _serve(mega: Mega, carts: VirtualCarts, link: Link, until: Callable[[], bool
 
 @pytest.mark.slow
 def test_acquire_records_with_the_board(mega, tmp_path):
-    """Host, pty, UART, PWM, carts, encoder pins and back: the gain is that of the cart."""
+    """`acquire` records a step through pty, serial line, PWM, carts and encoder pins.
+
+    The gain of the recorded step is that of the carts.
+    """
     (tmp_path / "submission.toml").write_text(SUBMISSION, encoding="utf-8")
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
     bench = prepare_bench(preset="throne-1dof")
@@ -264,6 +267,6 @@ def test_acquire_records_with_the_board(mega, tmp_path):
     with closing(open_link("pty")) as link, kept_going(partial(_serve, mega, carts, link)):
         acquire(tmp_path, port=link.address, only=["step"])
     [gain] = analyse(load_submission(tmp_path)).step_gains
-    # A level of 390 encoder counts, a noise of a fifth of one: a tenth of a percent; after 5 s a
-    # swing of 1 % is left, and enters the mean once.
+    # The level is 390 encoder counts and the noise a fifth of one: a tenth of a percent. After 5 s
+    # a swing of 1 % is left, which changes the mean by as much.
     assert gain.gain == pytest.approx(bench.chain.static_gains()[0], rel=0.01)

@@ -1,4 +1,4 @@
-"""A submission is the same whatever program saved its recordings."""
+"""A submission gives the same results whatever program saved its recordings."""
 
 import csv
 import json
@@ -18,7 +18,7 @@ FORMS = {"xlsx": xlsx, "tdms": tdms_of, "lvm": lvm}
 
 @pytest.fixture(scope="module")
 def teams(tmp_path_factory) -> Path:
-    """Return a class: one team's work four times, with its recordings in each form."""
+    """A class of four copies of one team's work, each with files of another format."""
     root = tmp_path_factory.mktemp("forms")
     folder = root / "csv"
     write_submission(
@@ -39,7 +39,7 @@ def teams(tmp_path_factory) -> Path:
 
 
 def test_the_report_has_the_same_numbers(teams, tmp_path):
-    """Doubles survive both forms: parameters and checks are equal to the last digit."""
+    """CSV, Excel and TDMS files of the same recordings give equal parameters and checks."""
     told = {}
     for one in ("csv", "xlsx", "tdms"):
         done = cartlab_here("report", teams / one, "--no-pdf", "--out", tmp_path / one)
@@ -50,7 +50,7 @@ def test_the_report_has_the_same_numbers(teams, tmp_path):
 
 
 def test_the_grade_has_the_same_points(teams, tmp_path):
-    """Also from LabVIEW's six decimals; and a copy in another form is found."""
+    """All file formats get the same points, LabVIEW's six decimals included; copies are flagged."""
     out = tmp_path / "grades"
     rubric = RUBRICS / "throne-1dof.toml"
     done = cartlab_here("grade", teams, "--rubric", rubric, "--out", out, "--jobs", 1)
@@ -65,7 +65,7 @@ def test_the_grade_has_the_same_points(teams, tmp_path):
 
 
 def test_inspect_and_fill_know_every_form(teams, tmp_path):
-    """From a folder of files to a submission, and what each file holds."""
+    """`inspect` and `fill` read a folder of recordings in every file format."""
     for form in FORMS:
         shutil.copytree(teams / form / "data", tmp_path / form / "data")
         done = cartlab_here("inspect", tmp_path / form, "--json")

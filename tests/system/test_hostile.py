@@ -1,4 +1,4 @@
-"""A class full of hostile submissions beside honest ones: every row is there, none escapes."""
+"""In a class with hostile submissions, each gets its row and none harms the honest ones."""
 
 import base64
 import csv
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="pipes, links an
 NOBODY = 65_534
 HONEST = ("honest-1", "honest-2")
 
-# Python itself reports what it is about to do: every process of a run logs it.
+# Python itself logs what each process of a run is about to do.
 AUDIT = """\
 import os, sys
 _log = os.open(os.environ["AUDIT_LOG"], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
@@ -78,7 +78,7 @@ def graded(request, tmp_path_factory):
     yield base, names, done
     for path in school.rglob("*"):
         if path.is_dir() and not path.is_symlink():
-            path.chmod(0o755)  # so that it can be removed
+            path.chmod(0o755)  # so that the folder can be removed
 
 
 def _small(folder: Path) -> dict[str, bytes]:
@@ -118,7 +118,7 @@ def _below(folder: Path) -> list[tuple[str, int]]:
 
 
 def test_every_hand_in_has_its_row_and_its_reason(graded):
-    """Whatever its name and content: one line of reason, and no fault of the grader."""
+    """Each hostile submission gets one line with a reason, and the grader never fails on any."""
     base, names, done = graded
     assert done.returncode == 1, done.stderr
     assert len(names) >= 100
@@ -140,17 +140,17 @@ def test_every_hand_in_has_its_row_and_its_reason(graded):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux says which file a descriptor belongs to")
 def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
-    """It writes only into its own folder, connects to nobody, and starts only Python."""
+    """Grading writes only into its own folder, makes no connection and starts only Python."""
     base, _, _ = graded
     lines = (base / "audit.txt").read_text(encoding="utf-8").splitlines()
     events = [line.partition("\t")[::2] for line in lines]
-    assert {"open", "subprocess.Popen"} <= {event for event, _ in events}  # it does listen
+    assert {"open", "subprocess.Popen"} <= {event for event, _ in events}  # it may listen
     own = (str(base / "out-"), str(base / "hook"), os.devnull)
-    compiled = ("__pycache__", "numba", "matplotlib", "fontconfig")  # caches of libraries
+    compiled = ("__pycache__", "numba", "matplotlib", "fontconfig")  # the caches of libraries
     for event, at in events:
         if event == "subprocess.Popen":
             program = at.strip("'")
-            libraries = ("fc-list", "lscpu", "uname")  # fonts, threads, the processor
+            libraries = ("fc-list", "lscpu", "uname")  # for fonts, threads and the processor
             assert program in (sys.executable, "") or Path(program).name in libraries, at
         elif event == "pickle.find_class":
             assert at.strip("'") not in ("os", "posix", "nt"), at
@@ -168,7 +168,7 @@ def test_nothing_is_written_elsewhere_and_nobody_is_called(graded):
 
 
 def test_the_honest_are_graded_as_if_they_were_alone(graded):
-    """The same bytes, no matter which other submissions are in the class."""
+    """Honest submissions get the same feedback, byte for byte, as without the hostile ones."""
     base, _, _ = graded
     _grade(base, "alone")
     for name in HONEST:
@@ -177,7 +177,7 @@ def test_the_honest_are_graded_as_if_they_were_alone(graded):
 
 
 def test_no_page_runs_or_fetches_anything_of_theirs(graded):
-    """As a browser parses it: our scripts only, no handlers, no address of another machine."""
+    """Feedback pages hold only our scripts, no event handlers, no address of another host."""
     base, _, _ = graded
     out = base / "out-school"
     pages = [out / "class.html", *sorted((out / "feedback").glob("*/feedback.html"))]
@@ -186,7 +186,7 @@ def test_no_page_runs_or_fetches_anything_of_theirs(graded):
         assert SECRET not in text
         (script,) = re.findall(r"<script[^>]*>(.*?)</script>", text, re.DOTALL)
         hashed = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-        assert f"script-src 'sha256-{hashed}'" in text  # no other would run
+        assert f"script-src 'sha256-{hashed}'" in text  # the browser would run no other script
         assert "alert(1)" not in script
         for tag, attributes in _elements(text):
             assert tag not in ("iframe", "object", "embed", "base", "form", "frame"), page
@@ -207,12 +207,12 @@ def _elements(text: str) -> Iterator[tuple[str, dict[str, str]]]:
 
 
 def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
-    """In the class's table and in the tables for learning platforms."""
+    """No cell of the class table or of a platform's table is a formula; all JSON is valid."""
     base, _, _ = graded
     out = base / "out-school"
     for lms in ("canvas", "moodle", "gradescope"):
         done = cartlab_here("export", out, "--lms", lms, "--out", base / "lms")
-        assert done.returncode == 1  # some with points have no name at all
+        assert done.returncode == 1  # some with points have no name
         assert "so not exported" in done.stderr
     tables = [out / "grades.csv", *(base / "lms").glob("*.csv")]
     assert len(tables) == 4
@@ -240,7 +240,7 @@ def test_no_cell_is_a_formula_and_all_json_is_valid(graded):
     not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root changes user"
 )
 def test_what_may_not_be_read_is_a_row(tmp_path_factory):
-    """A folder or file without read permission costs its own row, at whichever step."""
+    """A folder or file without read permission changes only the row of its own submission."""
     base = tmp_path_factory.mktemp("rights")
     for name in ("folder", "inside", "toml", "listed", "good"):
         (base / "class" / name / "data").mkdir(parents=True)
@@ -270,7 +270,7 @@ def test_what_may_not_be_read_is_a_row(tmp_path_factory):
 
 
 def test_what_goes_away_or_changes_meanwhile_is_a_row(tmp_path):
-    """A file that is gone when it is read, and one that was replaced by then."""
+    """If a file disappears or is replaced while it is graded, only its own row says so."""
     for name in ("gone", "changed"):
         (tmp_path / "class" / name).mkdir(parents=True)
         (tmp_path / "class" / name / "submission.toml").write_text(

@@ -61,7 +61,7 @@ def source(tmp_path):
 
 
 def put(folder, name: str, text: str | bytes, *, at: int) -> None:
-    """Write a file with a given time of change."""
+    """Write a file with a given modification time."""
     path = folder / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     os.utime(path, (at, at))
@@ -74,7 +74,7 @@ def take(work, source) -> tuple[list, Notes]:
 
 
 def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
-    """In the order they were written, each matches the next item; a stray file is kept as such."""
+    """Each exported file becomes the plan's next recording, in the order written."""
     put(source, "B.txt", dwell(2.0), at=200)
     put(source, "A.txt", STEP, at=100)
     put(source, "extra run!.txt", dwell(5.0), at=150)
@@ -89,13 +89,13 @@ def test_files_become_the_recordings_that_the_plan_asks_for(work, source):
     assert [e.kind for e in submission.experiments] == ["step", "sine", "sine"]
     assert [e.frequency for e in submission.experiments] == [None, pytest.approx(5, rel=1e-2), 2.0]
     record = read_data(submission).records[0]
-    # 0.5 V and 400 counts a volt, of 0.00227 cm.
+    # 0.5 V, and 400 counts per volt at 0.00227 cm per count.
     assert record.y[0].max() == pytest.approx(200 * 0.00227)
     assert "# ours" in (work / "submission.toml").read_text(encoding="utf-8")
 
 
 def test_a_file_is_taken_once(work, source):
-    """A second session recognises copies of imported files, also under another name."""
+    """A file that was imported before is recognised by a second session, under any name."""
     put(source, "A.txt", STEP, at=100)
     assert len(take(work, source)[0]) == 1
     put(source, "A again.txt", STEP, at=300)
@@ -104,7 +104,7 @@ def test_a_file_is_taken_once(work, source):
 
 
 def test_the_usb_logger_is_known(tmp_path, source):
-    """`Time [us],Displacement [mm]` without an input is a decay of the one cart it measures."""
+    """A file headed `Time [us],Displacement [mm]` is a decay of the one cart it measures."""
     work = write_work(tmp_path / "one", [])
     toml = work / "submission.toml"
     text = toml.read_text(encoding="utf-8")
@@ -121,7 +121,7 @@ def test_the_usb_logger_is_known(tmp_path, source):
 
 
 def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
-    """A bare table becomes the next item of the plan; the message asks to check its columns."""
+    """A table without headings becomes the plan's next item; a message asks to check it."""
     u = np.where((T > 1) & (T < 3), 0.5, 0.0)
     rows = "".join(
         f"{t:.5f}\t{round(400 * v)}\t{round(200 * v + i % 2)}\t{v:.4f}\n"
@@ -144,7 +144,7 @@ def test_a_matrix_without_names_gets_its_columns_guessed(work, source):
     ],
 )
 def test_what_is_no_record_is_refused_and_said(work, source, name, content, why):
-    """A file that cannot be used stays where it is, with one line; nothing else changes."""
+    """A file that cannot be used stays where it is and gets one line; nothing else changes."""
     before = (work / "submission.toml").read_bytes()
     put(source, name, content, at=1)
     taken, notes = take(work, source)
@@ -155,7 +155,7 @@ def test_what_is_no_record_is_refused_and_said(work, source, name, content, why)
 
 
 def test_an_export_for_matlab_is_a_record(work, source):
-    """`NAME.m` with its matrix in brackets is imported like any export."""
+    """A MATLAB file `NAME.m` with a matrix in brackets is imported like any export."""
     heading, matrix = STEP.split("\n", 1)
     put(source, "run.m", f"% {heading}\ndata = {matrix.rstrip()};\n", at=1)
     taken, notes = take(work, source)
@@ -165,7 +165,10 @@ def test_an_export_for_matlab_is_a_record(work, source):
 
 
 def test_everything_else_in_the_folder_is_said_once(work, source):
-    """A script, a picture and a folder are named with the reason; hidden files are ignored."""
+    """A script, a picture and a folder are each named once with the reason;
+
+    hidden files are ignored.
+    """
     put(source, "plot.m", "x = load('run.txt');\nplot(x(:, 1))\n", at=1)
     put(source, "photo.JPG", b"\xff\xd8", at=2)
     put(source, "~run.txt", STEP, at=3)
@@ -186,13 +189,13 @@ def test_everything_else_in_the_folder_is_said_once(work, source):
 
 
 def test_a_file_is_waited_for_until_it_is_complete(work, source):
-    """A slow program's file is not read half-written; when the plan is done, watching ends."""
+    """A file that is still being written is not read, and watching ends when the plan is done."""
     half = len(STEP) // 2
     looks = iter(range(100))
 
     def export(seconds: float) -> None:
         look = next(looks)
-        if look in (2, 8):  # looked at again and again meanwhile
+        if look in (2, 8):  # the importer looks again and again meanwhile
             with (source / "A.txt").open("a", encoding="utf-8") as file:
                 file.write(STEP[:half] if look == 2 else STEP[half:])
         elif look == 9:
@@ -205,7 +208,7 @@ def test_a_file_is_waited_for_until_it_is_complete(work, source):
 
 
 class Tidy(Notes):
-    """A user who deletes a file as soon as a message appears."""
+    """An observer that deletes a file as soon as a message about it appears."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()
@@ -219,7 +222,7 @@ class Tidy(Notes):
 
 
 def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
-    """A file removed before it is read is skipped, and the others are imported."""
+    """A file that disappears before it is read is skipped, and the others are imported."""
     put(source, "A.txt", "no table\n", at=1)
     put(source, "B.txt", STEP, at=2)
     put(source, "C.txt", STEP, at=3)
@@ -231,7 +234,7 @@ def test_a_file_that_vanishes_between_two_looks_ends_nothing(work, source):
     sys.platform == "win32" or os.geteuid() == 0, reason="root and Windows lock otherwise"
 )
 def test_a_locked_file_is_taken_once_it_can_be_read(work, source):
-    """A file still locked by its program is reported once, and imported later."""
+    """A file that its program still locks is reported once, and imported when it can be read."""
     put(source, "A.txt", STEP, at=1)
     (source / "A.txt").chmod(0)
     waits = iter(range(9))
@@ -260,6 +263,6 @@ def test_the_command_takes_what_is_there(work, source):
 
 
 def test_a_folder_that_is_none_is_said(work, source):
-    """A missing folder gives one line."""
+    """If the folder to import from is missing, the command prints one line."""
     with pytest.raises(ConfigError, match="nowhere: not a folder"):
         Importer(work, source / "nowhere", observer=Notes())

@@ -1,4 +1,4 @@
-"""Ctrl-C while the program still loads ends it like any other program: 130, no traceback."""
+"""Ctrl-C while the program still loads ends it with status 130 and without a traceback."""
 
 import subprocess
 import sys
@@ -9,8 +9,8 @@ from tests.helpers.places import ROOT
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no such signal")
 
-# Presses Ctrl-C when the N-th module is imported: at the same moment on any machine. The first two
-# are the package itself and the command line, before anything of it runs.
+# Presses Ctrl-C when the N-th module is imported, which is the same moment on any machine. The
+# first two modules are the package itself and the command line, before any of its code runs.
 _PRESS = """
 import os, signal, sys
 at, *words = sys.argv[1:]
@@ -33,14 +33,14 @@ main()
 
 @pytest.mark.parametrize("at", [*range(3, 12), *range(12, 300, 24)])
 def test_ctrl_c_while_the_commands_load_is_quiet(at):
-    """Whichever module is being loaded: nothing has begun, so there is no message."""
+    """Ctrl-C while the command line loads ends it without a message, since no work has begun."""
     done = _pressed(at, "effects")
     assert (done.returncode, done.stderr) == (130, "")
 
 
 @pytest.mark.parametrize("at", range(400, 1300, 200))
 def test_ctrl_c_while_a_command_loads_what_it_needs_is_one_line(tmp_path, at):
-    """Numbers, figures and pages are loaded by the command that needs them, while it runs."""
+    """Ctrl-C while a command loads its libraries for numbers, figures or pages gives one line."""
     out = tmp_path / "out"
     done = _pressed(at, "report", "submissions/one-cart", "--no-pdf", "--out", str(out))
     assert done.returncode == 130

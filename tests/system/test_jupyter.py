@@ -24,7 +24,10 @@ PREFIX = "/user/ada/"
 
 @pytest.fixture
 def lab(tmp_path):
-    """A JupyterLab of Ada's, as JupyterHub starts it; its process, address and token."""
+    """A JupyterLab of the user Ada, as JupyterHub starts it;
+
+    with its process, address and token.
+    """
     pytest.importorskip("jupyterlab", reason="JupyterLab is not installed")
     pytest.importorskip("jupyter_server_proxy", reason="jupyter-server-proxy is not installed")
     if not entry_points(group="jupyter_serverproxy_servers", name="cartlab"):
@@ -74,7 +77,7 @@ def _status(url: str, **headers: str) -> int:
 
 
 def test_the_desk_opens_from_the_launcher_and_only_for_its_owner(lab, browser):
-    """Files, set-up, report and zip work below the prefix; other doors stay shut."""
+    """Files, set-up, report and zip work for the owner of the server; everyone else is refused."""
     process, url, token = lab
     context = browser.new_context(viewport={"width": 1400, "height": 900})
     context.set_default_timeout(1e3 * PATIENCE)
@@ -115,6 +118,6 @@ def test_the_desk_opens_from_the_launcher_and_only_for_its_owner(lab, browser):
     here = f"{url}cartlab/open"
     own = url.partition("/user")[0]
     assert _status(f"http://127.0.0.1:{port}/open", Origin=f"http://127.0.0.1:{port}") == 403
-    assert _status(here, Origin=own) in (401, 403)  # nobody is logged in
+    assert _status(here, Origin=own) in (401, 403)  # without a login
     assert _status(here, Origin="https://evil.example", Authorization=f"token {token}") == 403
     context.close()

@@ -1,4 +1,4 @@
-"""The live page: who may see it, what it shows in a browser, and that it never delays a run."""
+"""The live page: who may see it, what it shows, and that it never delays a recording."""
 
 import http.client
 import json
@@ -90,7 +90,7 @@ def page(folder) -> Iterator[LivePage]:
 
 
 def test_points_are_few_in_units_and_of_this_run(folder):
-    """One line in five, in volts and centimetres; a new run clears the old points."""
+    """The page gets every fifth line, in volts and centimetres; a new run clears the old points."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
     state.started(SINE)
@@ -113,7 +113,7 @@ def test_points_are_few_in_units_and_of_this_run(folder):
 
 
 def test_a_slow_reader_gets_less_and_not_later(folder):
-    """After a minute without a reader, the last twelve seconds are there and no queue has grown."""
+    """A page that has not asked for a minute gets the last twelve seconds only."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset())
     state.started(SINE)
@@ -125,7 +125,7 @@ def test_a_slow_reader_gets_less_and_not_later(folder):
 
 
 def test_the_plan_says_what_is_done_now_and_broken(folder):
-    """Each recording has its state, and a partial one its reason until it succeeds."""
+    """The plan shows the state of each recording, and why one is partial until it succeeds."""
     state = LiveState(folder)
     state.planned(PLAN, frozenset({"decay-1"}))
     state.started(SINE)
@@ -140,7 +140,7 @@ def test_the_plan_says_what_is_done_now_and_broken(folder):
 
 
 def test_an_instruction_waits_for_its_own_answer(folder):
-    """An answer to an earlier instruction does not count; closing the page ends the wait."""
+    """Only the answer to the current instruction counts; if the page ends, the wait ends too."""
     state = LiveState(folder)
     assert not state.answer(1)
     waiting = threading.Thread(target=state.confirm, args=("hold cart 2",))
@@ -182,7 +182,7 @@ def news(page: LivePage, opened: ExitStack) -> http.client.HTTPResponse:
 
 
 def test_it_is_served_to_this_computer_only_with_strict_headers(page):
-    """Loopback only, own scripts and styles only, no framing, no referrer, no cache."""
+    """The page listens on this computer only, allows only its own scripts, and forbids caching."""
     assert urlsplit(page.url).hostname == "127.0.0.1"
     response, text = ask(page)
     assert response.status == 200
@@ -193,13 +193,13 @@ def test_it_is_served_to_this_computer_only_with_strict_headers(page):
     assert response.headers["Referrer-Policy"] == "no-referrer"
     assert response.headers["Cache-Control"] == "no-store"
     assert response.headers["X-Content-Type-Options"] == "nosniff"
-    assert "//" not in text  # nothing from anywhere else
+    assert "//" not in text  # nothing from another host
     for name in ("live.js", "live.css", "report.css"):
         assert ask(page, name)[0].status == 200
 
 
 def test_who_does_not_know_the_secret_sees_nothing(page):
-    """No secret, a wrong one, a truncated one, or no slash: 403 for every address."""
+    """Every address with a missing, wrong or incomplete secret gets 403."""
     path = urlsplit(page.url).path
     for other in ("/", "/x/", path[:-2] + "/", path[:-1], "/events", "/live.js", f"/x{path}"):
         response, text = ask(page, other)
@@ -210,7 +210,7 @@ def test_who_does_not_know_the_secret_sees_nothing(page):
 
 
 def test_requests_of_other_pages_are_refused(page):
-    """Another host name, another origin, a cross-site request: 403."""
+    """A request with another host name or origin, or from another site, gets 403."""
     port = urlsplit(page.url).port
     good = f"http://127.0.0.1:{port}"
     assert ask(page, Host=f"evil.example:{port}")[0].status == 403
@@ -237,14 +237,14 @@ def test_requests_of_other_pages_are_refused(page):
     ],
 )
 def test_nonsense_confirms_nothing(page, body, status):
-    """Broken, strange or long answers are refused, and the page goes on."""
+    """A malformed, unknown or too long answer is refused, and the page still works."""
     origin = page.url[: page.url.index("/", 8)]
     assert ask(page, "press", "POST", body, Origin=origin)[0].status == status
     assert ask(page)[0].status == 200
 
 
 def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
-    """Two pages differ; the secret is in no log line and no printed line."""
+    """Each live page has a new secret, which no log line and no printed line contains."""
     caplog.set_level(logging.DEBUG)
     secrets = set()
     for _ in range(2):
@@ -259,13 +259,13 @@ def test_the_secret_is_new_each_time_and_written_nowhere(folder, caplog, capfd):
 
 
 def test_a_port_that_is_taken_is_one_clear_line(page, folder):
-    """Asking for a busy port says so."""
+    """If the port is taken, the error says so."""
     with pytest.raises(HardwareError, match="is not free for the page"):
         LivePage(folder, port=urlsplit(page.url).port or 0)
 
 
 def test_news_come_as_events_and_too_many_pages_are_turned_away(page):
-    """The first event is the whole state, then points; a ninth page gets 503 and costs nothing."""
+    """A page gets the whole state first, then new points; a ninth page gets 503."""
     with ExitStack() as opened:
         stream, *_ = [news(page, opened) for _ in range(8)]
         assert stream.headers["Content-Type"].startswith("text/event-stream")
@@ -292,7 +292,7 @@ def _held(page: LivePage) -> int:
 
 
 def test_strangers_leave_the_run_its_descriptors(page):
-    """Of 400 idle connections some are held, with or without half a request; the owner gets in."""
+    """Of 400 idle connections at most 140 are held, and the owner's page still loads."""
     url = urlsplit(page.url)
     with ExitStack() as opened:
         stream = news(page, opened)
@@ -301,7 +301,7 @@ def test_strangers_leave_the_run_its_descriptors(page):
             opened.enter_context(stranger)
             if number % 2:
                 stranger.sendall(b"GET / HTTP/1.1\r\nHost: ")
-            if number % 30 == 0:  # fewer than are accepted at once
+            if number % 30 == 0:  # fewer than the server accepts at once
                 until(lambda: _held(page) <= 140)
         until(lambda: _held(page) <= 140)
         assert ask(page)[0].status == 200
@@ -309,7 +309,7 @@ def test_strangers_leave_the_run_its_descriptors(page):
 
 
 def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
-    """A full queue of other connections, accepted at once with it, crowds out no request."""
+    """A full queue of idle connections, accepted with the owner's, does not keep the owner out."""
     url, held, go_on = urlsplit(page.url), threading.Event(), threading.Event()
     snapshot = page.snapshot
 
@@ -325,7 +325,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
         rightful = socket.create_connection((url.hostname, url.port), timeout=PATIENCE)
         opened.enter_context(rightful)
         rightful.sendall(f"GET {url.path} HTTP/1.1\r\nHost: {url.netloc}\r\n\r\n".encode())
-        for _ in range(200):  # more than can wait
+        for _ in range(200):  # more than the queue holds
             stranger = opened.enter_context(socket.socket())
             stranger.setblocking(False)
             stranger.connect_ex((url.hostname, url.port))
@@ -334,7 +334,7 @@ def test_nobody_is_faster_than_who_has_the_secret(page, monkeypatch):
 
 
 def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatch):
-    """An idle connection ends by itself; one with the secret stays."""
+    """A connection without the secret is closed after a time; one with the secret stays."""
     monkeypatch.setattr("pipeline.web.server._STRANGER_STAYS", 0.2)
     with LivePage(folder) as page, ExitStack() as opened:
         stream = news(page, opened)
@@ -343,7 +343,7 @@ def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatc
         with socket.create_connection((url.hostname, url.port), timeout=PATIENCE) as stranger:
             with suppress(ConnectionResetError):
                 assert stranger.recv(1) == b""
-        page.planned(PLAN, frozenset())  # sent to all that still listen
+        page.planned(PLAN, frozenset())  # sent to all pages that still listen
         while line := stream.readline():
             if line == b"event: state\n":
                 break
@@ -351,7 +351,7 @@ def test_a_stranger_is_turned_out_in_time_and_a_reader_is_not(folder, monkeypatc
 
 
 def test_a_run_is_not_held_up(folder):
-    """With two pages that read and one that does not, 50 lines pass within a heartbeat."""
+    """While two pages read and one does not, the live page takes 50 lines within a heartbeat."""
     took = []
     with ExitStack() as opened:
         with LivePage(folder) as page:
@@ -365,14 +365,14 @@ def test_a_run_is_not_held_up(folder):
                 began = time.perf_counter()
                 page.readings(batch, Anomalies())
                 took.append(time.perf_counter() - began)
-                time.sleep(0.02)  # which a bench needs for them
+                time.sleep(0.02)  # the time that a bench needs for 50 lines
         for reader in readers:
             reader.join()
     assert np.median(took) < HEARTBEAT_EVERY
 
 
 def test_pages_hear_the_end_and_the_server_is_gone(folder):
-    """Leaving the context ends every stream with the last state, and frees the port."""
+    """When the session ends, each open page gets the last state, and the port is freed."""
     with ExitStack() as opened:
         with LivePage(folder) as page:
             page.planned(PLAN, frozenset())
@@ -457,7 +457,7 @@ def test_it_shows_plan_progress_counters_and_curves(page, show):
 
 @pytest.mark.parametrize("how", ["click", "Enter"])
 def test_an_instruction_is_confirmed_with_its_button(page, show, how):
-    """It appears with the focus on its button, and disappears once it is done."""
+    """An instruction appears with the focus on its button, and disappears once it is confirmed."""
     window = show()
     done = threading.Event()
 
@@ -478,7 +478,7 @@ def test_an_instruction_is_confirmed_with_its_button(page, show, how):
 
 
 def test_the_buttons_are_those_that_would_be_heeded(page, show):
-    """Skip, Keep and Repeat work once in a run; Stop works always, also as Esc from anywhere."""
+    """Skip, Keep and Repeat work once in each run; Stop works always, also by Esc."""
     window = show()
     skip = window.get_by_role("button", name="Skip")
     expect(skip).to_be_disabled()
@@ -502,7 +502,10 @@ def test_the_buttons_are_those_that_would_be_heeded(page, show):
 
 
 def test_every_page_open_sees_the_same(page, show):
-    """A second page opened during a run has the earlier points; confirming on one clears both."""
+    """A page opened during a run shows the earlier points;
+
+    an answer on one page counts for both.
+    """
     first = show()
     record(page)
     second = show(size=PHONE)
@@ -515,7 +518,7 @@ def test_every_page_open_sees_the_same(page, show):
 
 @pytest.mark.parametrize("size", [WIDE, PHONE], ids=["wide", "phone"])
 def test_everybody_can_read_it(page, show, size):
-    """Axe finds no fault by day or night; nothing is wider than the screen."""
+    """The live page passes axe by day and night, and nothing is wider than the screen."""
     window = show(size=size)
     record(page)
     threading.Thread(target=page.confirm, args=("let go of all carts",)).start()
@@ -527,7 +530,7 @@ def test_everybody_can_read_it(page, show, size):
 
 
 def test_by_night_the_curves_change_colour(page, show):
-    """The canvas follows the colour scheme while the page is open."""
+    """If the system switches to dark mode, the curves of an open page change colour."""
     window = show(color_scheme="light")
     record(page)
     expect(window.locator("#plots .keys").first).to_contain_text("3.99")
@@ -555,7 +558,7 @@ def test_the_end_is_told(folder, browser):
 @pytest.mark.slow
 @pytest.mark.sample
 def test_a_session_is_watched_and_confirmed_in_the_browser(tmp_path, browser):
-    """`acquire --web` on a stock bench: a button starts it; no file holds the secret."""
+    """With `acquire --web`, a button on the page starts a recording; no file holds the secret."""
     work = write_work(tmp_path / "work", [sine("dwell", seconds=1, settle=0.3)])
     toml = work / "submission.toml"
     scaled = toml.read_text(encoding="utf-8").replace('"cm"', '"cm", per_count = 0.00227')

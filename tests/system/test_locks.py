@@ -1,4 +1,4 @@
-"""The lock files have what pyproject.toml asks for, and no address."""
+"""The lock files agree with pyproject.toml, and contain no address."""
 
 import re
 import tomllib
@@ -24,7 +24,7 @@ def _pinned(name: str) -> dict[str, tuple[str, int]]:
 
 
 def _asked(extra: str) -> list[Requirement]:
-    """Return what an extra needs, its own extras followed."""
+    """Return the requirements of an extra, including those of the extras that it names."""
     needed = []
     for one in map(Requirement, PROJECT["optional-dependencies"][extra]):
         needed += [n for e in one.extras for n in _asked(e)] if one.name == "cartlab" else [one]
@@ -35,7 +35,7 @@ def _asked(extra: str) -> list[Requirement]:
     ("lock", "extras"), [("requirements.lock", []), ("requirements-dev.lock", ["courses", "dev"])]
 )
 def test_a_lock_has_a_version_that_the_project_allows(lock, extras):
-    """Whoever changes a dependency makes the locks again."""
+    """Each lock file has, for each dependency, a version that pyproject.toml allows."""
     pinned = _pinned(lock)
     asked = [*map(Requirement, PROJECT["dependencies"]), *(n for e in extras for n in _asked(e))]
 
@@ -49,7 +49,7 @@ def test_a_lock_has_a_version_that_the_project_allows(lock, extras):
 
 
 def test_both_locks_have_the_same_versions_and_no_address():
-    """What is tested is what a user gets, from whatever index they use."""
+    """Users and developers get the same versions, and no lock file names a package index."""
     users, developers = _pinned("requirements.lock"), _pinned("requirements-dev.lock")
     assert {name: developers.get(name) for name in users} == users, AGAIN
     for name in ("requirements.lock", "requirements-dev.lock"):

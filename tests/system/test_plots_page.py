@@ -1,4 +1,4 @@
-"""The page of plots in a browser: from the student's page, by keyboard, on a phone, in the dark."""
+"""The page of plots in a browser: by keyboard, on a phone, in dark mode."""
 
 import re
 
@@ -20,13 +20,13 @@ DRAWN = f"canvases => canvases.map(c => ({INK})(c).some(v => v > 0))"
 
 
 def shown(window) -> str:
-    """Return the view that an address holds."""
+    """Return the part of the address that says what is shown."""
     return window.evaluate("location.hash")
 
 
 @pytest.mark.usefixtures("work_here")
 def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
-    """Two runs, one cart, the residual, the spectrum, by keys alone; kept until a file changes."""
+    """By keys alone a student compares two runs, and sees one cart's residual and its spectrum."""
     folder = a_submission(tmp_path / "team", "two-cart")
     with DeskServer(folder=folder) as server:
         window = show(server.url)
@@ -62,7 +62,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
         assert window.locator("canvas").evaluate_all(DRAWN) == [True]
         expect(window.locator(".key li")).to_have_count(4)
 
-        # A number in the table opens its residual; an address opens its view again.
+        # A number in the table opens its residual, and the address of a view opens that view again.
         window.get_by_role("link", name=re.compile("residual of sweep, x₂, linear model")).click()
         expect(window.locator("#told")).to_have_text("sweep: residual")
         address = window.url
@@ -89,7 +89,7 @@ def test_a_student_looks_through_runs_and_models(show, tmp_path):  # noqa: F811
 
 
 def test_without_scripts_there_is_a_picture_and_the_table(browser, tmp_path):
-    """The run with the largest error, and the errors of every run."""
+    """Without scripts the page shows the worst run as a picture, and the errors of every run."""
     analysis = make_analysis(1)
     runs = compare_runs(analysis, gap=None, progress=silent)
     page = tmp_path / "compare.html"

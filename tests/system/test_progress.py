@@ -1,4 +1,4 @@
-"""Progress: one changing line on a terminal; elsewhere a new line now and then."""
+"""Progress is one changing line on a terminal, and otherwise a new line from time to time."""
 
 import io
 import os
@@ -21,7 +21,7 @@ from tests.helpers.waiting import until
 
 
 def test_short_work_says_nothing_to_a_pipe(tmp_path):
-    """If stderr is not a terminal, only the summary is printed, without control characters."""
+    """If stderr is no terminal, a short command prints only its summary, as plain text."""
     done = cartlab_here("report", EXAMPLES / "one-cart", "--out", tmp_path, "--no-pdf")
 
     assert done.stdout == ""
@@ -32,7 +32,7 @@ def test_short_work_says_nothing_to_a_pipe(tmp_path):
 
 @pytest.mark.parametrize("work", [progress_line, _batch_progress])
 def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
-    """Less and less often while it goes on, and not after its end."""
+    """If stderr is no terminal, long work prints fewer and fewer lines, and none after its end."""
     monkeypatch.setattr("pipeline.cli.common.FIRST_WORD", 0.02)
     said, threads = [], threading.active_count()
 
@@ -44,14 +44,14 @@ def test_long_work_tells_a_pipe_what_it_is_about(work, monkeypatch, capsys):
         progress(*((3, 40, "fitting") if work is _batch_progress else ("fitting",)))
         began = time.monotonic()
         until(lambda: hear().count("fitting …") >= 3, "three lines")
-        # After 0.02, 0.06 and 0.14 s at the soonest.
+        # The three lines come after 0.02, 0.06 and 0.14 s at the soonest.
         assert time.monotonic() - began > 0.1
     assert threading.active_count() == threads
     assert ("3 of 40: fitting" in hear()) == (work is _batch_progress)
 
 
 def test_what_was_known_before_is_no_speed():
-    """Of 1000 submissions 990 were graded before; at 2 s for each of the others, 8 s are left."""
+    """The time left ignores grades known from before: 4 submissions left at 2 s each take 8 s."""
     now = 0.0
     bar = Progress(get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -65,7 +65,7 @@ def test_what_was_known_before_is_no_speed():
 
 
 def test_a_time_says_what_it_is_of():
-    """Each of the two times says whether it has passed or is still to come."""
+    """The progress line says of each of its two times whether it has passed or is still to come."""
     now = 0.0
     bar = Progress(*columns(), get_time=lambda: now, disable=True)
     show = counting(bar)
@@ -80,7 +80,7 @@ def test_a_time_says_what_it_is_of():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
-    """A terminal shows the stages with the time, and finally removes the line."""
+    """A terminal shows the stage with the time so far, and the line is removed in the end."""
     import pty
 
     ours, theirs = pty.openpty()
@@ -98,7 +98,7 @@ def test_a_terminal_sees_what_is_done_and_for_how_long(tmp_path):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo terminals")
 def test_ctrl_c_is_answered(tmp_path):
-    """A message confirms that the report was stopped, with the exit status of Ctrl-C."""
+    """After Ctrl-C a message says that the report was stopped, and the exit status is 130."""
     import pty
 
     ours, theirs = pty.openpty()
@@ -119,5 +119,5 @@ def test_ctrl_c_is_answered(tmp_path):
 def _read(terminal: int) -> bytes:
     try:
         return os.read(terminal, 4096)
-    except OSError:  # on Linux the other end is closed by now
+    except OSError:  # on Linux the other end is already closed
         return b""

@@ -1,4 +1,4 @@
-"""The whole pipeline on recordings of a real ECP 210 (springs wall-1 and 1-2, dry friction)."""
+"""The pipeline on recordings of a real ECP 210 with springs wall-1 and 1-2, and dry friction."""
 
 import pytest
 from numpy.testing import assert_allclose
@@ -16,7 +16,7 @@ def two_carts(real_data, tmp_path_factory):
 
 
 def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
-    """Masses and springs agree within 10 % with those of an independent viscous fit."""
+    """Masses and springs agree within 10 % with those of another fit with viscous damping."""
     chain = two_carts.chain
     assert_allclose(chain.m, [5.5e-6, 3.7e-6], rtol=0.1)
     assert_allclose(chain.k[:2], [1.79e-3, 1.03e-3], rtol=0.1)
@@ -24,12 +24,12 @@ def test_two_carts_have_the_masses_and_springs_found_before(two_carts):
 
 
 def test_the_repeat_that_stands_off_is_named(two_carts):
-    """The first of five repeats moved differently; it is left out by name."""
+    """The first of five repeats, which moved differently, is left out by name."""
     assert [(one.experiment, one.is_wrong) for one in two_carts.left_out] == [("both-1", False)]
 
 
 def test_single_carts_have_their_frequencies_and_friction(two_carts):
-    """Each cart alone has its own frequency, and friction is seen in every hand-released decay."""
+    """Each cart alone has its own frequency, and friction is found in all decays of cart 2."""
     alone = {d.experiment: d for d in two_carts.log_decrements}
     for i in range(1, 6):
         assert 23.2 <= alone[f"alone-1-{i}"].omega_n <= 23.7
@@ -38,10 +38,10 @@ def test_single_carts_have_their_frequencies_and_friction(two_carts):
 
 
 def test_the_closed_loop_is_compared_and_its_logged_effort_found_out(two_carts):
-    """The PID run is compared with the model; its log has another sign and scale."""
+    """The PID run is compared with the model, and its logged input has another sign or scale."""
     closed = {h.cart: h for h in two_carts.hardware if h.loop == "closed"}
     assert set(closed) == {1, 2}
-    # The loop holds cart 1 at the set point, on the bench and in the model.
+    # On the bench and in the model, the loop holds cart 1 at the set point.
     assert_allclose(closed[1].steady_state_model, 1000, rtol=0.05)
     assert_allclose(closed[1].steady_state_measured, 1000, rtol=0.05)
     scales = [h.input_scale for h in two_carts.hardware if h.input_scale is not None]
@@ -50,14 +50,14 @@ def test_the_closed_loop_is_compared_and_its_logged_effort_found_out(two_carts):
 
 
 def test_every_skipped_stage_says_why(two_carts):
-    """Without dwells that stage is skipped with its reason, and the rest has run."""
+    """Without dwells the sine stage is skipped with a reason, and all other stages run."""
     assert "sine steady state" in {skip.stage for skip in two_carts.skipped}
     assert two_carts.fit.method == "time_fit"
     assert two_carts.feedback is not None
 
 
 def test_one_cart_from_steps_alone(real_data, tmp_path):
-    """Steps of one cart give gain, frequency and damping, initial and final."""
+    """From steps of one cart alone, gain, frequency and damping get initial and final values."""
     folder = write_one_cart_submission(tmp_path / "one", real_data)
     analysis = analyse(load_submission(folder))
     initial = {row.name: row.initial.value for row in analysis.rows if row.initial}

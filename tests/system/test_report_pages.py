@@ -38,15 +38,15 @@ CASES = (
     *(pytest.param(case, marks=[pytest.mark.slow, pytest.mark.sample])
       for case in ("real-one", "real-two")),
 )  # fmt: skip
-# One effect for each kind of picture.
+# One effect for each kind of figure.
 PICTURED = tuple({effect.axis: effect for effect in reversed(CATALOGUE)}.values())
-LARGEST = 3_000_000  # bytes of a page
+LARGEST = 3_000_000  # largest size of a page, in bytes
 WIDE, LAPTOP, PHONE = (1280, 900), (1100, 800), (390, 844)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return the folder of a case's report, made on first use."""
+    """Return the folder with the report of a case, made on first use."""
     made: dict[str, Path] = {}
 
     def of(case: str, request) -> Path:
@@ -81,7 +81,7 @@ def _analysis(case: str, out: Path, request) -> Analysis:
 
 @pytest.fixture(params=CASES)
 def made(request, folder) -> Path:
-    """The folders of the cases, one after the other."""
+    """The report folders of all cases, one after another."""
     return folder(request.param, request)
 
 
@@ -98,13 +98,13 @@ def page_of(made: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def window(browser):
-    """The window that shows most pages: a new one takes a second to open."""
+    """The browser window that shows most pages; a new window takes a second to open."""
     return browser.new_context().new_page()
 
 
 @pytest.fixture
 def show(browser, window):
-    """Open a page, in a new window if that has options; its errors fail the test."""
+    """Open a page, in a new window if options are given; script errors fail the test."""
     pages, errors = [], []
 
     def on_error(error) -> None:
@@ -138,7 +138,7 @@ def show(browser, window):
 
 
 def test_the_page_is_valid_html(made):
-    """A strict parser finds no fault, every id is unique, and the file is small."""
+    """A strict parser finds no fault in the HTML, every id is unique, and the file is small."""
     html = page_of(made).read_text(encoding="utf-8")
 
     html5lib.HTMLParser(strict=True).parse(html)
@@ -148,15 +148,15 @@ def test_the_page_is_valid_html(made):
     assert len(html.encode()) < LARGEST
 
 
-# Word boxes include ascent and descent of the font: letters on neighbouring lines may overlap a
-# little, and a word on top of another overlaps by more than half.
+# The box of a word includes ascent and descent of its font, so the boxes of neighbouring lines may
+# overlap a little. A word on top of another one overlaps by more than half.
 _MOST_OVERLAP = 0.25
 _WORD = re.compile(r'<word xMin="(.*?)" yMin="(.*?)" xMax="(.*?)" yMax="(.*?)">(.*?)</word>')
 
 
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
 def test_no_word_of_the_pdf_is_cut_or_covered(made):
-    """All words lie on their page, and none lies on another."""
+    """In the PDF each word lies on its page, and no word lies on another."""
     pdf = next(made.glob("*.pdf"), None)
     if pdf is None:
         pytest.skip("a page alone, without a PDF")
@@ -176,7 +176,7 @@ def test_no_word_of_the_pdf_is_cut_or_covered(made):
         assert covered(words) == []
 
 
-# In units of the height of a page's text; the last page may end early.
+# As a share of the height of a page's text. The last page may end early.
 MOST_WHITE = 1 / 3
 PRINTED = ("one", "two", "three", "gap", "solution")
 
@@ -184,7 +184,10 @@ PRINTED = ("one", "two", "three", "gap", "solution")
 @pytest.mark.skipif(shutil.which("pdftoppm") is None, reason="no pdftoppm: poppler-utils")
 @pytest.mark.parametrize("case", PRINTED)
 def test_no_page_of_the_print_is_a_third_empty(case, folder, request):
-    """If a figure does not fit, the figures of the page shrink, or tables break."""
+    """In print no page before the last is a third empty.
+
+    Figures shrink and tables break to fill it.
+    """
     (pdf,) = folder(case, request).glob("*.pdf")
     pages = subprocess.run(
         ["pdftoppm", "-gray", "-r", "36", pdf], capture_output=True, check=True
@@ -215,7 +218,7 @@ def white_stretch(page: NDArray[np.uint8]) -> float:
 
 @pytest.mark.parametrize("case", PRINTED)
 def test_no_table_begins_at_the_foot_of_a_page(case, folder, request):
-    """Beside the caption there are at least its headings and four rows."""
+    """In print the caption of a table has at least the headings and four rows beside it."""
     (pdf,) = folder(case, request).glob("*.pdf")
     tables = list(rows_by_page(PdfReader(pdf)))
     assert len(tables) > 2
@@ -267,7 +270,7 @@ class Box(NamedTuple):
     text: str
 
     def lies_in(self, other: "Box") -> bool:
-        """Return whether nothing sticks out of the other box."""
+        """Return whether this box lies wholly inside the other box."""
         across = other.left <= self.left and self.right <= other.right
         return across and other.top <= self.top and self.bottom <= other.bottom
 
@@ -278,7 +281,7 @@ class Box(NamedTuple):
 
 
 def covered(boxes: list[Box]) -> list[tuple[str, str]]:
-    """Return pairs of texts of which one covers the other."""
+    """Return the pairs of texts of which one covers the other."""
     pairs = []
     boxes = sorted(boxes, key=lambda box: box.top)
     for i, a in enumerate(boxes):
@@ -295,8 +298,8 @@ def covered(boxes: list[Box]) -> list[tuple[str, str]]:
 # ------------------------------------------------------------------- in the browser
 
 
-# Every run of text outside mathematics and drawings, every formula as a whole, and every text of
-# a drawing: with its box, and the box that may cut it.
+# The texts of a page: each run of text outside formulas and drawings, each formula as a whole, and
+# each text of a drawing. Each comes with its box, and with the box that may cut it off.
 BOXES = """() => {
   const found = [];
   const add = (rect, text, owner) => {
@@ -333,11 +336,11 @@ BROKEN = """() => Array.from(document.querySelectorAll('td:nth-child(2):not(:las
 
 
 def test_everybody_can_read_it_on_every_screen(made, show):
-    """Axe finds nothing serious or critical: names, roles, order of headings, contrast at night.
+    """On every screen axe finds nothing serious in names, roles, headings and contrast at night.
 
-    Nothing exceeds the page except what can be scrolled, no text covers another, figures contain
-    their texts. On a laptop every column of a table is in sight; on a phone the name of a check is
-    on one line.
+    Only parts that scroll are wider than the page, no text covers another, and figures contain
+    their texts. A laptop shows every column of a table; a phone shows the name of a check on one
+    line.
     """
     page = show(page_of(made))
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
@@ -364,7 +367,7 @@ def test_everybody_can_read_it_on_every_screen(made, show):
 
 @pytest.mark.parametrize("case", ["class", "feedback"])
 def test_a_phone_shows_the_numbers_of_a_table(case, folder, request, show):
-    """The column of names stays in sight and takes at most half of the view, where there is one."""
+    """On a phone a table's column of names stays in sight and takes at most half of the view."""
     page = show(page_of(folder(case, request)), size=PHONE)
     widths = page.evaluate("""() => Array.from(document.querySelectorAll('details'),
         (fold) => fold.open = true) && Array.from(
@@ -394,7 +397,7 @@ SPLIT = """() => {
 
 
 def test_a_phone_squeezes_no_column_and_splits_no_unit(three, show):
-    """No cell of a table is higher than five lines; a number and its unit are on one line."""
+    """On a phone no cell of a table is higher than five lines, and a number stays with its unit."""
     page = show(page_of(three), size=PHONE)
     page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
     assert 0 < page.evaluate(TALL) < 130
@@ -406,18 +409,21 @@ SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg
 
 
 def test_figures_can_be_read_on_a_laptop(made, show):
-    """No letter of a figure is lower than ten pixels; no button lies below its figure."""
+    """On a laptop letters of figures are at least ten pixels high;
+
+    no button lies below a figure.
+    """
     page = show(page_of(made), size=LAPTOP)
     assert page.evaluate(SMALLEST) >= 10
     for plot in page.locator(".plot").all():
         bounds, tools = plot.bounding_box(), plot.locator(".tools").bounding_box()
         assert tools["x"] >= bounds["x"] + bounds["width"] / 2
-        # They hang over its edge by a few pixels.
+        # The buttons hang over the figure's edge by a few pixels.
         assert tools["y"] + tools["height"] <= bounds["y"] + bounds["height"] + 10
 
 
 def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
-    """The distribution is in sight at once; flags come before criteria, which show their titles."""
+    """The page of a class first shows the distribution of points, then flags, then criteria."""
     page = show(page_of(folder("class", request)), size=LAPTOP)
     first = page.locator("figure").first.bounding_box()
     assert first["y"] + first["height"] < LAPTOP[1]
@@ -429,7 +435,7 @@ def test_a_class_begins_with_how_the_points_are_spread(folder, request, show):
 
 
 def test_a_class_is_searched_and_sorted(folder, request, show):
-    """Words filter the table, headings sort it by number or name, up and down; names are links."""
+    """Words filter the table of a class, and headings sort it by number or name, up and down."""
     page = show(page_of(folder("class", request)))
     table = page.locator("table.finder")
     rows = table.locator("tbody tr:visible")
@@ -461,13 +467,13 @@ def numbers(text: str) -> list[float]:
 
 
 def test_a_figure_says_the_values_under_the_pointer(three, show):
-    """Over a measured point of the Bode figure, frequency, magnitude and phase are shown."""
+    """Over a point of the Bode figure the pointer shows frequency, magnitude and phase."""
     analysis = analysed("three-cart")
     response = next(r for r in analysis.frequency_responses if r.cart == 3)
     page = show(page_of(three))
     figure = page.locator("#frequency-response figure").first
     figure.scroll_into_view_if_needed()
-    box = figure.locator("svg use").nth(10).bounding_box()  # the legend's own comes last
+    box = figure.locator("svg use").nth(10).bounding_box()  # the last point is that of the legend
 
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
 
@@ -482,7 +488,7 @@ def test_a_figure_says_the_values_under_the_pointer(three, show):
 
 
 def test_a_figure_zooms_where_it_is_dragged_and_comes_back(three, show):
-    """Dragging shows a part on all panels that share an axis; the button shows all again."""
+    """Dragging zooms all panels of a figure that share an axis, and the button shows all again."""
     page = show(page_of(three))
     figure = page.locator("figure").first
     figure.scroll_into_view_if_needed()
@@ -516,7 +522,7 @@ def geometry(figure) -> list[list[str | None]]:
 
 
 def test_a_figure_answers_to_the_keyboard(three, show):
-    """Arrow keys go from point to point, plus zooms, 0 shows all."""
+    """Arrow keys go from point to point in a figure, plus zooms in, and 0 shows all."""
     page = show(page_of(three))
     figure = page.locator("figure").first
     figure.locator(".stage").focus()
@@ -535,7 +541,7 @@ def test_a_figure_answers_to_the_keyboard(three, show):
 
 
 def test_numbers_can_be_copied(three, show):
-    """A table is copied with tabs and plain numbers, value and error apart."""
+    """A copied table has tabs and plain numbers, with value and error in separate columns."""
     page = show(page_of(three), permissions=["clipboard-read", "clipboard-write"])
 
     page.get_by_role("button", name="Copy Table 2").click()
@@ -554,7 +560,7 @@ def test_numbers_can_be_copied(three, show):
 
 
 def test_without_scripts_the_page_is_whole(three, show):
-    """Figures, numbers and folded parts can be read where no script runs."""
+    """Without scripts all figures, numbers and folded parts can be read."""
     page = show(page_of(three), java_script_enabled=False)
 
     assert page.locator("figure svg").count() == page.locator("figure").count() > 5
@@ -565,7 +571,7 @@ def test_without_scripts_the_page_is_whole(three, show):
 
 @pytest.mark.skipif(shutil.which("pdftotext") is None, reason="no pdftotext: poppler-utils")
 def test_paper_shows_what_a_page_folds(three, show, tmp_path):
-    """Printing opens the folded tables and omits what only works on a screen."""
+    """Printing opens the folded tables, and omits buttons that work only on a screen."""
     page = show(page_of(three))
     paper = tmp_path / "paper.pdf"
     page.pdf(path=paper, format="A4")

@@ -1,4 +1,4 @@
-"""Whole submissions spoilt at random: every command gives a result or one line, in time."""
+"""For whole submissions with random faults, every command gives a result or one line, in time."""
 
 import json
 import re
@@ -16,7 +16,7 @@ from tests.helpers.commandline import cartlab_here
 from tests.helpers.poison import poisoned
 from tests.system.test_any_submission import CHANNELS
 
-# Of the processor, on a machine of any load; `gap` has its own budget beside it.
+# Time of the processor, whatever else the machine does. `gap` also has a budget of its own.
 MOST_TIME = 60.0  # s
 KINDS = ("decay", "step", "sine", "sweep", "closed_loop", "bode")
 FACTORS = (1e-9, 1e-3, 0.1, 0.5, 0.97, 2, 10, 1e3, 1e9)
@@ -33,7 +33,7 @@ ADDED = (
 
 @cache
 def good(carts: int) -> dict[str, bytes]:
-    """Return the files of a small submission: few dwells, few repeats."""
+    """Return the files of a small submission with few dwells and few repeats."""
     with tempfile.TemporaryDirectory() as folder:
         write_submission(Path(folder), f"throne-{carts}dof", seed=1, compact=True, reported=True)
         files = {
@@ -50,7 +50,7 @@ def good(carts: int) -> dict[str, bytes]:
 
 
 def odd(files: dict[str, bytes], rng: Random) -> None:
-    """Change a submission's statements about its bench and runs into other plausible ones."""
+    """Replace what a submission states about its bench and runs by other plausible values."""
     toml = files["submission.toml"].decode("utf-8", "replace")
 
     def change(pattern: str, *new: str) -> str:
@@ -85,7 +85,7 @@ def odd(files: dict[str, bytes], rng: Random) -> None:
 
 
 def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
-    """Spoil a column of a table, or of all tables, as a bench may do."""
+    """Spoil one column of a table, or of all tables, as a faulty bench may do."""
     tables = sorted(name for name in files if name.endswith(".csv"))
     how, column = CHANNELS[rng.choice(sorted(CHANNELS))], rng.randrange(1, 5)
     for name in tables if every else [rng.choice(tables)]:
@@ -101,7 +101,7 @@ def spoil_channel(files: dict[str, bytes], rng: Random, *, every: bool) -> None:
 
 
 def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
-    """Return a submission of that many carts with a few faults."""
+    """Return a submission with the given number of carts and a few random faults."""
     files = dict(good(carts))
     for _ in range(rng.choice([1, 1, 2, 4])):
         if rng.random() < 0.6:
@@ -112,7 +112,7 @@ def spoilt(carts: int, rng: Random) -> dict[str, bytes]:
 
 
 def run(command: str, folder: Path) -> None:
-    """Give a submission folder to a command, and check the result."""
+    """Run a command on a submission folder, and check its exit status and what it wrote."""
     out = folder.parent / "out"
     document = {"report": "results.json"}.get(command, f"{command}.json")
     began = time.process_time()
@@ -137,7 +137,7 @@ def _refuse(constant: str) -> None:
 
 
 def try_seed(command: str, seed: int) -> None:
-    """Spoil a submission and give it to a command."""
+    """Spoil a submission at random, and run a command on it."""
     rng = Random(f"{command} {seed}")
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base) / "work"
@@ -150,7 +150,7 @@ def try_seed(command: str, seed: int) -> None:
 
 @pytest.mark.parametrize("command", ["report", "import"])
 def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
-    """A few seeds, of one cart."""
+    """For two spoilt submissions, `report` and `import` give a result or one line of error."""
     for seed in (0, 3):
         try_seed(command, seed)
 
@@ -160,6 +160,6 @@ def test_a_spoilt_submission_is_a_report_or_a_complaint(command):
     ("command", "seeds"), [("report", 300), ("solution", 100), ("import", 300), ("gap", 30)]
 )
 def test_no_spoilt_submission_ends_in_a_traceback(command, seeds):
-    """Hundreds."""
+    """For hundreds of spoilt submissions, every command gives a result or one line of error."""
     for seed in range(seeds):
         try_seed(command, seed)

@@ -52,7 +52,7 @@ SENT = """submission_77001:
 
 @cache
 def sound() -> dict[str, bytes]:
-    """Return the files that are spoilt below, by name."""
+    """Return the good files, by name, that the tests spoil."""
     with tempfile.TemporaryDirectory() as folder:
         submission = load_submission(write_work(Path(folder), []))
         plan = plan_text(propose_plan(submission), submission.system).encode()
@@ -73,7 +73,7 @@ def sound() -> dict[str, bytes]:
 
 
 def spoilt(name: str, rng: Random) -> bytes:
-    """Return a sound file after a change of its bytes, or of their meaning."""
+    """Return a good file with random changes of its bytes or of its values."""
     raw = FILES[rng.choice(sorted(FILES))] if name == "import" else sound()[name]
     if rng.random() < 0.5:
         return damaged(raw, rng)
@@ -84,13 +84,13 @@ def spoilt(name: str, rng: Random) -> bytes:
     if name.endswith(".csv"):
         try:
             return poisoned_table(raw.decode(), rng).encode("utf-8", "replace")
-        except ValueError:  # words where numbers are scaled
+        except ValueError:  # the table has words in place of numbers
             return damaged(raw, rng)
     return damaged(raw, rng)
 
 
 def use(name: str, path: Path) -> None:
-    """Read a file, and write its result."""
+    """Read a file with the function for its name, and use what was read."""
     student = Student(
         id="s1", name="Jane Doe", number="7", grade=make_grade("a"), by_hand=frozenset()
     )
@@ -128,7 +128,10 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Spoil a file and read it: at most one line of error (one for each mistake in TOML)."""
+    """Spoil a file at random and read it;
+
+    expect at most one line of error, in TOML one per mistake.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
         path.write_bytes(spoilt(name, Random(f"{name} {seed}")))
@@ -139,7 +142,7 @@ def try_seed(name: str, seed: int) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_spoilt_file_is_a_complaint_or_a_result(name):
-    """A few seeds of each kind of file."""
+    """For 30 random faults in each kind of file, there is a result or a short error."""
     for seed in range(30):
         try_seed(name, seed)
 
@@ -147,6 +150,6 @@ def test_a_spoilt_file_is_a_complaint_or_a_result(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_no_spoilt_file_ends_in_a_traceback(name):
-    """Thousands of each."""
+    """For thousands of random faults in each kind of file, there is a result or a short error."""
     for seed in range(30, 3_000):
         try_seed(name, seed)

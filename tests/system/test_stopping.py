@@ -1,4 +1,4 @@
-"""Ctrl-C ends a command, whatever a library does with it."""
+"""Ctrl-C ends a command even if a library swallows the interrupt."""
 
 import contextlib
 import signal
@@ -10,7 +10,7 @@ from pipeline.cli.stopping import ctrl_c_says
 
 
 def _work(said: list[str], *, look: bool = False, error: Exception | None = None) -> None:
-    """Press Ctrl-C during work that drops it, then look, or end in an error."""
+    """Press Ctrl-C during work that swallows the interrupt; then look for it, or raise an error."""
     with ctrl_c_says(lambda: said.append("stopped")) as looked:
         with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
@@ -23,9 +23,9 @@ def _work(said: list[str], *, look: bool = False, error: Exception | None = None
 
 @pytest.mark.parametrize("how", [{"look": True}, {"look": False}, {"error": ValueError("broken")}])
 def test_an_interrupt_that_a_library_drops_ends_the_work(how):
-    """Python drops one that falls into the callback of a weak reference; the next look finds it.
+    """If a library swallows Ctrl-C, the command still ends, at its next look or at its end.
 
-    At the latest it is found at the end, or with the error that the interrupted library raises.
+    If the interrupted library raises an error, the command ends with 130 all the same.
     """
     said = []
     with pytest.raises(typer.Exit) as ended:
@@ -41,7 +41,7 @@ def test_an_error_without_ctrl_c_stays_an_error():
 
 
 def test_afterwards_ctrl_c_is_what_it_was():
-    """The earlier handler is back."""
+    """After the command's work the earlier handler of Ctrl-C is restored."""
     before = signal.getsignal(signal.SIGINT)
     with ctrl_c_says(lambda: None):
         assert signal.getsignal(signal.SIGINT) is not before

@@ -1,4 +1,4 @@
-"""The site: it loads nothing from outside, and its catalogue of effects is the program's."""
+"""The website loads nothing from other hosts, and its catalogue of effects is the program's."""
 
 import pytest
 
@@ -27,7 +27,7 @@ def test_the_page_of_effects_is_the_catalogue():
     ],
 )
 def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
-    """Scripts, styles, pictures and fonts of another host end the build."""
+    """If a page would load a script, style, picture or font from another host, the build fails."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / name).write_text(text, encoding="utf-8")
     (found,) = website.fetched_from_outside(tmp_path)
@@ -36,7 +36,7 @@ def test_what_a_browser_would_fetch_elsewhere_is_found(name, text, tmp_path):
 
 
 def test_links_and_local_files_are_no_loads(tmp_path):
-    """A link to another site, a namespace and a file beside the page load nothing."""
+    """A link to another site, a namespace and a local file do not count as loads from outside."""
     website = pytest.importorskip("docs.website", reason="the site needs cartlab[docs]")
     (tmp_path / "a.html").write_text(
         '<a href="https://example.org">there</a> <img src="../a.png"> <script src="a.js"></script>'
