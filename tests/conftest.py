@@ -21,8 +21,8 @@ from tests.helpers.compiled import await_compiler, start_compiler
 from tests.helpers.places import REAL_DATA
 from tests.helpers.waiting import PATIENCE
 
-# Containers may forbid Python to store compiled code. Then each of the hundred programs that tests
-# start would compile the package again, and so would each worker.
+# In containers Python may not be allowed to store compiled code. Then each of the hundred programs
+# that the tests start, and each worker, would compile the package again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
@@ -33,21 +33,21 @@ atexit.register(shutil.rmtree, os.environ["XDG_STATE_HOME"], ignore_errors=True)
 if "PYTEST_XDIST_WORKER" in os.environ:  # which shares the machine with others
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-# The same examples every time, and no verdict on how fast a busy machine is.
+# Hypothesis draws the same examples every time, and does not judge how fast a busy machine is.
 settings.register_profile(
     "cartlab", deadline=None, derandomize=True, max_examples=50,
     suppress_health_check=[HealthCheck.too_slow],
 )  # fmt: skip
 settings.load_profile("cartlab")
 
-# The first is the second without windows, in less than half of its processor time.
+# The first is Chromium without windows, which needs less than half of the processor time.
 CHROMIUM = shutil.which("chromium-headless-shell") or shutil.which("chromium")
 _BENCHES = "benches"  # the group of the files that wait for them most of their time
 _WITH_BENCHES = {
     "bench/host/test_acquire", "bench/host/test_mistakes", "bench/host/test_safety",
     "simulated/emulator/test_server", "system/test_live_page",
 }  # fmt: skip
-_LONGEST = {  # over ten seconds of a processor: they would end long after the others
+_LONGEST = {  # each over ten seconds: started late, they would end last
     "desk/test_bench", "desk/test_ending", "desk/test_grades", "desk/test_jobs",
     "desk/test_student", "experiments/exploring/test_exploration", "gap/test_explain",
     "grading/autograder/test_gradescope", "grading/batch/test_faults_of_the_computer",
@@ -56,7 +56,7 @@ _LONGEST = {  # over ten seconds of a processor: they would end long after the o
     "system/test_desk", "system/test_desk_grades", "system/test_desk_rooms",
     "system/test_report_pages",
 }  # fmt: skip
-_FEW = 2  # files that are sooner done here than other processes are started
+_FEW = 2  # up to so many files, starting other processes costs more than it saves
 
 # A shell starts background jobs with Ctrl-C ignored, and their children inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -85,14 +85,14 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
     """Run a file or two in this process.
 
-    Else use several workers, as tests often wait for a bench.
+    With more files, use several workers, as tests often wait for a bench.
     """
     few = len(config.args) <= _FEW and all(".py" in argument for argument in config.args)
     return 0 if few else (os.cpu_count() or 1) + 1
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Start with tests that wait for benches, then the longest files.
+    """Put tests that wait for benches first, then the longest files.
 
     The short files come last, so that no worker ends alone with a long one.
     """
@@ -105,7 +105,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Exclude the thousands of collected tests and modules from later garbage collections."""
+    """Exclude the collected tests and modules, many thousands, from later garbage collections."""
     gc.freeze()
     if "PYTEST_XDIST_WORKER" in os.environ:
         await_compiler()
@@ -132,7 +132,7 @@ def _group(nodeid: str) -> str:
 
 @pytest.fixture(scope="session", autouse=True)
 def _patient_host() -> Iterator[None]:
-    """Allow virtual benches longer to answer: on a busy machine they have no core of their own."""
+    """Allow virtual benches longer to answer, as a busy machine gives them no core of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("pipeline.bench.host.session.SILENCE", 3.0)
         for module in ("session", "serial_line"):
@@ -142,7 +142,7 @@ def _patient_host() -> Iterator[None]:
 
 @pytest.fixture
 def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run the desk's jobs in this process."""
+    """Run the desk's jobs in this process instead of in new ones."""
     from tests.helpers.desks import WorkerHere
 
     monkeypatch.setattr("pipeline.desk.jobs.Supervisor", WorkerHere)
@@ -150,7 +150,7 @@ def work_here(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def browser():
-    """Return a real browser; tests that need it are skipped where it is missing."""
+    """Return a real browser; tests that need it are skipped if no browser is installed."""
     if CHROMIUM is None:
         pytest.skip("no chromium: apt-get install chromium-headless-shell")
     from playwright.sync_api import expect, sync_playwright
@@ -182,7 +182,7 @@ def real_bench() -> Iterator[Emulator]:
 def real(real_bench: Emulator) -> Emulator:
     """Return the bench in real time, with its carts at rest and no faults left from earlier tests.
 
-    The last fault it could report is in a run of ten lines, which no test records.
+    The bench reports a last fault only in a run of ten lines, which no test records.
     """
     from pipeline.bench.host.serial_line import open_line
     from pipeline.bench.protocol.messages import Hands, Start, Wave
@@ -196,7 +196,7 @@ def real(real_bench: Emulator) -> Emulator:
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """Folder of real measurements; tests that need it skip where it is absent."""
+    """Return the folder of real measurements; tests that need it are skipped if it is absent."""
     if not REAL_DATA.is_dir():
         pytest.skip(f"real measurements are not here ({REAL_DATA})")
     return REAL_DATA

@@ -23,7 +23,7 @@ EXAMPLES = ("one-cart", "two-cart", "three-cart")
 # Columns of a gradebook that differ from run to run, or from version to version.
 CLOCKS = frozenset({"at", "key"})
 LEFT_OUT = frozenset({".pdf", ".sqlite", ".zip"})  # compared as text, rows and files instead
-BOOKKEEPING = frozenset({".lock", ".turn", ".made.json"})  # of this version alone
+BOOKKEEPING = frozenset({".lock", ".turn", ".made.json"})  # the same only within one version
 
 
 def main() -> int:
@@ -85,7 +85,7 @@ def _reports(out: Path) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         real = write_two_cart_submission(Path(scratch, "real"), REAL_DATA, steps=(1, 2, 3))
         _run(out / "real.txt", "report", real, "--out", out / "real", "--tables")
-    (out / "real" / "results.mat").unlink()  # its head says when it was written
+    (out / "real" / "results.mat").unlink()  # its first line says when it was written
 
 
 def _solutions(out: Path) -> None:
@@ -177,7 +177,7 @@ def _run(said: Path, *command: str | Path) -> None:
 
 
 def _rows(book: Path) -> Iterator[str]:
-    """Yield every row of a gradebook as text, without its times of writing."""
+    """Yield every row of a gradebook as text, without the times at which the rows were written."""
     with sqlite3.connect(book) as open_book:
         query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
         for (table,) in open_book.execute(query).fetchall():

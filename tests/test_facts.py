@@ -1,4 +1,4 @@
-"""Code asks for facts; it never reads them back out of our own sentences, ids and names."""
+"""No code takes a fact out of a sentence, an id or a name that the program itself wrote."""
 
 import ast
 from collections.abc import Iterator
@@ -19,14 +19,14 @@ READERS = {
     "removeprefix",
     "removesuffix",
 }
-# Names of messages and ids: an attribute of anything, or a variable.
+# Names of messages and ids: an attribute of any object, or a variable.
 SAID = {"message", "reason", "stage", "id", "about", "note", "parameter", "warning",
         "partial"}  # fmt: skip
-# In these rooms such a variable holds the name of a parameter, never that of a file.
+# In these packages such a variable holds the name of a parameter, never the name of a file.
 ROOMS = ("checks", "identify", "soundness", "report/equations", "grading/mistakes", "grading/judge",
          "grading/references")  # fmt: skip
 PARAMETERS = {"name", "omega", "zeta", "worst"}
-# A reason is shown line by line: one line for each fault.
+# The lines of a reason may be taken apart, since each line is a fault of its own.
 ALLOWED = {'grade.reason.split("\\n")', 'reason.split("\\n")'}
 
 
@@ -59,9 +59,9 @@ def _is_said(node: ast.expr, names: set[str]) -> bool:
 
 
 def _is_part(index: ast.expr) -> bool:
-    """Return whether an expression takes letters of a text.
+    """Return whether an expression takes letters out of a text.
 
-    A slice, or one letter by its number.
+    That is a slice, or one letter by its number.
     """
     return isinstance(index, ast.Slice) or (
         isinstance(index, ast.Constant) and isinstance(index.value, int)
@@ -73,7 +73,7 @@ MODULES = [path for path in sorted(PIPELINE.rglob("*.py")) if path != PIPELINE /
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(PIPELINE)))
 def test_no_fact_is_read_back_from_words(path: Path):
-    """Messages, ids, stages and names of parameters are not taken apart: `names.py` reads names."""
+    """Only `names.py` takes names apart; messages, ids and stages are never taken apart."""
     place = path.relative_to(PIPELINE).as_posix()
     of_parameters = place.startswith(tuple(f"{room}/" for room in ROOMS))
     assert read_back(path.read_text(encoding="utf-8"), of_parameters=of_parameters) == []
@@ -95,5 +95,5 @@ def test_no_fact_is_read_back_from_words(path: Path):
     ],
 )
 def test_what_stood_there_before_is_found(slip: str):
-    """Each of these lines was in the program once; the test recognises all of them."""
+    """The test recognises each of these lines, which once were in the program."""
     assert read_back(slip, of_parameters=True)

@@ -1,4 +1,4 @@
-"""Imports go down only, stages stay apart, and each package has a home."""
+"""Imports go down only, no stage imports another stage, and each package has a home."""
 
 import ast
 from collections.abc import Sequence
@@ -11,7 +11,8 @@ from tests.helpers.places import ROOT
 
 PIPELINE = ROOT / "pipeline"
 
-# From the ground up, rooms and the rooms within them; a module imports from its own room or below.
+# The rooms, from the lowest up, and the rooms within them. A module imports from its own room or
+# from lower ones.
 LEVELS = (
     ("__init__", "arrays", "errors", "garbage", "threads", "resources", "plant.limits"),
     ("json_files",),
@@ -107,7 +108,7 @@ def _imports(path: Path) -> list[str]:
 
 
 def test_imports_go_down_only():
-    """A module imports from lower rooms or its own; every room has a level."""
+    """A module imports only from its own room or lower ones, and every room has a level."""
     upward = []
     for path in MODULES:
         room = _room(path.relative_to(PIPELINE).with_suffix("").parts)
@@ -123,13 +124,18 @@ def test_imports_go_down_only():
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda path: path.stem)
 def test_stages_never_import_each_other(stage):
-    """Only the workflow knows the order of the stages; what they share lives in `estimation`."""
+    """No stage imports another stage.
+
+    Only the workflow knows their order; code that they share is in `estimation`.
+
+    only the workflow knows their order, and they share `estimation`.
+    """
     assert len(STAGES) > 10
     assert not [name for name in _imports(stage) if name.startswith("pipeline.stages")]
 
 
 def test_each_package_has_a_home():
-    """Matplotlib is imported by the report, typer by the command line, and so on."""
+    """Each outside package is imported in one room only, for example matplotlib by the report."""
     abroad = []
     for path in MODULES:
         place = ".".join(path.relative_to(PIPELINE).with_suffix("").parts) + "."
@@ -141,18 +147,21 @@ def test_each_package_has_a_home():
 
 
 def test_a_file_is_read_in_one_sitting():
-    """No module that identifies or explains has more than 400 lines, except the maps of types."""
+    """No module that identifies or explains has over 400 lines, unless it only lists types."""
     rooms = ("plant", "estimation", "stages", "identify", "gap")
     files = [
         *PIPELINE.glob("*.py"),
         *(path for room in rooms for path in (PIPELINE / room).rglob("*.py")),
     ]
     long = [f.name for f in files if len(f.read_text(encoding="utf-8").splitlines()) > 400]
-    assert sorted(long) == ["results.py", "types.py"]  # the maps of types
+    assert sorted(long) == ["results.py", "types.py"]  # those that list types
 
 
 def test_tests_stand_in_folders_named_as_what_they_test():
-    """Exceptions: tests of the whole program, statistics, benchmarks, and the helpers."""
+    """Each test is in a folder named after what it tests.
+
+    Exceptions are the tests of the whole program, statistics, benchmarks, and the helpers.
+    """
     others = {"helpers", "truth", "system", "statistics", "benchmarks"}
     folders = {path.parent.relative_to(ROOT / "tests") for path in ROOT.glob("tests/**/test_*.py")}
     homeless = [str(f) for f in folders if f.parts and f.parts[0] not in others

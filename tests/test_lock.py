@@ -1,4 +1,4 @@
-"""One run at a time writes into a folder."""
+"""Only one run at a time may write into a folder."""
 
 import os
 import subprocess
@@ -25,7 +25,7 @@ with alone_in(out), scratch_in(out) as scratch:
 
 @pytest.fixture
 def other(tmp_path):
-    """Another process that has the folder."""
+    """Start another process that holds the folder's lock."""
     command = [sys.executable, "-c", _HOLDER, str(tmp_path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -35,10 +35,10 @@ def other(tmp_path):
 
 
 def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
-    """The message names the process that writes there; its scratch folder stays while it lives.
+    """While one process writes, a second run is refused with its number and removes nothing of it.
 
-    When that process is dead its lock is gone too. The next run removes its scratch folder, and its
-    own at the end.
+    Once the first process is dead, the next run gets the lock, and removes the scratch folders of
+    both.
     """
     refused = pytest.raises(
         ConfigError, match=rf"another cartlab \(process {other.pid}\) is writing"
@@ -60,14 +60,17 @@ def test_a_second_run_is_refused_until_the_first_is_dead(other, tmp_path):
 
 
 def test_a_lock_that_is_none_is_said(tmp_path):
-    """A file of that name that is not a lock stops the run with a message."""
+    """A file with the lock's name that is not a lock stops the run with a message."""
     (tmp_path / ".lock").write_bytes(b"something else" * 100)
     with pytest.raises(ConfigError, match="not a lock of cartlab"), alone_in(tmp_path):
         pass
 
 
 def test_a_folder_nothing_came_of_goes_again(tmp_path):
-    """A folder made for a run that ended at once is removed; a folder that existed stays."""
+    """If a run fails at once, a folder made for it is removed.
+
+    A folder that existed before the run stays.
+    """
     for out in (tmp_path / "new" / "out", tmp_path):
         with pytest.raises(ZeroDivisionError), alone_in(out), scratch_in(out):
             raise ZeroDivisionError

@@ -1,4 +1,4 @@
-"""Parameter names are read in one place, and the laws of a chain hold for its names."""
+"""Parameter names are read in one place, and real chains obey the inequalities between names."""
 
 import pytest
 
@@ -10,7 +10,7 @@ from pipeline.set_up import PAPER_UNITS
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_every_name_is_read_back(n):
-    """Each name has one kind; those of single carts know which."""
+    """Each parameter name gives its kind back, and a name with a cart number gives the cart."""
     for name in parameter_names(n):
         read = read_name(name)
         assert read.is_gain + read.is_frequency + read.is_ratio == 1
@@ -22,7 +22,7 @@ def test_every_name_is_read_back(n):
 
 
 def test_a_rigid_body_has_a_damping_but_no_ratio():
-    """Its two names have units of their own."""
+    """A rigid body has the parameters mass and damping, each with its own unit."""
     mass, damping = map(read_name, parameter_names(1, rigid=True))
     assert mass.unit(PAPER_UNITS) == "V s^2/cm"
     assert damping.is_damping
@@ -30,7 +30,7 @@ def test_a_rigid_body_has_a_damping_but_no_ratio():
 
 
 def test_a_table_without_its_last_resonance_sets_no_upper_bound():
-    """A cart alone may be faster than the first resonance if the table lacks the last one."""
+    """Without the last resonance, single carts may be faster than the first resonance."""
     names = ["K_1", "K_2", "omega_1", "omega_2", "omega_a"]
     found = [(lesser, greater) for lesser, greater, _ in orders(names)]
     assert found == [("K_2", "K_1"), ("omega_a", "omega_1"), ("omega_a", "omega_2")]
@@ -38,7 +38,7 @@ def test_a_table_without_its_last_resonance_sets_no_upper_bound():
 
 @pytest.mark.parametrize("preset", ["throne-2dof", "throne-3dof"])
 def test_a_real_chain_obeys_them(preset):
-    """The paper's own carts satisfy every inequality."""
+    """The carts of the paper satisfy every inequality between named parameters."""
     values = PRESETS[preset].parameters()
     for low, middle, high, _ in brackets(PRESETS[preset].n):
         assert values[low] < values[middle] < values[high]
@@ -47,7 +47,7 @@ def test_a_real_chain_obeys_them(preset):
 
 
 def test_names_are_said_in_words():
-    """Names are written in words; any other text stays as it is."""
+    """`read_name` gives parameter names in words."""
     said = {name: read_name(name).words for name in ("zeta", "zeta_1", "omega_n", "omega_b",
             "omega_x", "K_2", "mass")}  # fmt: skip
     assert said == {

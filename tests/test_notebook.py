@@ -1,6 +1,6 @@
-"""The notebook.
+"""The package in a notebook.
 
-One import, results that display themselves, and an example that runs to the end.
+One import is enough, results display themselves, and the example notebook runs to its end.
 """
 
 import ast
@@ -34,13 +34,13 @@ def lab() -> Lab:
 
 
 def test_analyse_is_the_packages_own(lab):
-    """`from pipeline import analyse` is this function and gives the results of a report."""
+    """`from pipeline import analyse` gives this function and the same results as a report."""
     assert pipeline.analyse is analyse
     assert json_text(lab.results) == json_text(analysed("two-cart"))
 
 
 def test_nothing_heavy_is_loaded_until_it_is_asked_for():
-    """Importing the package loads nothing heavy; an unknown name is an error."""
+    """Importing the package loads no large library; asking it for an unknown name is an error."""
     code = (
         "import sys, pipeline; "
         "print({'numpy', 'matplotlib', 'pandas', 'control'} & set(sys.modules))"
@@ -54,7 +54,7 @@ def test_nothing_heavy_is_loaded_until_it_is_asked_for():
 
 
 def test_the_system_is_the_identified_chain(lab):
-    """States, input and outputs are named, and A to D are those of results.json."""
+    """States, input and outputs of the system are named; A to D are those of results.json."""
     system = lab.system
     assert system.isctime()
     assert system.state_labels == ["x1", "v1", "x2", "v2"]
@@ -64,35 +64,35 @@ def test_the_system_is_the_identified_chain(lab):
 
 
 def test_one_cart_held_is_a_system_of_its_own(lab):
-    """With cart 1 held only cart 2 is left, and nothing drives it."""
+    """With cart 1 held the system has only cart 2, and the input does not drive it."""
     alone = lab.chain.to_control(free=(2,))
     assert (alone.state_labels, alone.output_labels) == (["x2", "v2"], ["x2"])
     assert_array_equal(alone.B, np.zeros((2, 1)))
 
 
 def test_transfer_functions_are_those_of_the_system(lab):
-    """One for each output, with the frequency response of the state model."""
+    """Each output has a transfer function with the frequency response of the state model."""
     omega = np.geomspace(1.0, 100.0, 20)
     assert list(lab.transfer_functions) == ["x1", "x2"]
     for row, (name, found) in enumerate(lab.transfer_functions.items()):
         assert found.output_labels == [name]
-        # Near a resonance of zeta 0.03 a polynomial of degree four loses two digits.
+        # Near a resonance of zeta 0.03, a polynomial of degree four loses two digits.
         assert_allclose(found(1j * omega), lab.chain.frequency_response(omega)[row], rtol=1e-11)
 
 
 def test_the_closed_loop_is_the_designed_one(lab):
-    """It has the sample time of the design; its poles are those of the design and of the delay."""
+    """The loop has the design's sample time and poles, and a pole at zero for the delay."""
     loop, design = lab.closed_loop, lab.design
     assert loop.dt == design.sample_time
     assert loop.input_labels == ["r"]
     expected = np.append(np.exp(design.poles * loop.dt), 0.0)
     away = np.abs(loop.poles()[:, None] - expected)
-    # The pole at zero is as well conditioned as the others, all of them apart.
+    # All poles are apart, so the pole at zero is as well conditioned as the others.
     assert away[linear_sum_assignment(away)].max() < 1e-9
 
 
 def test_tables_have_the_names_of_the_results(lab):
-    """One row for each parameter, check, decay, step and dwell; units are in the attributes."""
+    """Each table has one row per parameter, check, decay, step or dwell; attributes hold units."""
     results = plain(lab.results, digits=17)
     for frame, rows in (
         (lab.parameters, results["parameters"]),
@@ -127,7 +127,7 @@ def test_records_are_tables_by_time(lab):
 
 
 def test_what_was_not_found_is_said(lab):
-    """Without a fit or a design there is no system or loop; the error says where to look."""
+    """Without a fit or a design there is no system or loop, and the error says what is missing."""
     bare = replace(lab, results=replace(lab.results, fit=None, feedback=None))
     with pytest.raises(DataError, match="the carts were not identified"):
         _ = bare.system
@@ -148,7 +148,7 @@ def test_an_analysis_shows_its_summary_and_its_table(lab):
 
 
 def test_each_section_shows_itself(lab):
-    """All sections of the report can be shown alone, figures included; others are refused."""
+    """Each section of the report can be displayed alone, with figures; other names are refused."""
     for section in lab.sections:
         page = Page(lab.show(section)._repr_html_())
         assert len(page.text) > 20, section
@@ -159,13 +159,13 @@ def test_each_section_shows_itself(lab):
 
 
 def test_a_folder_that_is_none_is_one_clear_error(tmp_path):
-    """A notebook gets the same message as the command line."""
+    """A folder that is no submission gives the same message as on the command line."""
     with pytest.raises(SubmissionError, match="no such folder"):
         analyse(tmp_path / "nowhere")
 
 
 def test_the_style_sheet_stays_inside(lab):
-    """Every rule is nested under the element's own class, so the notebook's look is its own."""
+    """Every style rule is nested under the element's own class and leaves the notebook alone."""
     html = lab._repr_html_()
     style = html[html.index("<style>") + 7 : html.index("</style>")].strip()
     assert style.startswith(".cartlab {")
@@ -179,7 +179,7 @@ def test_the_style_sheet_stays_inside(lab):
 
 
 def test_the_example_notebook_runs(monkeypatch):
-    """Every code cell runs, in order, and the last value of a cell displays itself."""
+    """Every code cell of the example runs, in order, and displays its last value."""
     mpl.use("agg")
     monkeypatch.chdir(EXAMPLES.parent)
     notebook = json.loads(NOTEBOOK.read_text(encoding="utf-8"))
@@ -201,7 +201,7 @@ def test_the_example_notebook_runs(monkeypatch):
     assert shown["checks"].empty
     assert "omega_a falls from 10.138 to" in shown["heavier"]
     steps = shown["steps"]
-    # The bench ran the designed loop; another controller settles too, and overshoots.
+    # The bench ran the designed loop. Another controller would settle too, but overshoot.
     assert steps.loc["designed", "SettlingTime"] == steps.loc["measured", "SettlingTime"]
     assert_allclose(steps["SteadyStateValue"], 1.0, rtol=5e-3)  # two encoder steps of 0.0023 cm
     assert 5 < steps.loc["mine", "Overshoot"] < 10

@@ -21,7 +21,7 @@ IN_HERTZ = {**RIGHT, "omega_n": 2.1}
 
 @pytest.fixture
 def lab(tmp_path) -> Path:
-    """Recordings, and no number reported in `submission.toml`."""
+    """Return a folder of recordings without any reported numbers."""
     folder = tmp_path / "lab"
     write_submission(folder, "throne-1dof", seed=7, compact=True)
     return folder
@@ -33,7 +33,7 @@ def test_it_is_the_packages_own():
 
 
 def test_numbers_of_the_notebook_are_checked_first_which_then_where(lab):
-    """Neither answer has a value, and both are in the file of `cartlab check`."""
+    """A first check says which numbers disagree, and a second where to look; both are logged."""
     first = check(lab, reported={"final": IN_HERTZ})
     assert first.disagree == ("final.omega_n",)
     assert first.agree == ("final.K", "final.zeta")
@@ -45,7 +45,7 @@ def test_numbers_of_the_notebook_are_checked_first_which_then_where(lab):
 
 
 def test_without_numbers_those_of_the_file_are_checked(lab):
-    """With the answer that the command line gives for the same folder, but for its count."""
+    """Without numbers from the notebook, those in `submission.toml` are checked."""
     with (lab / "submission.toml").open("a", encoding="utf-8") as file:
         file.write("\n[reported.final]\nK = 28.9\nomega_n = 2.1\nzeta = 0.101\n")
     typed = check(lab, reported={"final": IN_HERTZ})
@@ -56,7 +56,7 @@ def test_without_numbers_those_of_the_file_are_checked(lab):
 
 
 def test_numbers_that_numpy_computed_are_numbers(lab):
-    """Also in arrays: gains, and the matrices of a state model."""
+    """Numbers that numpy computed are accepted, in arrays too, such as a state model's matrices."""
     computed = {name: np.float64(value) for name, value in RIGHT.items()}
     A = np.array([[0.0, 1.0], [-(13.2**2), -2 * 0.101 * 13.2]])
     B = np.array([[0.0], [28.9 * 13.2**2]])
@@ -66,7 +66,7 @@ def test_numbers_that_numpy_computed_are_numbers(lab):
 
 
 def test_a_text_keeps_the_digits_that_were_typed(lab):
-    """Python drops the 0 of 0.10, which makes its last digit coarser."""
+    """A number given as text keeps its digits: "0.10" counts as finer than 0.1."""
     as_typed = check(lab, reported={"final": {"zeta": "0.10"}})
     as_number = check(lab, reported={"final": {"zeta": 0.10}})
     assert as_typed.agree == as_number.agree == ("final.zeta",)
@@ -74,7 +74,7 @@ def test_a_text_keeps_the_digits_that_were_typed(lab):
 
 
 def test_a_share_counts_missing_numbers_as_wrong(lab):
-    """So that nobody earns more by reporting less."""
+    """A missing number counts as wrong, so that nobody earns more by reporting less."""
     found = check(lab, reported={"final": {"K": 28.9, "omega_n": 2.1}})
     assert found.share("final.K") == 1.0
     assert found.share("final.K", "final.omega_n") == 0.5
@@ -84,7 +84,7 @@ def test_a_share_counts_missing_numbers_as_wrong(lab):
 
 
 def test_a_rubric_gives_its_tolerances(lab, tmp_path):
-    """A number 10 % off passes a rubric that allows 20 %."""
+    """With a rubric that allows 20 %, a number that is 10 % off agrees."""
     text = (RUBRICS / "throne-1dof.toml").read_text(encoding="utf-8")
     text = re.sub(r"(?m)^(full|none)_percent = .*\n", "", text)
     limits = 'check = "final"\nfull_percent = 20.0\nnone_percent = 40.0'
@@ -109,7 +109,7 @@ def test_a_rubric_gives_its_tolerances(lab, tmp_path):
     ],
 )
 def test_what_is_no_number_is_one_clear_error(lab, reported, said):
-    """And no answer is counted for it."""
+    """A text, NaN or unknown name in place of a number is one error, and no answer is counted."""
     with pytest.raises(SubmissionError, match=said):
         check(lab, reported=reported)
     assert read_answers(lab) == ()

@@ -1,4 +1,4 @@
-"""`explain` in a notebook: tables and systems that say what `cartlab gap` says."""
+"""`explain` in a notebook gives tables and systems with the results of `cartlab gap`."""
 
 import control
 import numpy as np
@@ -18,7 +18,7 @@ FORCE, LAG = 0.004, 0.02  # V, s
 
 @pytest.fixture(scope="module")
 def gap(tmp_path_factory) -> ExplainedGap:
-    """One cart with dry friction and a drive that lags."""
+    """The gap of one cart with dry friction and a drive that lags."""
     folder = tmp_path_factory.mktemp("explained") / "lab"
     hide = [f"coulomb_friction:cart=1,force={FORCE}", f"actuator_lag:time_constant={LAG}"]
     bench = prepare_bench(preset="throne-1dof", hide=hide)
@@ -27,7 +27,7 @@ def gap(tmp_path_factory) -> ExplainedGap:
 
 
 def test_effects_are_a_table(gap):
-    """One row for each effect, in the order found, and one for each parameter with its unit."""
+    """The table has one row for each parameter of an effect, in the order found, with its unit."""
     assert pipeline.explain is explain
     assert gap.verdict == "named"
     assert sorted(gap.effects["effect"]) == ["actuator_lag", "coulomb_friction"]
@@ -41,7 +41,7 @@ def test_effects_are_a_table(gap):
 
 
 def test_a_recording_is_simulated_by_both_models(gap):
-    """By time: measured, linear, with the effects; only the last comes near the measurement."""
+    """Of both simulations of a recording, only the one with the effects is near the measurement."""
     frame = gap.simulate(gap.records[-1])
 
     assert frame.index.name == "time"
@@ -53,7 +53,7 @@ def test_a_recording_is_simulated_by_both_models(gap):
 
 
 def test_the_systems_are_those_of_the_models(gap):
-    """The linear one is the chain; the other has a lag, and friction that stops a release."""
+    """The linear system is the chain; the other has a lag, and friction that stops a release."""
     assert gap.linear.state_labels == ["x1", "v1"]
     assert_allclose(gap.linear.A, gap.results.linear.chain.state_space()[0])
     assert isinstance(gap.system, control.NonlinearIOSystem)
@@ -70,13 +70,13 @@ def test_the_systems_are_those_of_the_models(gap):
 
     (x,) = np.atleast_2d(response.outputs)
     assert np.abs(x[:100]).max() > 1.0
-    # Friction holds the cart within force / stiffness of its spring's rest.
+    # Friction holds the cart within force / stiffness of its spring's rest position.
     assert np.ptp(x[-100:]) < 1e-3
     assert abs(x[-1]) <= FORCE / gap.results.model.chain.k.sum()
 
 
 def test_the_force_left_is_a_table(gap):
-    """One row for each window; if the model is right, only noise is left."""
+    """The table of forces has one row per window; if the model is right, it holds only noise."""
     assert list(gap.residual.columns) == [
         "experiment", "time", "cart", "position", "velocity", "input", "force",
     ]  # fmt: skip
@@ -86,7 +86,7 @@ def test_the_force_left_is_a_table(gap):
 
 
 def test_the_plots_show_what_the_gap_found(gap):
-    """Held-out runs simulated with the effects: the same curves as the gap, and its errors."""
+    """The plots show the gap's own curves and errors for the held-out runs."""
     runs = {run.id: run for run in compare_runs(gap.analysis, gap=gap.results, progress=silent)}
     held = [row for row in gap.results.by_record if row.held_out]
     assert {runs[row.experiment].kind for row in held} >= {"decay", "step"}
@@ -97,6 +97,6 @@ def test_the_plots_show_what_the_gap_found(gap):
         frame = gap.simulate(row.experiment)
         shown = found.y[-len(frame) :]
         swing = np.ptp(cart.measured)
-        # The start of each run is fitted again, within the noise of some readings.
+        # The start of each run is fitted again, within the noise of a few readings.
         assert_allclose(shown, frame["with_effects", "x1"], atol=2 * row.noise_floor * swing)
         assert found.nrmse < max(1.2 * row.final, 1.1 * row.noise_floor)

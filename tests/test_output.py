@@ -1,4 +1,4 @@
-"""Results are written whole, in their place, and never through a link."""
+"""An output file is written whole, in its own folder, and never through a link."""
 
 import csv
 import io
@@ -26,7 +26,7 @@ from pipeline.output import (
 
 
 def test_a_file_is_replaced_whole(tmp_path):
-    """New content takes the place of the old, with nothing left beside it."""
+    """A file gets its new content at once, and no temporary file is left."""
     path = tmp_path / "results.json"
     write_file(path, "old")
     write_file(path, "ω\n")
@@ -35,7 +35,7 @@ def test_a_file_is_replaced_whole(tmp_path):
 
 
 def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
-    """The file is one writer's, whole; a failed write leaves no file behind."""
+    """If many write a file at once, it holds one writer's content; failed writes leave nothing."""
     path, texts = tmp_path / "notes.md", [str(i) * 300_000 for i in range(8)]
     with ThreadPoolExecutor(8) as pool:
         list(pool.map(lambda text: write_file(path, text), 5 * texts))
@@ -47,9 +47,9 @@ def test_a_file_that_many_write_at_once_is_one_of_theirs(tmp_path):
 
 
 def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
-    """Only old files of ours are removed.
+    """A write removes the old temporary files of writes that were killed, and no other files.
 
-    Others may be writing, or a student may use such a name.
+    Newer ones may still be in use, and a student may have a file with a similar name.
     """
     names = [f".{16 * '0'}.part", f".{16 * '1'}.part", ".mine.part", "left.part"]
     for name in names:
@@ -61,7 +61,7 @@ def test_what_a_killed_write_left_goes_with_the_next(tmp_path):
 
 
 def test_a_folder_is_looked_through_once(tmp_path):
-    """A folder of thousands of files is searched once: a search takes longer than a write."""
+    """Old temporary files are searched once per folder, as a search takes longer than a write."""
     write_file(tmp_path / "notes.md", "whole")
     left = tmp_path / f".{16 * '0'}.part"
     left.write_text("half")
@@ -71,7 +71,7 @@ def test_a_folder_is_looked_through_once(tmp_path):
 
 
 def test_a_link_is_replaced_not_followed(tmp_path):
-    """A link inside a submission does not lead our output to another file."""
+    """A link in a submission is replaced by the output, which does not go to the link's target."""
     victim = tmp_path / "victim"
     victim.write_text("precious")
     link = tmp_path / "report.html"
@@ -82,17 +82,17 @@ def test_a_link_is_replaced_not_followed(tmp_path):
 
 
 def test_a_linked_folder_inside_a_submission_is_refused(tmp_path):
-    """The default output folder of a submission must be a folder of its own."""
+    """If a submission's default output folder is a link to elsewhere, it is refused."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     (tmp_path / "report").symlink_to(elsewhere)
     with pytest.raises(ConfigError, match="is a link; choose another folder with --out"):
         own_folder(tmp_path, "report")
-    assert check_folder(tmp_path / "report").is_dir()  # if the user names it
+    assert check_folder(tmp_path / "report").is_dir()  # allowed if the user names it
 
 
 def test_a_file_in_the_way_is_refused(tmp_path):
-    """A file where the output folder should be is named."""
+    """If a file has the name of the output folder, the error names it."""
     (tmp_path / "out").write_text("")
     with pytest.raises(ConfigError, match="out: is a file"):
         check_folder(tmp_path / "out")
@@ -100,7 +100,7 @@ def test_a_file_in_the_way_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", ["report.pdf", "gs.csv", "Grades.HTML"])
 def test_a_file_s_name_is_no_new_folder(tmp_path, name):
-    """A name with an ending is a file; an existing folder of that name is a folder."""
+    """An output name with an ending is a file, unless a folder of that name exists."""
     with pytest.raises(ConfigError, match="give a folder with --out"):
         named_folder(tmp_path / name)
     (tmp_path / name).mkdir()
@@ -109,7 +109,7 @@ def test_a_file_s_name_is_no_new_folder(tmp_path, name):
 
 
 def test_stale_files_go(tmp_path):
-    """Only files that match are removed, also links, but no folders."""
+    """Only files and links that match a pattern are removed, and no folders."""
     (tmp_path / "a.svg").write_text("")
     (tmp_path / "keep.txt").write_text("")
     (tmp_path / "b.svg").mkdir()
@@ -118,7 +118,10 @@ def test_stale_files_go(tmp_path):
 
 
 def test_a_folder_with_something_in_it_is_not_new(tmp_path):
-    """A submission is never written over another; an empty folder is accepted."""
+    """A submission is never written into a folder that holds something.
+
+    An empty folder is accepted.
+    """
     assert new_folder(tmp_path / "fresh") == tmp_path / "fresh"
     assert new_folder(tmp_path) == tmp_path
     (tmp_path / "submission.toml").write_text("")
@@ -133,7 +136,7 @@ def test_a_folder_with_something_in_it_is_not_new(tmp_path):
     "text", ["-1.5", "+3", "1e-3", "-.5", "7", "-", "ünal-lab", "K_1: 2; K_2: 3"]
 )
 def test_numbers_and_words_are_left_alone(text):
-    """A minus sign before a number is not a formula, nor is one inside a word."""
+    """A minus sign before a number, or inside a word, does not count as a formula."""
     assert harmless(text) == text
 
 
@@ -148,7 +151,7 @@ _HIDING = [
 @pytest.mark.parametrize("hidden", _HIDING)
 @pytest.mark.parametrize("before", ["", "x;", 'x;"', "x; '"])
 def test_formulas_are_neutralised(before, hidden, sign):
-    """Formulas are found behind invisible characters, at a cell's start and after a semicolon."""
+    """Formulas are found after invisible characters, at a cell's start and after a semicolon."""
     text = harmless(before + hidden + sign)
     assert text.isprintable()
     assert re.match(r"(x;)?'[ \"']*" + re.escape(sign), text)
@@ -160,7 +163,7 @@ _MEANT = st.text(st.sampled_from("=+-@;,\"'\r\n\t \u3000\u00ad\u200eab1")) | st.
 @given(st.lists(st.lists(_MEANT, min_size=2, max_size=2), max_size=4))
 @pytest.mark.parametrize("separator", [",", ";", "\t"])
 def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
-    """With any separator of a spreadsheet: as many rows as were written, and no formula."""
+    """With any separator of a spreadsheet, a table has as many rows as written, and no formula."""
     text = csv_text(("a", "b"), rows)
     assert not [c for c in text if unicodedata.category(c).startswith("C") and c != "\n"]
     assert text.count("\n") == len(rows) + 1
@@ -168,13 +171,13 @@ def test_no_row_and_no_formula_comes_of_a_text(separator, rows):
     if separator == ",":
         assert back == [["a", "b"], *([harmless(cell) for cell in row] for row in rows)]
     cells = [cell for row in back for cell in row]
-    # A dash for a missing value is not quoted; a program that joins it with the next comma sees no
+    # A dash for a missing value is not quoted. A program that joins it with the next comma sees no
     # formula.
     number = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-(,.*)?", re.IGNORECASE | re.DOTALL)
     assert not [c for c in cells if c.lstrip()[:1] in [*"=+-@"] and not number.fullmatch(c)]
 
 
 def test_numbers_stay_bare_and_texts_are_quoted():
-    """Every program reads a number as a number; a missing number is an empty cell."""
+    """In a table numbers are bare and texts quoted; a missing number is an empty cell."""
     rows = [("1024", 17.50, np.float64(1 / 3), np.int64(3), float("nan"), None, 'a "b"')]
     assert csv_text("abcdefg", rows).splitlines()[1] == '"1024",17.5,0.3333333333,3,,,"a ""b"""'

@@ -53,7 +53,7 @@ def test_parameters_follow_the_papers_table(results):
 
 
 def test_shapes_agree_with_the_number_of_carts(results):
-    """Matrices, gains and poles have the sizes that two carts ask for."""
+    """Matrices, gains and poles have the sizes that belong to two carts."""
     space = results["state_space"]
     assert [len(space["A"]), len(space["A"][0]), len(space["B"]), len(space["B"][0])] == [
         4,
@@ -67,7 +67,7 @@ def test_shapes_agree_with_the_number_of_carts(results):
 
 
 def test_hardware_has_one_entry_a_run_and_cart(results):
-    """The loop that ran and the plant driven by the measured input have one entry each."""
+    """The loop that ran, and the plant under the measured input, each have one entry per cart."""
     keys = [(entry["experiment"], entry["cart"]) for entry in results["hardware"]]
     assert len(keys) == len(set(keys)) == 2
     assert all(entry["loop"] == "closed" for entry in results["hardware"])
@@ -75,7 +75,7 @@ def test_hardware_has_one_entry_a_run_and_cart(results):
 
 
 def test_every_data_file_has_its_hash(results):
-    """Provenance lists each file named in the submission with a SHA-256."""
+    """results.json lists each file named in the submission with its SHA-256."""
     files = results["provenance"]["files"]
     assert {p.name for p in (EXAMPLES / "two-cart" / "data").iterdir()} == {
         name.rpartition("/")[2] for name in files

@@ -22,7 +22,7 @@ DOCS = ROOT / "docs"
 
 
 def assert_fits(name: str, text: str) -> None:
-    """Insist that a file obeys the shipped schema, and that the model knows each of its keys."""
+    """Assert that a file obeys the shipped schema and has no key that the model lacks."""
     shipped = json.loads((DOCS / f"{name}.schema.json").read_text(encoding="utf-8"))
     jsonschema.Draft202012Validator(shipped).validate(json.loads(text))
     back = file_model(MODELS[name]).model_validate_json(text).model_dump_json(by_alias=True)
@@ -45,7 +45,7 @@ def example(request):
 
 
 def test_real_results_obey_the_schema(example):
-    """Results and solution of every shipped example fit the schema; it lacks no key."""
+    """Results and solution of every shipped example obey the schema, which has all their keys."""
     assert_fits("results", json_text(example))
     assert_fits("solution", solution_text(example))
 
@@ -61,13 +61,13 @@ def test_results_with_gaps_obey_the_schema(carts):
 
 @pytest.mark.parametrize("verdict", ["named", "partial", "none", "ambiguous", "unexplained"])
 def test_gaps_obey_the_schema(verdict):
-    """Every verdict's file fits, effects, rivals and windows included."""
+    """gap.json obeys the schema for every verdict, with effects, rivals and windows."""
     keys = () if verdict == "none" else ("coulomb_friction", "cubic_spring")
     assert_fits("gap", json_text(make_gap(verdict, keys)))
 
 
 def test_grades_obey_the_schema(tmp_path):
-    """A class with every kind of row: graded, failed, flagged, shared, late, changed by hand."""
+    """Grades obey the schema: graded, failed, flagged, shared, late, changed by hand."""
     files = sorted((write_class(tmp_path) / "feedback").glob("*/grade.json"))
     assert len(files) == 16
     for file in files:
@@ -89,7 +89,7 @@ def test_a_broken_file_does_not_obey():
 
 
 def test_the_command_prints_it():
-    """`cartlab schema gap` is the shipped text; an unknown name is refused with a list of names."""
+    """`cartlab schema gap` prints the shipped schema; an unknown name gets the list of names."""
     command = [sys.executable, "-m", "pipeline", "schema"]
     done = subprocess.run([*command, "gap"], capture_output=True, encoding="utf-8", check=True)
     assert done.stdout == (DOCS / "gap.schema.json").read_text(encoding="utf-8")

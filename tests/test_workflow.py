@@ -24,12 +24,12 @@ def analyses():
 
 @pytest.mark.parametrize("name", PRESET_OF)
 def test_examples_give_back_the_carts_that_made_them(analyses, name):
-    """Every final parameter is that of the preset within four standard errors."""
+    """In each example all final parameters are within four standard errors of the truth."""
     truth = PRESETS[PRESET_OF[name]].parameters()
     final = {row.name: row.final for row in analyses[name].rows}
     assert list(final) == list(truth)
     for parameter, estimate in final.items():
-        # Four sigma on 32 parameters: one in 500 fixed seeds would fail by chance.
+        # With four standard errors and 32 parameters, one in 500 fixed seeds would fail by chance.
         assert abs(estimate.value - truth[parameter]) < 4 * estimate.std, parameter
         # The standard errors themselves are small: about 30 dwells at 0.1 %.
         assert estimate.std < 2e-3 * truth[parameter], parameter
@@ -37,7 +37,7 @@ def test_examples_give_back_the_carts_that_made_them(analyses, name):
 
 @pytest.mark.parametrize("name", PRESET_OF)
 def test_examples_pass_every_check_and_skip_nothing(analyses, name):
-    """The shipped examples are whole and consistent: all stages ran, no check fails."""
+    """In the shipped examples every stage runs and no check fails."""
     analysis = analyses[name]
     assert not analysis.skipped
     assert [check.id for check in analysis.checks if check.outcome == "fail"] == []
@@ -46,13 +46,13 @@ def test_examples_pass_every_check_and_skip_nothing(analyses, name):
 
 
 def test_same_input_gives_same_bytes(analyses):
-    """Analysing the same folder again gives the same results.json."""
+    """Analysing the same folder twice gives the same bytes of results.json."""
     again = analyse(load_submission(EXAMPLES / "two-cart"))
     assert json_text(again) == json_text(analyses["two-cart"])
 
 
 def test_how_the_records_follow_is_handed_on(analyses):
-    """The fit of the records to the carts is computed once and handed on."""
+    """`analyse` hands on how well the carts explain each record, as a new computation confirms."""
     for analysis in analyses.values():
         fits = follow(analysis.records, analysis.chain)
         assert fits
@@ -89,8 +89,8 @@ def test_a_missing_experiment_is_skipped_with_its_reason_and_the_rest_goes_on(
     analysis = analyse(_without(tmp_path, kinds=[kind]))
     assert stage in {skip.name for skip in analysis.skipped}
     truth = PRESETS["throne-2dof"]
-    # Without dwells the fit rests on steps and a sweep in encoder counts: percents, not tenths of a
-    # percent.
+    # Without dwells the fit uses steps and a sweep in encoder counts: right to percents, not to
+    # tenths of a percent.
     assert analysis.chain is not None
     assert_allclose(analysis.chain.m, truth.m, rtol=0.01)
     assert_allclose(analysis.chain.k[1:], truth.k[1:], rtol=0.01)
@@ -107,7 +107,7 @@ def test_steps_alone_still_give_a_full_report(tmp_path):
 
 
 def test_decays_alone_end_in_reasons_not_in_a_crash(tmp_path):
-    """Decays alone give no final estimate; everything that needs one gives the reason."""
+    """From decays alone, each stage that needs the final estimate is skipped with a reason."""
     analysis = analyse(_without(tmp_path, kinds=["sine", "sweep", "step", "closed_loop"]))
     assert analysis.chain is None
     stages = {skip.stage for skip in analysis.skipped}
@@ -127,7 +127,7 @@ def test_no_controller_is_designed_for_a_goal_that_nobody_stated():
 
 
 def test_the_design_can_be_left_out_and_had_later(analyses):
-    """Grading skips the design; computed later it is the same as in the whole workflow."""
+    """An analysis without the design, as grading uses it, can compute the same design later."""
     submission, whole = load_submission(EXAMPLES / "one-cart"), analyses["one-cart"].feedback
     without = analyse(submission, design=False)
     assert without.feedback is None

@@ -27,12 +27,12 @@ from pipeline.workflow import analyse
 COUNT = 0.00227  # cm, the encoder step
 RATE = 200.0  # Hz
 BODY = Chain(m=np.array([3e-4]), c=np.array([1e-3]), k=np.zeros(2))  # V, cm, s: slows in 0.3 s
-# Four standard errors: one in 16 000 parameters is further off by chance.
+# Four standard errors: by chance one in 16 000 parameters is further off.
 SIGMAS = 4.0
 
 
 def record(folder: Path, chain: Chain, name: str, u: Array, *, rng: np.random.Generator) -> None:
-    """Write the encoder readings of a run from rest under u (n,) as `data/NAME.csv`."""
+    """Write the encoder readings of a run from rest under input u (n,) as `data/NAME.csv`."""
     t = np.arange(u.size) / RATE
     y = simulate_linear(chain, t, u)
     y = COUNT * np.round((y + rng.normal(0, COUNT / 4, y.shape)) / COUNT)
@@ -74,7 +74,7 @@ def dwells(
 
 
 def assert_body_found(analysis: Analysis) -> None:
-    """Check that mass and damping are right within a few percent and within their errors."""
+    """Assert that mass and damping are right within a few percent and their errors."""
     final = {row.name: row.final for row in analysis.rows}
     assert list(final) == ["mass", "damping"]
     for name, truth in {"mass": BODY.m[0], "damping": BODY.c[0]}.items():
@@ -92,7 +92,7 @@ def assert_body_found(analysis: Analysis) -> None:
     ids=str,
 )
 def test_carts_on_some_springs_are_found(tmp_path, k):
-    """Whichever wall lacks a spring, every named parameter is that of the bench."""
+    """Whichever wall lacks a spring, every named parameter of the carts is found."""
     m, c = np.array([3e-4, 2.5e-4, 2e-4]), np.array([1.2e-3, 8e-4, 6e-4])
     chain = Chain(m=m[: len(k) - 1], c=c[: len(k) - 1], k=np.array(k))
     write_submission(tmp_path / "bench", SimulatedBench(chain=chain), seed=len(k), compact=True)
@@ -108,7 +108,7 @@ def test_carts_on_some_springs_are_found(tmp_path, k):
 
 @pytest.mark.parametrize("frequencies", [[0.5, 2.0], [0.5, 1.0, 2.0], [0.4, 0.6, 1.0, 1.5, 2.5]])
 def test_dwells_give_a_body_on_no_spring_its_mass_and_damping(tmp_path, frequencies):
-    """Two dwells are enough: two amplitudes and two phases determine two parameters."""
+    """Two dwells suffice for a free body: two amplitudes and two phases give mass and damping."""
     runs = dwells(tmp_path, frequencies, rng=np.random.default_rng(len(frequencies)))
     analysis = analysed(tmp_path, springs="[false, false]", carts=1, runs=runs)
     assert analysis.fit is not None
@@ -117,7 +117,7 @@ def test_dwells_give_a_body_on_no_spring_its_mass_and_damping(tmp_path, frequenc
 
 
 def test_a_step_gives_a_body_on_no_spring_its_mass_and_damping(tmp_path):
-    """Without dwells the run under a constant force determines both."""
+    """Without dwells a run under constant force gives a free body's mass and damping."""
     t = np.arange(int(4 * RATE)) / RATE
     u = 5e-3 * (np.where(t > 0.2, 1.0, 0.0) - np.where(t > 2.0, 1.0, 0.0))
     record(tmp_path, BODY, "push", u, rng=np.random.default_rng(1))
@@ -130,7 +130,7 @@ def test_a_step_gives_a_body_on_no_spring_its_mass_and_damping(tmp_path):
 
 
 def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
-    """They have masses, dampings and a spring but no static gains, which the report skips."""
+    """Two carts without wall springs get masses, dampings and spring, but no static gains."""
     chain = Chain(m=np.array([3e-4, 2e-4]), c=np.array([1e-3, 6e-4]), k=np.array([0, 0.06, 0]))
     t = np.arange(int(8 * RATE)) / RATE
     u = 0.02 * np.sin(2 * np.pi * (0.5 + 0.3 * t) * t)
@@ -150,7 +150,7 @@ def test_two_carts_that_no_spring_ties_to_a_wall_are_found(tmp_path):
     "springs", [(False, True, False), (True, False, False)], ids=["no wall", "not joined"]
 )
 def test_springs_that_the_bench_does_not_have_are_asked_about(tmp_path, springs):
-    """If no carts fit, the summary asks about the springs; no heading or column is empty."""
+    """If no carts fit, the summary asks about the springs, and no heading or column is empty."""
     shutil.copytree(EXAMPLES / "two-cart", tmp_path / "bench")  # between cart 2 and the wall is one
     toml = tmp_path / "bench" / "submission.toml"
     text = re.sub("springs = .*", f"springs = {json.dumps(springs)}", toml.read_text("utf-8"))

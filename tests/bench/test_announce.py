@@ -11,13 +11,13 @@ from pipeline.simulated.emulator.announce import RunningBench, announced, runnin
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path, monkeypatch):
-    """Use a runtime folder apart from that of the benches of other tests."""
+    """Keep the benches of these tests apart from those of other tests."""
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     return tmp_path
 
 
 def test_a_bench_is_listed_while_it_runs():
-    """It is listed neither before nor after."""
+    """A virtual bench is listed while it runs, and neither before nor after."""
     bench = RunningBench(name="throne-1dof", address="socket://127.0.0.1:7")
     assert running_benches() == []
     with announced(bench):
@@ -26,7 +26,7 @@ def test_a_bench_is_listed_while_it_runs():
 
 
 def test_a_bench_that_was_killed_is_not_listed(own_folder):
-    """Not even if another process has its number now; the next bench removes its file."""
+    """A killed bench is not listed, even if another process has its number; its file is removed."""
     bench = RunningBench(name="b", address="socket://127.0.0.1:8")
     with announced(bench):
         (folder,) = own_folder.iterdir()
@@ -41,7 +41,7 @@ def test_a_bench_that_was_killed_is_not_listed(own_folder):
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has other rights")
 def test_a_folder_that_others_can_write_to_is_not_believed(own_folder):
-    """A link to a folder is not trusted either."""
+    """Benches in a folder that others can write to, or in a linked folder, are not listed."""
     bench = RunningBench(name="b", address="socket://127.0.0.1:8")
     with announced(bench):
         (folder,) = own_folder.iterdir()

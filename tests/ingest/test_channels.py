@@ -1,4 +1,4 @@
-"""What signals reveal by themselves: encoder step, sign of the input, broken channels."""
+"""What the signals themselves reveal: encoder step, broken or clipped channels, copies."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,10 @@ def test_a_signal_without_steps_has_no_encoder_step():
 
 
 def test_a_mirrored_position_is_told_from_a_reference():
-    """A copy of encoder 1 read between two samples mirrors it; a set point does not."""
+    """A copy of encoder 1, read between two samples, is recognised as a copy.
+
+    A set point is not taken for a copy.
+    """
     x = np.rint(440 * (1 - np.exp(-2 * T) * np.cos(13 * T)))
     between = np.rint(0.5 * x + 0.5 * np.r_[x[0], x[:-1]])
     assert mirrors(between, x)
@@ -47,7 +50,7 @@ def test_a_mirrored_position_is_told_from_a_reference():
 
 
 def test_a_stuck_encoder_is_found():
-    """A reading that freezes at speed and jumps back is stuck; a cart at its crest is not."""
+    """A reading that freezes in motion and jumps back is stuck; a cart at its peak is not."""
     x = np.rint(440 * np.sin(6 * T))
     assert stuck_spans(x) == []
     frozen = x.copy()
@@ -60,7 +63,10 @@ def test_a_stuck_encoder_is_found():
 
 
 def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
-    """With few counts no reading shows speed; a cart held by friction continues where it is."""
+    """A coarse encoder was stuck if it comes back with a jump.
+
+    A cart held by friction does not jump.
+    """
     x = np.rint(12 * np.sin(3 * T))
     assert stuck_spans(x) == []
     held = np.concatenate([x[:240], np.full(60, x[240]), x[240:]])
@@ -72,7 +78,7 @@ def test_a_coarse_encoder_that_stuck_comes_back_with_a_jump():
 
 @pytest.mark.parametrize("digits", [2, 3, 4, 9])
 def test_clipping_is_told_from_a_rounded_crest(digits):
-    """A sine rounded to a few digits dwells at its crest, but is not clipped."""
+    """A sine that rounding makes flat at its peak is not taken for a clipped one."""
     crest = np.round(0.8 * np.sin(7.3 * T), digits)
     assert saturation(crest) is None
     clipped = np.clip(np.round(1.6 * np.sin(7.3 * T), digits), -1.0, 1.0)
@@ -80,7 +86,7 @@ def test_clipping_is_told_from_a_rounded_crest(digits):
 
 
 def test_a_coarse_encoder_clips_no_crest_of_a_few_samples():
-    """Noise takes a count off the top of a sine of 23 samples a cycle: three of them are equal."""
+    """A coarse sine with three equal samples at its peak, as noise may leave, is not clipped."""
     t = 0.00884 * np.arange(159)
     sines = [np.round(34 * np.sin(31.2274 * t + phase)) for phase in np.linspace(0, 6, 400)]
     assert {saturation(np.minimum(sine, 33)) for sine in sines} == {None}
@@ -88,6 +94,6 @@ def test_a_coarse_encoder_clips_no_crest_of_a_few_samples():
 
 
 def test_steps_and_slow_approaches_are_not_clipped():
-    """Inputs with flat extremes by design, and slow approaches, are sound."""
+    """Steps and slow approaches to a value are not taken for clipping."""
     assert saturation(np.where(T > 1, 1.0, 0.0)) is None
     assert saturation((1 - np.exp(-2 * T)).round(4)) is None

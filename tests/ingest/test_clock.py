@@ -1,4 +1,4 @@
-"""Sample times: true ones are kept, rounded ones straightened, broken ones found."""
+"""Sample times: true ones are kept, rounded ones replaced by an even clock, broken ones found."""
 
 import numpy as np
 import pytest
@@ -24,8 +24,8 @@ def test_a_rounded_even_clock_is_straightened(interval, start, n, rounded_down):
     clock = read_clock(stamps)
 
     assert clock.stopped is None
-    # Rounding is at its worst where it jumps once, by 1 ms in mid-record: a least-squares slope
-    # takes 1.5 ms/n from such a step.
+    # Rounding errs most if it jumps once, by 1 ms in the middle of a record: the slope of least
+    # squares changes by 1.5 ms/n.
     assert_allclose(clock.mean_interval, interval, atol=1.6e-3 / n)
     offset = np.median(clock.t - true)  # rounding down may shift all by a whole step
     assert abs(offset) <= 1e-3
@@ -33,7 +33,7 @@ def test_a_rounded_even_clock_is_straightened(interval, start, n, rounded_down):
 
 
 def test_the_ecp_clock_is_found():
-    """8.854 ms in stamps of 1 ms, as the ECP prints them, to a nanosecond's worth of rate."""
+    """The ECP's interval of 8.854 ms is found to nanoseconds from stamps in whole ms."""
     true = 0.0088542 * np.arange(677, dtype=np.float64)
     clock = read_clock(np.round(true, 3))
     assert (clock.rounding, clock.pieces) == (1e-3, 1)
@@ -41,7 +41,7 @@ def test_the_ecp_clock_is_found():
 
 
 def test_a_clock_that_missed_beats_is_straightened_in_pieces():
-    """If a bench skipped samples, each part gets its own line within the rounding."""
+    """If a bench skipped samples, each part between gaps gets its own even clock."""
     steps = np.full(8000, 0.0011279)
     steps[[1500, 4200, 6100]] += 0.004
     true = np.cumsum(steps)
@@ -49,13 +49,13 @@ def test_a_clock_that_missed_beats_is_straightened_in_pieces():
     clock = read_clock(true.round(3))
 
     assert clock.pieces > 1
-    assert np.abs(clock.t - true).max() < 1e-3  # never farther off than the stamps' own rounding
+    assert np.abs(clock.t - true).max() < 1e-3  # never farther off than the rounding of the stamps
     assert np.sqrt(np.mean((clock.t - true) ** 2)) < 1e-4  # stamps alone: 0.29 ms
 
 
 @pytest.mark.parametrize("digits", [9, 6, 5])
 def test_true_uneven_times_are_kept_as_they_are(digits):
-    """Jitter and drift of the clock are measured truth, not rounding."""
+    """Times that jitter or drift by more than their rounding are kept as measured."""
     rng = np.random.default_rng(3)
     steps = 0.005 * (1 + 0.05 * rng.standard_normal(2000) + np.linspace(0, 0.1, 2000))
     stamps = np.round(np.cumsum(steps), digits)
@@ -66,7 +66,7 @@ def test_true_uneven_times_are_kept_as_they_are(digits):
 
 
 def test_a_jittering_clock_in_rounded_stamps_is_kept():
-    """If no straight line fits within the rounding, the stamps are kept."""
+    """If no even clock fits the stamps within their rounding, the stamps are kept."""
     rng = np.random.default_rng(4)
     stamps = np.round(np.cumsum(0.005 + 0.001 * rng.standard_normal(2000)), 3)
     clock = read_clock(stamps)
@@ -75,24 +75,24 @@ def test_a_jittering_clock_in_rounded_stamps_is_kept():
 
 
 def test_an_even_clock_needs_no_straightening():
-    """Stamps that are exact multiples are left alone."""
+    """Even stamps, without any rounding error, are kept."""
     clock = read_clock(0.001 * np.arange(500, dtype=np.float64))
     assert clock.pieces == 0
     assert clock.jitter < 1e-12
 
 
 def test_several_samples_to_one_stamp_are_told_apart():
-    """A 2.3-kHz log in whole ms has equal stamps; the clock behind them is recovered."""
+    """From a log at 2.3 kHz, whose stamps in whole ms repeat, the even clock is recovered."""
     true = np.arange(2000, dtype=np.float64) / 2300
     clock = read_clock(np.floor(true * 1e3) / 1e3)
     assert clock.stopped is None
     assert (np.diff(clock.t) > 0).all()
-    assert_allclose(clock.mean_interval, 1 / 2300, rtol=1e-3)  # 1 ms of 870 ms
+    assert_allclose(clock.mean_interval, 1 / 2300, rtol=1e-3)  # 1 ms in a record of 870 ms
 
 
 @pytest.mark.parametrize("at", [1, 37, 99])
 def test_where_time_stops_or_turns_back_is_found(at):
-    """The first sample that does not advance is named."""
+    """The first sample whose time does not advance is found."""
     stamps = 0.01234567 * np.arange(100, dtype=np.float64)
     still, back = stamps.copy(), stamps.copy()
     still[at] = still[at - 1]
@@ -102,7 +102,7 @@ def test_where_time_stops_or_turns_back_is_found(at):
 
 
 def test_gaps_are_found():
-    """An interval of several usual ones is a gap, in even and in rounded stamps."""
+    """An interval several times as long as usual is a gap, in even and in rounded stamps."""
     for stamps in (
         0.01 * np.arange(500, dtype=np.float64),
         np.round(0.0088542 * np.arange(500, dtype=np.float64), 3),
@@ -118,12 +118,12 @@ def test_gaps_are_found():
     [([0.0, 0.009, 0.018], 1e-3), ([1.5, 2.0], 0.1), ([3.0, 4.0], 1.0), ([0.1 / 3, 1.0], 0.0)],
 )
 def test_the_decimal_step_of_stamps(values, step):
-    """The last decimal place in use, none for full precision."""
+    """`decimal_step` is the last decimal place in use, and zero for full precision."""
     assert decimal_step(np.array(values)) == step
 
 
 def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.ndarray]:
-    """Return stamps in whole ms of records of 1 s to 15 s, started at any time."""
+    """Return the stamps in whole ms of records of 1 s to 15 s that start at any time."""
     rng = np.random.default_rng(7)
     sizes = np.linspace(1, 15, n) / interval
     true = [rng.uniform(0, 1) + interval * np.arange(int(size)) for size in sizes]
@@ -132,13 +132,13 @@ def a_session(interval: float, *, n: int = 15, jitter: float = 0.0) -> list[np.n
 
 @pytest.mark.parametrize(
     ("interval", "error"),
-    # 15 s hold several beats between clock and stamps: each pins the phase to a sample's advance
-    # in it, 0.3 µs. Less than one: the rounding over the length of all records, 1 ms in 120 s,
-    # twice that, for most of them show no jump.
+    # In 15 s the stamps jump against the clock several times, and each jump fixes the phase to 0.3
+    # µs. If there is less than one jump: the rounding over the length of all records, 1 ms in 120
+    # s, doubled since most of them show no jump.
     [(1.00031e-3, 3e-7 / 15), (0.99987e-3, 3e-7 / 15), (1.000047e-3, 2e-3 / 120)],
 )
 def test_the_records_of_a_session_share_one_period(interval, error):
-    """Near 1 kHz one record alone is off by up to a stamp in its length; together they are not."""
+    """Near 1 kHz all records of a session together give the period, which one alone would not."""
     stamps = a_session(interval)
 
     clocks = read_clocks(stamps)
@@ -151,15 +151,15 @@ def test_the_records_of_a_session_share_one_period(interval, error):
 
 @pytest.mark.parametrize("interval", [1.00031e-3, 0.99987e-3])
 def test_ticks_that_are_late_at_times_leave_one_period(interval):
-    """Jitter far below the rounding makes stamps flicker and does not split the session."""
+    """Jitter far below the rounding of stamps does not split a session into several periods."""
     clocks = read_clocks(a_session(interval, jitter=2e-5))
     assert len({clock.period for clock in clocks}) == 1
-    # 20 µs of jitter, three deviations of it at either end of the longest record, 15 s.
+    # The jitter is 20 µs: three standard deviations at both ends of the longest record, 15 s.
     assert_allclose(clocks[0].mean_interval, interval, rtol=6 * 2e-5 / 15)
 
 
 def test_clocks_that_differ_stay_apart():
-    """Two benches in one session keep their own periods, and full-precision stamps stay."""
+    """Records of two benches in one session keep their own periods, and exact stamps are kept."""
     one, other = a_session(1.00031e-3, n=4), a_session(0.0088542, n=4)
     exact = 0.00500001 * np.arange(900, dtype=np.float64)
 
@@ -172,7 +172,7 @@ def test_clocks_that_differ_stay_apart():
 
 
 def test_a_session_of_even_stamps_is_left_alone():
-    """If no other period is visible, the stamps are the times."""
+    """If the stamps show no other period than their own, they are kept."""
     stamps = a_session(1e-3)
     for clock, kept in zip(read_clocks(stamps), stamps, strict=True):
         assert clock.pieces == 0

@@ -1,4 +1,4 @@
-"""`cartlab fill` writes what the files in `data/` are into `submission.toml`, in place."""
+"""`cartlab fill` describes the files in `data/` in `submission.toml`, and keeps what is there."""
 
 import json
 import os
@@ -39,12 +39,12 @@ def put(folder: Path, name: str, **columns: np.ndarray) -> None:
 
 
 def states(folder: Path) -> dict[str, tuple[str, str, str | None]]:
-    """Fill; return state, id and kind by file."""
+    """Fill the submission; return state, id and kind by file."""
     return {f.file: (f.state, f.experiment, f.kind) for f in fill_submission(folder)}
 
 
 def test_a_folder_of_files_becomes_a_submission(tmp_path):
-    """Carts, units, kinds and the free carts come from the files; the rest is a comment."""
+    """`fill` finds carts, units, kinds and free carts; all else in the file is a comment."""
     still = 0 * T
     put(tmp_path, "run 10.csv", time=T, input=SINE, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
     put(tmp_path, "run 2.csv", time=T, input=STEP, x1__cm=RING / 300, x2__cm=0.4 * RING / 300)
@@ -65,12 +65,12 @@ def test_a_folder_of_files_becomes_a_submission(tmp_path):
     }  # fmt: skip
     text = (tmp_path / "submission.toml").read_text(encoding="utf-8")
     assert "# unsure: what ran: controller" in text
-    assert "#[design]" in text  # of the commented file that `cartlab new` writes
+    assert "#[design]" in text  # a comment of the file that `cartlab new` writes
     assert len(read_data(submission).records) == 4
 
 
 def test_a_second_run_prints_as_much_as_the_first(tmp_path):
-    """Free carts and unsure facts, until somebody removes the mark from the file."""
+    """A second `fill` repeats free carts and doubts, until a person removes the doubt's mark."""
     still = 0 * T
     put(tmp_path, "pull.csv", time=T, input=still, x1=RING, x2=still)
     put(tmp_path, "loop.csv", time=T, input=RING / 999, reference=STEP, x1=RING, x2=RING)
@@ -92,7 +92,7 @@ def test_a_second_run_prints_as_much_as_the_first(tmp_path):
 
 @pytest.mark.parametrize("command", ["inspect", "fill"])
 def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, command):
-    """A spreadsheet in `data/` is named beside the files that were read, or alone."""
+    """An old spreadsheet in `data/` is named as not read, with other files or alone."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "data" / "b.xls").write_bytes(b"PK")
     done = cartlab_here(command, tmp_path)
@@ -105,7 +105,7 @@ def test_what_is_no_recording_by_its_name_is_said_to_be_left_out(tmp_path, comma
 
 
 def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
-    """A picture and a script are named as not recordings; of many files, the first few."""
+    """Files that are no recordings are named, at most the first few, except what tools hide."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     for name in (".git/HEAD", ".cache/b.csv", "report/bode.svg", "plot.py", "Thumbs.db"):
@@ -126,7 +126,7 @@ def test_every_file_is_named_but_for_what_a_tool_hides(tmp_path):
 
 
 def test_fill_says_whether_it_wrote(tmp_path):
-    """It also writes a comment for an unknown file; a second run changes nothing."""
+    """`fill` says whether it wrote anything, even if it was only a comment on an unknown file."""
     said = []
     for name in ("a.csv", "b.csv", "b.csv"):
         put(tmp_path, name, p=RING, q=STEP)
@@ -136,14 +136,14 @@ def test_fill_says_whether_it_wrote(tmp_path):
 
 
 def test_the_exporter_s_empty_columns_are_no_carts(tmp_path):
-    """An encoder that never moves in any file belongs to no cart."""
+    """An encoder that never moves in any file is not counted as a cart."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING, x2=0.5 * RING, x3=0 * T)
     fill_submission(tmp_path)
     assert load_submission(tmp_path).system.carts == 2
 
 
 def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
-    """Kinds, ids and comments of the person stay; a second run changes nothing."""
+    """`fill` keeps kinds, ids and comments that a person typed, and adds what is missing."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", time=T, input=0 * T, x1=RING)
@@ -167,7 +167,7 @@ def test_what_stands_there_is_kept_and_what_lacks_is_completed(tmp_path):
 
 
 def test_what_is_no_recording_gets_no_table(tmp_path):
-    """Copies, unknown files and texts are named; an unknown file gets a comment, once."""
+    """Copies, texts and unknown files get no table; an unknown file gets one comment."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, "riddle.csv", foo=RING, bar=STEP)
@@ -180,7 +180,10 @@ def test_what_is_no_recording_gets_no_table(tmp_path):
 
 
 def test_the_same_samples_in_another_form_get_one_table(tmp_path):
-    """A recording saved as .csv and .mat is one; another with the same ranges is not a copy."""
+    """The same recording saved as .csv and .mat gets one table.
+
+    A recording that only has the same ranges gets its own table.
+    """
     (tmp_path / "data").mkdir()
     whole = {"time": T, "input": STEP, "x1": RING}
     put(tmp_path, "a.csv", **whole)
@@ -191,7 +194,7 @@ def test_the_same_samples_in_another_form_get_one_table(tmp_path):
 
 
 def test_a_bare_matrix_gets_its_columns(tmp_path):
-    """The columns that the signals reveal are written; nothing is left to ask."""
+    """For a matrix without headings, `fill` writes the columns that the signals reveal."""
     (tmp_path / "data").mkdir()
     rows = [f"{t:.5f}\t{x:.0f}\t{u}" for t, x, u in zip(T, RING, STEP, strict=True)]
     (tmp_path / "data" / "bare.txt").write_text("\n".join(rows) + "\n")
@@ -204,7 +207,7 @@ def test_a_bare_matrix_gets_its_columns(tmp_path):
 
 
 def test_columns_that_the_signals_leave_open_are_asked_about(tmp_path):
-    """Any column may drive the other in a steady sine: one is proposed, the table says to look."""
+    """In a steady sine either column may be the input: `fill` proposes one and asks to check it."""
     (tmp_path / "data").mkdir()
     sines = np.round(300 * np.sin(20 * T)), np.round(200 * np.sin(20 * T - 1))
     rows = [f"{t:.5f}\t{x:.0f}\t{u:.0f}" for t, x, u in zip(T, *sines, strict=True)]
@@ -217,7 +220,7 @@ def test_columns_that_the_signals_leave_open_are_asked_about(tmp_path):
 
 
 def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
-    """An encoder without a cart gets no column; all files get their tables."""
+    """An encoder without a cart gets no column, and all files still get their tables."""
     new_submission(tmp_path, carts=1)
     rows = [
         f"{t:.5f}\t{x:.0f}\t{y:.0f}\t{u}"
@@ -232,9 +235,9 @@ def test_a_bare_matrix_of_more_carts_than_there_are_spoils_nothing(tmp_path):
 
 @pytest.mark.parametrize(("carts", "asked"), [(1, "x1 = …"), (2, "more carts")])
 def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
-    """It gets a table without `carts`.
+    """If a column moves that belongs to none of the stated carts, `fill` asks about it.
 
-    The message says which column moves against the statement.
+    The file gets a table without `carts`.
     """
     new_submission(tmp_path, carts=carts)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=0 * T, x2=0 * T, x3=RING)
@@ -247,7 +250,7 @@ def test_a_cart_that_the_system_has_not_is_asked_about(tmp_path, carts, asked):
 
 
 def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
-    """A held cart that is written so is noted once; without the table it is a question."""
+    """A cart written as held is mentioned once; if its line is removed, `fill` asks about it."""
     put(tmp_path, "run.csv", time=T, input=STEP, x1=RING, x2=0.4 * RING)
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0 * T)
     first, second = fill_submission(tmp_path), fill_submission(tmp_path)
@@ -260,7 +263,7 @@ def test_a_held_cart_that_is_stated_is_no_remark(tmp_path):
 
 
 def test_a_table_without_its_file_is_reported(tmp_path):
-    """A renamed file gets a table of its own, and the old table a hint."""
+    """A renamed file gets a new table, and a hint names it for the table of its old name."""
     put(tmp_path, "step-1.csv", time=T, input=STEP, x1=RING)
     fill_submission(tmp_path)
     (tmp_path / "data" / "step-1.csv").rename(tmp_path / "data" / "step1.csv")
@@ -271,7 +274,7 @@ def test_a_table_without_its_file_is_reported(tmp_path):
 
 
 def test_links_out_of_the_folder_are_not_followed(tmp_path):
-    """A link to somebody else's file is not a file of the submission, and is refused by name."""
+    """A file that is a link to outside the submission is refused, with its name."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     put(tmp_path / "mine", "b.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "mine" / "data" / "a.csv").symlink_to(tmp_path / "theirs" / "data" / "a.csv")
@@ -286,7 +289,7 @@ def test_links_out_of_the_folder_are_not_followed(tmp_path):
 
 
 def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
-    """If `data` leads out of the submission, no name inside it is shown."""
+    """If `data` is a link to outside the submission, no name of a file in it is shown."""
     put(tmp_path / "theirs", "a.csv", time=T, input=STEP, x1=RING)
     (tmp_path / "theirs" / "data" / "grades.xls").write_bytes(b"PK")
     (tmp_path / "mine").mkdir()
@@ -301,7 +304,10 @@ def test_a_data_folder_that_is_a_link_tells_no_name_behind_it(tmp_path):
 
 @pytest.mark.parametrize("mark", ["\u202f", "\u00a0", "\u200b", "\ufeff", "\u202e"])
 def test_a_name_that_does_not_show_is_named(mark, tmp_path):
-    """`fill` names the file it skips and the reason, and exits with 1; the others are filled in."""
+    """A file name with an invisible character is refused and reported.
+
+    Other files are filled in.
+    """
     put(tmp_path, "b.csv", time=T, input=STEP, x1=RING)
     put(tmp_path, f"step{mark}1.csv", time=T, input=STEP, x1=2 * RING)
     done = cartlab_here("fill", str(tmp_path))
@@ -317,7 +323,7 @@ def test_a_name_that_does_not_show_is_named(mark, tmp_path):
 
 
 def test_nothing_to_fill_in_is_one_line(tmp_path):
-    """No folder, no file, a broken `submission.toml`: an error, and nothing is written."""
+    """Without a folder or recordings, or with a broken `submission.toml`, nothing is written."""
     with pytest.raises(ConfigError, match="no such folder"):
         fill_submission(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="contains no recordings"):
@@ -339,18 +345,18 @@ def test_nothing_to_fill_in_is_one_line(tmp_path):
     ],
 )
 def test_what_is_no_table_is_one_line(old, new, where, tmp_path):
-    """A value in place of a table or number gives the file's own error."""
+    """A wrong type in `submission.toml` gives one line that names the key; nothing is written."""
     put(tmp_path, "pull.csv", time=T, input=0 * T, x1=RING, x2=0.4 * RING)
     typed = "version = 1\n[system]\ncarts = 1\n".replace(old, new).replace("[other]\ncarts = 1", "")
     (tmp_path / "submission.toml").write_text(typed, encoding="utf-8")
     done = CliRunner().invoke(app, ["fill", str(tmp_path)])
-    assert isinstance(done.exception, SubmissionError)  # on which the command ends with status 2
+    assert isinstance(done.exception, SubmissionError)  # with which the command ends with status 2
     assert f"submission.toml: {where}: expected" in str(done.exception)
     assert (tmp_path / "submission.toml").read_text(encoding="utf-8") == typed
 
 
 def test_the_command_says_what_it_did(tmp_path):
-    """A table or JSON on stdout; exit status 1 if a file cannot be used yet."""
+    """`fill` prints a table or JSON, and its exit status is 1 if a file cannot be used yet."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     result = CliRunner().invoke(app, ["fill", str(tmp_path)], catch_exceptions=False)
     assert result.exit_code == 0
@@ -363,7 +369,7 @@ def test_the_command_says_what_it_did(tmp_path):
 
 @pytest.mark.parametrize(("name", "carts"), [("one-cart", 1), ("two-cart", 2), ("three-cart", 3)])
 def test_the_files_of_an_example_are_told_apart(name, carts, tmp_path):
-    """Without its tables, a worked example gets kinds and free carts of all files back."""
+    """Without an example's tables, `fill` finds kinds and free carts of all its files."""
     true = load_submission(EXAMPLES / name)
     shutil.copytree(true.folder / "data", tmp_path / "bare" / "data")
     found = {f.file: f for f in fill_submission(tmp_path / "bare")}
@@ -381,7 +387,7 @@ _TABLES = st.permutations(["system", "experiments", "reported.initial", "design"
 
 @given(_COMMENTS, _TABLES, st.integers(0, 3), st.booleans())
 def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blank):
-    """Every comment, key and digit outlives an added table, in any order."""
+    """Adding a table keeps every comment, key and digit of the file, in any order."""
     bodies = {
         "system": "[system] {}\ncarts = 1\ninput = {{ unit = 'V' }} {}\n",
         "experiments": "".join(
@@ -410,7 +416,7 @@ def test_whatever_stands_there_stays(tmp_path_factory, comments, tables, n, blan
 
 
 def test_an_outdated_change_is_refused(tmp_path):
-    """A caller that saw an older text changes nothing, and gets the current text."""
+    """A change made from an outdated text is refused, and the caller gets the current text."""
     new_submission(tmp_path / "team", carts=1)
     toml = tmp_path / "team" / "submission.toml"
     seen = text_digest(toml.read_text(encoding="utf-8"))
@@ -422,7 +428,7 @@ def test_an_outdated_change_is_refused(tmp_path):
 
 
 def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
-    """Under `[system]` for all files with such columns, in an experiment's table for its own."""
+    """Stated `columns` identify a file: those of `[system]` any file, those of a table its own."""
     put(tmp_path, "a.csv", clock=T, volts=STEP, sled=2 * RING)
     put(tmp_path, "b.csv", time=T, input=SINE, x1=RING)
     put(tmp_path, "c.csv", clock=T, volts=STEP, other=RING)
@@ -441,7 +447,7 @@ def test_columns_that_are_stated_tell_what_a_file_is(tmp_path):
 
 
 def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
-    """Sheets, broken links, tables of another ending or place: each has a state and advice."""
+    """Each file that is not read is named with a reason and advice."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     data = tmp_path / "data"
     text = (data / "a.csv").read_text(encoding="utf-8")
@@ -467,7 +473,7 @@ def test_whatever_lies_there_is_named_with_what_to_do(tmp_path):
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such names")
 @pytest.mark.parametrize("name", ["run\u200b1.csv", "run\u202f1.csv", os.fsdecode(b"run\xff.csv")])
 def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
-    """A recording whose name cannot be printed is reported."""
+    """A recording whose name cannot be printed is refused, and the name shown with escapes."""
     put(tmp_path, "a.csv", time=T, input=STEP, x1=RING)
     shutil.copy(tmp_path / "data" / "a.csv", tmp_path / "data" / name)
     for command in (["fill"], ["fill", "--json"], ["inspect"], ["inspect", "--json"]):
@@ -481,7 +487,7 @@ def test_a_name_that_no_table_may_have_is_told(tmp_path, name):
 
 
 def test_a_bare_matrix_without_a_clock_says_how_to_name_it(tmp_path):
-    """The ranges of the columns are listed, and the commented table has the keys to fill in."""
+    """For a matrix without a clock, `fill` shows the columns' ranges and the keys to fill in."""
     (tmp_path / "data").mkdir()
     scipy.io.savemat(tmp_path / "data" / "m.mat", {"log": np.column_stack([RING, STEP]), "K": 3.0})
     (found,) = fill_submission(tmp_path)

@@ -1,4 +1,4 @@
-"""Every form of data file gives the same numbers: text of any dialect, `.mat` of any layout."""
+"""Every form of data file gives the same numbers: any dialect of text, any layout of `.mat`."""
 
 import hashlib
 from collections.abc import Callable
@@ -67,7 +67,7 @@ def test_an_ecp_export_is_read_in_every_dialect(content):
 
 @pytest.mark.parametrize("keep", [(0, 1, 3, 5), (1, 2, 3, 4), (0, 1, 2, 4, 5), (0, 1, 2, 3, 4, 5)])
 def test_an_ecp_export_may_hold_any_of_its_columns(keep):
-    """The columns that a student ticked, in the order of the export."""
+    """An ECP export is read with whatever columns the student ticked."""
     names = ("Sample", "Time", "Commanded Pos", "Encoder 1 Pos", "Encoder 2 Pos", "Control Effort")
     values = (np.arange(N), TIME, 0 * TIME, X1, X2, U)
     rows = [" ".join(f"{values[k][i]:.4f}" for k in keep) for i in range(N)]
@@ -80,13 +80,13 @@ def test_an_ecp_export_may_hold_any_of_its_columns(keep):
 
 
 def test_lines_are_counted_as_an_editor_counts_them():
-    """A row's place is its line in the file, whatever ends the lines."""
+    """A row's number is its line in an editor, whatever characters end the lines."""
     got = table(ECP["a MATLAB script"])
     assert (got.place(0), got.place(N - 1)) == ("line 3", f"line {N + 2}")
 
 
 def test_text_after_an_ecp_export_is_mentioned():
-    """A script that goes on after its data is mentioned."""
+    """Text after an ECP export, such as the rest of a script, is mentioned in a note."""
     got = table(ECP["a MATLAB script"] + "plot(data)\n")
     assert got.notes == (f"text after line {N + 2} is not data and was not read",)
 
@@ -133,13 +133,13 @@ def test_delimiter_and_decimal_mark_are_found(content):
 
 
 def test_whole_numbers_with_decimal_commas_are_no_decimals():
-    """In a comma-separated table of whole numbers each comma separates."""
+    """In a table of whole numbers separated by commas, no comma is read as a decimal mark."""
     got = table("time,x1\n" + "".join(f"{i},{i % 3}\n" for i in range(20)))
     assert_array_equal(got.values, [np.arange(20), np.arange(20) % 3])
 
 
 def test_columns_without_headings_are_numbered():
-    """A table without a heading is addressed by number."""
+    """A table without headings has its columns numbered."""
     got = table("".join(f"{t} {x}\n" for t, x in zip(TIME, X1, strict=True)))
     assert got.names == ("1", "2")
     assert got.index(2) == 1
@@ -148,14 +148,14 @@ def test_columns_without_headings_are_numbered():
 
 
 def test_one_column_alone_is_read():
-    """A single channel without time needs only its sample rate."""
+    """A single channel without a time column is read, if its sample rate is stated."""
     got = table("displacement\n" + "\n".join(f"{x:g}" for x in X1))
     assert got.names == ("displacement",)
     assert_array_equal(got.values[0], X1)
 
 
 def test_a_row_of_units_goes_into_the_headings():
-    """As oscilloscopes write them: names, units, an empty line, numbers."""
+    """A row of units, as oscilloscopes write it, is joined to the headings."""
     got = table(
         "Time,Channel A\n(ms),(V)\n\n"
         + "".join(f"{t},{x}\n" for t, x in zip(TIME, X1, strict=True))
@@ -165,7 +165,7 @@ def test_a_row_of_units_goes_into_the_headings():
 
 
 def test_the_bench_log_is_told_from_an_ecp_export():
-    """Same headings, tabs, no brackets, and the effort in duty counts."""
+    """A bench log has the headings of an ECP export, but is recognised by tabs and no brackets."""
     lines = ["Sample\tTime\tEncoder 1 Pos\tEncoder 2 Pos\tControl Effort"]
     lines += [
         f"{i + 1}\t{t:g}\t{a:g}\t{b:g}\t410"
@@ -187,7 +187,7 @@ def mat(compress: bool = False, **variables: object) -> bytes:
 @pytest.mark.parametrize("compress", [False, True])
 @pytest.mark.parametrize("dtype", ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8"])
 def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
-    """Short and unsigned integers come back as saved, as in scipy's reader."""
+    """Integers of every type in a .mat file are read as scipy reads them."""
     values = np.arange(0, 100, 2).astype(dtype)
     raw = mat(compress=compress, time=TIME[None, :], enc1=values, duty=values[:, None])
 
@@ -200,7 +200,7 @@ def test_mat_vectors_of_every_number_type_are_read(dtype, compress):
 
 
 def test_a_big_endian_mat_file_is_read():
-    """A file of another processor has the same bytes in reverse."""
+    """A .mat file written on a processor with reversed byte order is read."""
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x01\x00MI"
     values = np.arange(9.0).astype(">f8").tobytes()
     body = b"".join(
@@ -218,7 +218,7 @@ def test_a_big_endian_mat_file_is_read():
 
 
 def test_a_bare_matrix_has_numbered_columns():
-    """Columns of one matrix have numbers; a transposed one is turned, with a note."""
+    """The columns of a single matrix are numbered; a lying matrix is transposed, with a note."""
     matrix = np.column_stack([np.arange(N), TIME, X1, U])
     upright, lying = table(mat(data=matrix)), table(mat(data=matrix.T))
     assert upright.form == "matrix"
@@ -230,7 +230,7 @@ def test_a_bare_matrix_has_numbered_columns():
 
 
 def test_what_a_mat_file_holds_besides_is_mentioned():
-    """Structs, text and single numbers are left out and named."""
+    """Structs, texts and single numbers in a .mat file are not read, and are named."""
     got = table(mat(time=TIME, x1=X1, run={"P": 1.0}, name="bench 4", rate=113.0))
     assert got.names == ("time", "x1")
     said = "not read: run (1 × 1, struct), name (1 × 7, text), rate (1 × 1, float64)"
@@ -239,7 +239,7 @@ def test_what_a_mat_file_holds_besides_is_mentioned():
 
 
 def test_a_counter_that_ran_over_is_made_continuous():
-    """A 16-bit encoder count that overflows goes on, and the record says so."""
+    """A 16-bit encoder count that overflows is made continuous, and the record says so."""
     true = 65_500 + 3 * np.arange(N)
     got = table(mat(time=TIME, enc1=(true % 65_536).astype("u2"), duty=np.zeros(N, "i2")))
     assert_allclose(np.diff(column(got, "enc1")), 3, rtol=0, atol=0)
@@ -254,13 +254,13 @@ def test_the_hash_is_of_the_bytes(tmp_path):
 
 
 def test_a_file_of_blanks_of_any_sort_is_empty():
-    """A next-line mark alone, as some mainframes end lines, is not a row."""
+    """A file with only blanks or line ends, of whatever sort, counts as empty."""
     with pytest.raises(SubmissionError, match="the file is empty"):
         table(b"\x85")
 
 
 def test_the_recording_is_the_matrix_whatever_lies_beside_it():
-    """Twelve settings and a list of gains hide no matrix, and are not taken for recordings."""
+    """A .mat file's matrix is the recording, even beside twelve settings and a list of gains."""
     matrix = np.column_stack([TIME, X1, U])
     stream = BytesIO()
     settings = {f"p{i}": float(i) for i in range(12)}
@@ -274,14 +274,14 @@ def test_the_recording_is_the_matrix_whatever_lies_beside_it():
 
 
 def test_a_matrix_beside_vectors_of_its_length_gives_its_columns_too():
-    """In the result of `[y, t] = lsim(…)`, t is a column, and so is each one of y, by number."""
+    """The columns of a matrix as long as the vectors beside it are read too, by number."""
     got = table(mat(t=TIME, y=np.column_stack([X1, U])))
     assert set(got.names) == {"t", "y column 1", "y column 2"}
     assert_array_equal(column(got, "y column 2"), U)
 
 
 def test_what_may_hold_another_recording_is_told_with_what_to_do():
-    """The note says how to read a further matrix, or a struct as large as the recording."""
+    """A note says how to read a second matrix, or a struct as large as the recording."""
     further = mat(time=TIME, x1=X1, log=np.ones((90, 70)), raw={"t": TIME, "x": X1, "u": U})
     notes = {v.name: v.advice for v in table(further).variables if not v.read}
     assert "save('new.mat', '-struct', 'raw')" in notes["raw"]
@@ -293,7 +293,7 @@ def test_what_may_hold_another_recording_is_told_with_what_to_do():
 
 
 def test_a_matlab_table_is_told_by_its_name():
-    """An object has no size where others have one; MATLAB's own data for it have no name."""
+    """A MATLAB `table` object cannot be read, and the error names it and how to export it."""
     flags, name = np.array([6, 8, 17, 0], dtype="<u4").tobytes(), b"run7".ljust(8, b"\0")
     body = flags + np.array([1, 4], dtype="<u4").tobytes() + name
     kept = scipy_element(np.zeros((1, 400), "u1"), name="")
@@ -303,7 +303,7 @@ def test_a_matlab_table_is_told_by_its_name():
 
 
 def mat73(**variables: np.ndarray) -> bytes:
-    """Write a version 7.3 file as MATLAB would: HDF5 behind a block of text, arrays transposed."""
+    """Write a version 7.3 file as MATLAB would: HDF5 after a block of text, arrays transposed."""
     stream = BytesIO()
     with h5py.File(stream, "w", userblock_size=512) as file:
         for name, values in variables.items():
@@ -317,7 +317,7 @@ def mat73(**variables: np.ndarray) -> bytes:
 
 
 def test_a_matlab_7_3_log_is_read_like_any_other():
-    """Version 5 and version 7.3 of the same variables make the same table."""
+    """Versions 5 and 7.3 of a MATLAB file with the same variables give the same table."""
     log = {
         "time": TIME,
         "enc1": (65_500 + 3 * np.arange(N)).astype("u2"),
@@ -332,7 +332,7 @@ def test_a_matlab_7_3_log_is_read_like_any_other():
 
 
 def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
-    """A struct, text and an empty array are left out and named."""
+    """A struct, a text and an empty array in a version 7.3 file are not read, and are named."""
     stream = BytesIO(mat73(time=TIME, x1=X1))
     with h5py.File(stream, "r+") as file:
         file.create_group("run")["P"] = 1.0
@@ -348,7 +348,7 @@ def test_what_a_matlab_7_3_file_holds_besides_is_mentioned():
 
 @pytest.mark.parametrize("spoil", ["huge", "elsewhere", "link", "cut"])
 def test_a_hostile_matlab_7_3_file_is_refused(spoil, tmp_path):
-    """Terabytes that do not exist, links to other files, half a file: one short error."""
+    """A 7.3 file that is cut, declares terabytes or links elsewhere gives one short error."""
     stream = BytesIO(mat73(time=TIME, x1=X1))
     (tmp_path / "secret").write_bytes(bytes(8 * N))
     with h5py.File(stream, "r+") as file:
@@ -376,7 +376,7 @@ def scipy_element(values: np.ndarray, *, name: str) -> bytes:
 
 
 def test_a_mat_file_of_names_alone_is_refused():
-    """A file of many thousand variables, or with a name of a megabyte, is one short error."""
+    """A .mat file with thousands of variables, or a name of a megabyte, gives one short error."""
     many = BytesIO()
     scipy.io.savemat(many, {f"v{i}": 1.0 for i in range(1001)})
     with pytest.raises(SubmissionError, match="more than 1,000 variables"):
@@ -402,7 +402,7 @@ def test_a_mat_file_of_names_alone_is_refused():
     ids=["text", "record", "texts"],
 )
 def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
-    """An attribute says double, but the data differ: the variable is named as not read."""
+    """If a 7.3 variable's data are not of the stated class, it is named as not read."""
     stream = BytesIO()
     with h5py.File(stream, "w", userblock_size=512) as file:
         file["time"], file["x1"] = np.arange(5.0)[None], np.arange(5.0)[None] ** 2
@@ -417,7 +417,7 @@ def test_a_matlab_7_3_variable_that_lies_about_its_class_is_not_read(odd):
 
 
 def mat73_with(fill: Callable[[h5py.File], object]) -> bytes:
-    """Return a version 7.3 file with a time, and what a function adds."""
+    """Return a version 7.3 file with a time and with what a function adds."""
     stream = BytesIO(mat73(time=TIME))
     with h5py.File(stream, "r+") as file:
         fill(file)
@@ -425,7 +425,7 @@ def mat73_with(fill: Callable[[h5py.File], object]) -> bytes:
 
 
 def test_a_matlab_7_3_file_takes_no_more_memory_than_a_recording():
-    """A part that inflates to gigabytes is refused, and so are numbers that are not in the file."""
+    """A version 7.3 file whose data inflate to gigabytes, or are missing, is refused."""
     packed = {"dtype": "f8", "compression": "gzip"}
     whole = {"shape": (1, N), "maxshape": (1, None), "chunks": (1, 2**26)}
     absent = {"shape": (1, 20_000_000), "chunks": (1, 2**16)}
@@ -436,7 +436,7 @@ def test_a_matlab_7_3_file_takes_no_more_memory_than_a_recording():
 
 
 def test_the_class_of_a_matlab_7_3_variable_is_one_line():
-    """Whatever its attribute holds, the variable is named with a short kind."""
+    """A variable of version 7.3 with any class attribute is named with a short kind."""
 
     def fill(file: h5py.File) -> None:
         file["note"] = np.arange(5.0)

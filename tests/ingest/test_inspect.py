@@ -32,7 +32,7 @@ def inspect(folder: Path, **columns: np.ndarray) -> Inspection:
 
 
 def test_the_essentials_are_printed(tmp_path):
-    """Form, samples, rate, duration, roles, ranges and the encoder step."""
+    """`inspect` shows format, samples, rate, duration, roles, ranges and the encoder step."""
     got = inspect(tmp_path, time=T, input=STEP, x1=X, remark=0 * T)
     assert got.format == "table of text (CSV)"
     assert got.samples == 2000
@@ -50,7 +50,7 @@ KINDS = {
     "step": {"input": STEP},
     "sine": {"input": 0.3 * np.sin(2 * np.pi * 4.0 * T)},
     "sweep": {"input": np.sin((1 + 3 * T) * T)},
-    # An ECP in open loop logs the effort as a target too: in counts, between two samples.
+    # An ECP in open loop logs its effort as the target too, in counts and between two samples.
     "sweep, logged twice": {
         "input": np.sin((1 + 3 * T) * T),
         "reference": np.rint(50 * np.sin((1 + 3 * (T - 0.6 / RATE)) * (T - 0.6 / RATE))),
@@ -61,7 +61,7 @@ KINDS = {
 
 @pytest.mark.parametrize(("kind", "signals"), KINDS.items(), ids=KINDS.keys())
 def test_the_kind_is_guessed(kind, signals, tmp_path):
-    """The input's shape and a reference reveal the kind of experiment."""
+    """The kind of experiment is guessed from the shape of the input and from a reference."""
     got = inspect(tmp_path, time=T, x1=X, **signals)
     assert got.kind == kind.split(",")[0]
     if kind == "sine":
@@ -71,7 +71,7 @@ def test_the_kind_is_guessed(kind, signals, tmp_path):
 
 
 def test_a_bode_table_is_recognised(tmp_path):
-    """A frequency column makes a table of amplitude ratios."""
+    """A file with a frequency column is read as a table of amplitude ratios."""
     got = inspect(tmp_path, frequency=np.arange(1.0, 9.0), x1=np.ones(8))
     assert got.kind == "bode"
     assert (got.rate, got.duration, got.problems) == (None, None, ())
@@ -109,13 +109,13 @@ PROBLEMS = {
 
 @pytest.mark.parametrize(("columns", "problem"), PROBLEMS.values(), ids=PROBLEMS.keys())
 def test_problems_are_named(columns, problem, tmp_path):
-    """Problems that would spoil a report are listed in advance."""
+    """`inspect` names problems that would spoil a report."""
     got = inspect(tmp_path, **columns)
     assert any(problem in said for said in got.problems), got.problems
 
 
 def test_a_cut_file_is_inspected_all_the_same(tmp_path):
-    """Half a last line is a problem with its line, not the end of the inspection."""
+    """If the last line of a file is cut, `inspect` names the line and shows everything else."""
     inspect(tmp_path, time=T, x1=X)
     text = (tmp_path / "a.csv").read_text().rstrip("\n")
     (tmp_path / "a.csv").write_text(text + "\n10.0")
@@ -127,20 +127,20 @@ def test_a_cut_file_is_inspected_all_the_same(tmp_path):
 
 
 def test_a_remark_does_not_keep_a_file_from_being_used(tmp_path):
-    """A column without a role is left out; the rest of the file is used."""
+    """A column without a role is a remark only, and the file can be used."""
     got = inspect(tmp_path, time=T, input=np.sin(T), x1=X, temperature=X)
     assert got.problems
     assert got.unusable == ()
 
 
 def test_a_clock_that_goes_back_keeps_a_file_from_being_used(tmp_path):
-    """As in a report, two records pasted together are not used."""
+    """A file whose time goes back, as in two records pasted together, cannot be used."""
     got = inspect(tmp_path, time=np.r_[T, T], x1=np.r_[X, X])
     assert any("goes back" in said for said in got.unusable)
 
 
 def test_the_text_and_the_json_say_the_same(tmp_path):
-    """Every problem and column is in both; the JSON has no NaN."""
+    """Every problem and column is in the text and in the JSON, and the JSON has no NaN."""
     got = inspect(tmp_path, time=np.round(T * 1.013, 3), input=0.3 * np.sin(25 * T), x1=_frozen())
     text, plain = format_inspection(got), json.loads(json.dumps(got.to_dict(), allow_nan=False))
     assert plain["kind"] == "sine"
@@ -151,7 +151,7 @@ def test_the_text_and_the_json_say_the_same(tmp_path):
 
 
 def test_columns_without_names_get_a_line_to_use(tmp_path):
-    """A bare matrix in the order of an ECP export: clock, encoders and effort are guessed."""
+    """For a matrix in the order of an ECP export, `inspect` prints a `columns` line to use."""
     counts = np.round(300 * np.sin(8 * T))
     copy = np.round(0.5 * counts + 0.5 * np.r_[0.0, counts[:-1]])
     matrix = np.column_stack([np.arange(T.size), T, copy, counts, -counts, -0.5 * STEP])
@@ -176,14 +176,14 @@ def test_columns_without_a_clock_get_no_suggestion(tmp_path):
 
 @pytest.mark.skipif(os.name == "nt", reason="links need rights on Windows")
 def test_a_link_may_be_inspected(tmp_path):
-    """A link to one's own file is allowed."""
+    """A link to one's own file may be inspected."""
     inspect(tmp_path, time=T, x1=X)
     (tmp_path / "link").symlink_to(tmp_path / "a.csv")
     assert inspect_file(tmp_path / "link").samples == 2000
 
 
 def test_what_is_no_data_file_is_one_line(tmp_path):
-    """A missing file and a folder are errors."""
+    """A missing file and a folder without recordings each give one line of error."""
     typed = tmp_path / "none.csv"
     with pytest.raises(SubmissionError, match=r"there is no file 'none\.csv'") as caught:
         inspect_file(typed)
@@ -197,7 +197,7 @@ def test_what_is_no_data_file_is_one_line(tmp_path):
 
 
 def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
-    """Its `data` folder is read, other files are not; problems are listed below."""
+    """For a folder, `inspect` prints one line per file of `data/`, and then the problems."""
     (tmp_path / "data").mkdir()
     inspect(tmp_path / "data", time=T, input=STEP, x1=X)
     (tmp_path / "data" / "photo.jpg").write_bytes(b"no data")
@@ -210,7 +210,7 @@ def test_a_folder_is_a_table_of_one_line_a_file(tmp_path):
 
 
 def test_what_is_wrong_with_many_files_is_said_once(tmp_path):
-    """A clock rounded in each of six files is one line under their table."""
+    """A problem that six files share is printed once, under their table."""
     (tmp_path / "data").mkdir()
     for number in range(6):
         inspect(tmp_path / "data", time=np.round(T, 2), input=STEP, x1=X)

@@ -32,7 +32,7 @@ def table(raw: bytes | str) -> FileTable:
 
 
 def table_or_one_line(raw: bytes) -> FileTable | None:
-    """Return the table, or None after an error of one line."""
+    """Read a file; return its table, or None if it gives an error of one line."""
     try:
         return table(raw)
     except SubmissionError as error:
@@ -50,7 +50,7 @@ SPECIAL = "***Start_Special***\r\nWaveform\t1,2\r\n***End_Special***\r\n\r\n"
 
 
 def multi(clock: np.ndarray) -> str:
-    """Return a file with an X column for each channel, the second of these times."""
+    """Return a file with an X column for each channel, in which the second has these times."""
     rows = ["\t".join(f"{v:.6f}" for v in row) for row in zip(TIME, U, clock, X1, strict=True)]
     text = GOOD[: GOOD.index("X_Value")] + "X_Value\tinput\tX_Value\tx1\tComment\r\n"
     return text.replace("X_Columns\tOne", "X_Columns\tMulti") + "\r\n".join(rows) + "\r\n"
@@ -78,7 +78,7 @@ LVM = {
 
 @pytest.mark.parametrize("content", LVM.values(), ids=LVM.keys())
 def test_every_dialect_of_lvm_gives_the_same_numbers(content):
-    """Separators, decimal marks and the three ways to write X change no number."""
+    """Any separator, decimal mark and way to write X in an .lvm file gives the same numbers."""
     got = table(content)
     assert got.form == "lvm"
     assert got.names == ("time", "input", "x1")
@@ -87,13 +87,13 @@ def test_every_dialect_of_lvm_gives_the_same_numbers(content):
 
 
 def test_units_of_the_header_go_into_the_headings():
-    """LabVIEW spells units in words."""
+    """Units in the header, which LabVIEW writes in words, are added to the headings."""
     segment = lvm_segment(COLUMNS, tags={"Y_Unit_Label": ["Volts", "Millimeters"]})
     assert table(HEAD + segment).names == ("time", "input [V]", "x1 [mm]")
 
 
 def test_segments_that_continue_each_other_are_one_recording():
-    """With a header each, or with one for all."""
+    """Segments that follow in time are one recording, with one header each or one for all."""
     for text in (
         GOOD + "\r\n" + lvm_segment(LATER),
         GOOD + "\r\n" + lvm_segment(LATER).partition("Comment\r\n")[2],
@@ -105,7 +105,7 @@ def test_segments_that_continue_each_other_are_one_recording():
 
 
 def test_comments_beside_rows_are_said_not_read():
-    """The last column holds texts."""
+    """Comments beside the rows, in the last column, are not read, and a note says so."""
     got = table(GOOD.replace("\r\n0.010000", "\tknock\r\n0.010000"))
     assert got.notes == ("comments beside the rows are not read",)
     assert got.values.shape == (3, N)
@@ -139,14 +139,14 @@ BAD_LVM = {
 
 @pytest.mark.parametrize(("content", "said"), BAD_LVM.values(), ids=BAD_LVM.keys())
 def test_a_broken_lvm_names_its_line(content, said):
-    """One line, never a part of the recording in silence."""
+    """A broken .lvm file gives one line of error, usually with the line's number, and no table."""
     with pytest.raises(SubmissionError, match=said) as caught:
         table(content)
     assert "\n" not in str(caught.value)
 
 
 def test_an_lvm_cut_short_is_known_even_between_two_rows():
-    """The header says how many samples there are."""
+    """A cut .lvm file is recognised from the number of samples in its header."""
     got = table(GOOD[: GOOD.index("0.300000")])
     assert got.cut is not None
     assert "30 of 40 samples" in got.cut
@@ -191,7 +191,7 @@ TDMS = {
 
 @pytest.mark.parametrize("raw", TDMS.values(), ids=TDMS.keys())
 def test_every_tdms_gives_the_same_numbers(raw):
-    """Segments, waveforms without a time channel and time stamps change no number."""
+    """Segments, waveforms and time stamps of a .tdms file change none of the numbers read."""
     got = table(raw)
     assert got.form == "tdms"
     assert [name.removesuffix(" [s]") for name in got.names] == ["time", "input", "x1"]
@@ -199,7 +199,7 @@ def test_every_tdms_gives_the_same_numbers(raw):
 
 
 def test_what_a_tdms_holds_besides_is_said():
-    """Short channels and texts are named with their sizes; units go into the headings."""
+    """A note names short channels and texts that are not read; units are added to the headings."""
     got = table(TDMS["settings"])
     assert got.notes == (
         "not read: run/gains, settings/gain (2 × 1, float64), run/by (1 × 1, no numbers)",
@@ -214,12 +214,12 @@ COUNT = struct.pack("<Q", N)
 
 
 def lead_in(flags: int, length: int, data: int) -> bytes:
-    """Return what stands before a segment."""
+    """Return the bytes at the start of a segment."""
     return b"TDSm" + struct.pack("<IIQQ", flags, 4712, length, data)
 
 
 def objects(*named: tuple[str, int]) -> bytes:
-    """Return metadata: paths and, above 0, how many doubles each has in a chunk."""
+    """Return metadata: paths, each with its number of doubles in a chunk, if above 0."""
     body = struct.pack("<I", len(named))
     for path, count in named:
         body += struct.pack("<I", len(path)) + path.encode()
@@ -265,7 +265,7 @@ BAD_TDMS = {
 
 @pytest.mark.parametrize(("raw", "said"), BAD_TDMS.values(), ids=BAD_TDMS.keys())
 def test_a_broken_tdms_is_one_line(raw, said, capfd):
-    """A file that npTDMS would read in part, with a line in a log, is refused."""
+    """A damaged .tdms file, which npTDMS would read in part, is refused with one line."""
     with pytest.raises(SubmissionError, match=said) as caught:
         table(raw)
     assert "\n" not in str(caught.value)
@@ -273,7 +273,7 @@ def test_a_broken_tdms_is_one_line(raw, said, capfd):
 
 
 def test_a_tdms_in_tiny_pieces_is_read_up_to_a_limit(monkeypatch):
-    """One value a piece is slow; past a number of pieces the file is refused."""
+    """A .tdms file with more pieces than a limit is refused, since reading it would be slow."""
     data = np.arange(200.0).tobytes()
     raw = lead_in(14, len(TINY) + len(data), len(TINY)) + TINY + data
     assert_array_equal(table(raw).values, np.arange(200.0).reshape(100, 2).T)
@@ -297,7 +297,7 @@ def test_a_damaged_tdms_is_a_table_or_one_line(hits):
 
 
 def test_other_forms_do_not_load_the_readers():
-    """Who grades text files pays for no other reader."""
+    """Reading text files does not load the libraries for other formats."""
     code = (
         "import sys; from pipeline.ingest.formats.recognise import parse_table; "
         "parse_table(b'time,x1\\n0,1\\n1,2\\n', source='a'); "

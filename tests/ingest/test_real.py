@@ -1,4 +1,4 @@
-"""Recordings of real benches are read: every file of every form that is available."""
+"""Files of real benches, in every form that is available, are read."""
 
 import tomllib
 from pathlib import Path
@@ -17,7 +17,7 @@ KINDS = {"DOF1_en1": "step", "DOF1_en2": "decay", "DOF2": "step", "test_3": "ste
 
 
 def read(folder: Path, toml: str, tmp_path: Path) -> Ingested:
-    """Read recordings in place, described by a submission written elsewhere."""
+    """Read recordings in place, with a submission written in another folder."""
     (tmp_path / "submission.toml").write_text(
         "version = 1\n[system]\ncarts = 2\nsprings = [true, true, false]\n"
     )
@@ -30,26 +30,26 @@ def read(folder: Path, toml: str, tmp_path: Path) -> Ingested:
 
 
 def experiment(name: str, kind: str, more: str = "") -> str:
-    """One table of experiments."""
+    """Return one table `[[experiments]]`."""
     return f'[[experiments]]\nid = "{name}"\nkind = "{kind}"\nfile = "{name}"\n{more}\n'
 
 
 def test_every_text_export_is_recognised(real_data):
-    """The kind of each recording is the one in its name."""
+    """`inspect` finds the kind of each recording that its file name states."""
     for path in sorted((real_data / "ecp210-ucsd").glob("*.csv")):
         got = inspect_file(path)
         expected = next((k for start, k in KINDS.items() if path.name.startswith(start)), None)
         assert got.kind == (expected or "closed_loop"), path.name
         assert got.samples == 677
         assert got.rate == pytest.approx(112.941, abs=1e-3)
-        assert len(got.problems) == 1, got.problems  # only the rounded clock
+        assert len(got.problems) == 1, got.problems  # the only problem is the rounded clock
         assert "rounded to 0.001 s" in got.problems[0]
 
 
 def test_the_servo_exports_are_recognised(real_data):
-    """A MATLAB script and plain text: a loop at the amplifier's limit, a sweep in open loop.
+    """Two exports of a servo are recognised: a saturated closed loop and a sweep in open loop.
 
-    In the sweep "Commanded Pos" is the effort in percent of a volt, logged a moment apart.
+    The sweep logs its effort, in percent of a volt and slightly late, as "Commanded Pos".
     """
     script = inspect_file(real_data / "ecp220-servo" / "raw_data_cl_step1.m")
     assert (script.samples, script.kind) == (451, "closed_loop")
@@ -59,7 +59,7 @@ def test_the_servo_exports_are_recognised(real_data):
 
 
 def test_the_signs_of_the_real_bench_are_found(real_data, tmp_path):
-    """In open loop +0.5 V moves cart 1 to negative counts; the controller counts the other way."""
+    """The input's sign is -1 in open loop and +1 in closed loop, as this bench logs it."""
     folder = real_data / "ecp210-ucsd"
     opened = [f"DOF1_en1_input1_test{i}.csv" for i in range(1, 6)]
     opened += [f"DOF2_en12_input1_test{i}.csv" for i in range(1, 6)]
@@ -79,7 +79,7 @@ def test_the_signs_of_the_real_bench_are_found(real_data, tmp_path):
 
 
 def test_the_exported_matrix_is_the_export(real_data, tmp_path):
-    """The same run as text and as a bare matrix is one record."""
+    """A run exported as text and as a matrix without headings gives the same record."""
     columns = "columns = { time = 2, x1 = 4, x2 = 5, input = 6 }"
     toml = experiment("DOF2_en12_input1_test1.csv", "step")
     toml += experiment("DOF2_en12_input1_test1.mat", "step", columns)
@@ -90,7 +90,7 @@ def test_the_exported_matrix_is_the_export(real_data, tmp_path):
 
 
 def test_the_serial_bench_logs_are_read(real_data, tmp_path):
-    """Both layouts; the edited copy is the end of the other, with its clock straightened too."""
+    """Both layouts of a serial log are read, and an edited copy agrees with the original's end."""
     toml = experiment("Jan281500.mat", "closed_loop")
     toml += experiment("Modified_Jan281500.mat", "closed_loop")
     whole, part = read(real_data / "teensy-torsional", toml, tmp_path).records
@@ -98,7 +98,7 @@ def test_the_serial_bench_logs_are_read(real_data, tmp_path):
     start = next(
         i for i in range(whole.t.size - n + 1) if np.array_equal(whole.y[:, i : i + n], part.y)
     )
-    # Both clocks lie within the rounding of the stamps they share.
+    # Both clocks are within the rounding of their common stamps.
     shift = part.t - whole.t[start : start + n]
     assert np.ptp(shift) < 1.5e-3
     assert whole.u is not None
@@ -108,7 +108,7 @@ def test_the_serial_bench_logs_are_read(real_data, tmp_path):
 
 
 def test_the_silverbox_is_read(real_data, tmp_path):
-    """A sample rate and column names replace the missing time column."""
+    """The Silverbox files, which have no time column, are read with a rate and column names."""
     more = (
         f"sample_rate = {1e7 / 2**14}\ncarts = [1]\nhold = 'band_limited'\n"
         'columns = { input = "V1", x1 = "V2" }'
@@ -122,7 +122,7 @@ def test_the_silverbox_is_read(real_data, tmp_path):
 
 
 def test_the_bench_mat_log_agrees_with_scipy(real_data):
-    """Every variable has the numbers of scipy's reader."""
+    """Every variable of a bench's .mat log has the numbers of scipy's reader."""
     for path in sorted(real_data.rglob("*.mat")):
         table, _ = read_table(path.parent, path.name)
         oracle = scipy.io.loadmat(path)

@@ -40,7 +40,7 @@ def csv(**columns: np.ndarray) -> str:
 
 
 def ecp(*, reference: np.ndarray, x1: np.ndarray, effort: np.ndarray) -> str:
-    """Write an ECP export of one encoder."""
+    """Return an ECP export of one encoder."""
     rows = [
         f"{i} {t:.3f} {r:.0f} {a:.0f} {u:.4f}"
         for i, (t, r, a, u) in enumerate(zip(T, reference, x1, effort, strict=True))
@@ -55,7 +55,10 @@ CM = 'position = { unit = "cm", per_count = 0.00227 }'
 
 
 def test_counts_become_position_units_once(tmp_path):
-    """An ECP's encoder columns are multiplied by per_count; the encoder step is one count."""
+    """Encoder columns of an ECP export are multiplied by per_count.
+
+    The encoder step is one count.
+    """
     record = read(tmp_path, CM, STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
     assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
     assert record.encoder_step(1) == 0.00227
@@ -65,14 +68,14 @@ def test_counts_become_position_units_once(tmp_path):
 
 
 def test_positions_of_a_csv_are_in_the_unit_already(tmp_path):
-    """per_count never touches x1 … of a CSV, whole numbers or not."""
+    """per_count never applies to the columns x1 … of a CSV file, even if all are whole numbers."""
     record = read(tmp_path, CM, STEP, csv(time=T, input=U, x2=X2, x1=X1)).records[0]
     assert_array_equal(record.position(1), X1)
     assert_array_equal(record.position(2), X2)
 
 
 def test_an_encoder_heading_in_a_csv_means_counts(tmp_path):
-    """A CSV whose heading names encoder counts is converted like an export."""
+    """A CSV column whose heading names encoder counts is converted like one of an export."""
     content = csv(time=T, input=U, x1=X1).replace("x1", "Encoder 1 Pos")
     record = read(tmp_path, CM, STEP, content).records[0]
     assert_allclose(record.position(1), 0.00227 * X1, rtol=1e-15)
@@ -80,10 +83,10 @@ def test_an_encoder_heading_in_a_csv_means_counts(tmp_path):
 
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 0.1), ("m", 100.0), ("cm", 1.0)])
 def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
-    """Displacement in mm becomes cm, and the record says so."""
+    """A displacement in mm is converted to cm, and the record says so."""
     content = csv(**{"Time__us": np.round(1e6 * T), f"Displacement__{unit}": X1})
     record = read(tmp_path, CM, 'kind = "decay"\ncarts = [2]', content).records[0]
-    assert record.carts == (2,)  # the one free cart
+    assert record.carts == (2,)  # cart 1, the only free one
     assert_allclose(record.position(2), factor * X1, rtol=1e-12)
     assert_allclose(record.t, T, atol=0.5e-6)
     assert any("converted" in note for note in record.notes) == (factor != 1.0)
@@ -101,7 +104,7 @@ def test_a_unit_in_the_heading_is_converted(unit, factor, tmp_path):
     ],
 )
 def test_the_usual_headings_are_understood(headings, tmp_path):
-    """Time, input and positions under headings that students use."""
+    """Usual headings of students for time, input and positions are understood."""
     record = read(
         tmp_path, CM, STEP, csv(a=T, b=U, c=X1, d=X2).replace("a,b,c,d", ",".join(headings))
     ).records[0]
@@ -114,7 +117,7 @@ def test_the_usual_headings_are_understood(headings, tmp_path):
 
 
 def test_a_copied_file_is_no_repeat(tmp_path):
-    """Two experiments with the same bytes are reported."""
+    """If two experiments have files with the same bytes, a warning says so."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     for name in ("one", "two"):
         toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
@@ -125,13 +128,13 @@ def test_a_copied_file_is_no_repeat(tmp_path):
 
 
 def test_time_in_other_units_is_suspected(tmp_path):
-    """Samples whole seconds apart are more likely milliseconds or sample numbers."""
+    """If samples are whole seconds apart, cartlab suspects milliseconds or sample numbers."""
     record = read(tmp_path, "", STEP, csv(time=np.arange(N), input=U, x1=X1)).records[0]
     assert any("samples are 1 s apart" in note for note in record.notes)
 
 
 def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
-    """Nobody guesses the cart of a column without a number."""
+    """If several carts are free, a single displacement column without a number is an error."""
     content = csv(**{"Time__us": np.round(1e6 * T), "Displacement__mm": X1})
     with pytest.raises(
         SubmissionError, match=r"no column is a cart's position; it has Time \[us\]"
@@ -142,7 +145,7 @@ def test_one_displacement_of_several_free_carts_needs_a_name(tmp_path):
 
 
 def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
-    """Without [system.position] the unit is the count."""
+    """Whole numbers in an ECP export without a stated scale are counts."""
     record = read(tmp_path, "", STEP, ecp(reference=0 * X1, x1=X1, effort=U)).records[0]
     assert_array_equal(record.position(1), X1)
 
@@ -157,7 +160,7 @@ def test_whole_ecp_values_without_a_scale_are_counts(tmp_path):
     ],
 )
 def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
-    """Without a unit it is asked for, since an encoder has no fractions of a count."""
+    """Fractions of a count in a column without a unit are questioned, as encoders count in whole steps."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -178,7 +181,7 @@ def test_fractions_of_a_count_are_asked_about(system, asked, tmp_path):
     ],
 )
 def test_an_unknown_unit_is_asked_about(system, ids, tmp_path):
-    """Known units of benches pass; any other unit raises a question."""
+    """A unit that benches do not use is questioned; known units are accepted."""
     folder = tmp_path / "s"
     data = read(folder, system, STEP, csv(time=T, input=U, x1=Y[0] / 440, x2=Y[1] / 440))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -189,7 +192,7 @@ def test_an_unknown_unit_is_asked_about(system, ids, tmp_path):
 
 
 def test_a_heading_in_another_unit_is_asked_about(tmp_path):
-    """Centimetres by the heading and counts by the file: a question asks which."""
+    """If the heading says centimetres and the submission counts, a question asks which is right."""
     folder = tmp_path / "s"
     data = read(folder, "", STEP, csv(time=T, input__N=U, x1__cm=Y[0] / 440, x2=X2))
     checks = check_units(data.records, bench=load_submission(folder).system.bench)
@@ -213,7 +216,7 @@ def bench_log(effort: np.ndarray) -> str:
     ("system", "scale"), [("", DUTY_COUNT), ('input = { unit = "V", per_count = 0.002 }', 0.002)]
 )
 def test_duty_counts_become_input_units(system, scale, tmp_path):
-    """A bench log's effort counts 4096 to 5 V unless the submission says otherwise."""
+    """A bench log's effort counts 4096 to 5 V, unless the submission states another scale."""
     duty = np.round(40_960 * U)
     record = read(tmp_path, system, STEP, bench_log(duty)).records[0]
     assert record.u is not None
@@ -226,7 +229,7 @@ PER_COUNT = 'input = { unit = "V", sign = 1, per_count = 1e-4 }'
 
 @pytest.mark.parametrize("written", ["512", "512.0"])
 def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
-    """Whole numbers that no voltage reaches are counts, if the submission states their scale."""
+    """If a scale is stated, whole numbers too large for volts are taken as duty counts."""
     duty = np.round(51_200 * U)
     content = csv(time=T, input=duty, x1=X1).replace(",512,", f",{written},")
     assert f",{written}," in content
@@ -248,7 +251,7 @@ def test_duty_counts_of_a_csv_become_input_units(written, tmp_path):
     ids=["a step of one volt", "fractions", "a heading in volts"],
 )
 def test_an_unneeded_scale_is_reported(content, tmp_path):
-    """Volts stay volts, and an unused per_count is named."""
+    """An input in volts is not scaled, and a note says that per_count is not used."""
     data = read(tmp_path, PER_COUNT, STEP, content)
     assert data.records[0].input_scale == 1.0
     (said,) = data.warnings
@@ -256,14 +259,14 @@ def test_an_unneeded_scale_is_reported(content, tmp_path):
 
 
 def test_an_effort_with_fractions_is_no_duty_count(tmp_path):
-    """The same log with volts stays in volts."""
+    """An effort with fractions is taken as volts, not as duty counts."""
     record = read(tmp_path, "", STEP, bench_log(U)).records[0]
     assert record.u is not None
     assert_array_equal(record.u, U)
 
 
 def test_the_bench_mat_layouts_agree_with_its_log(tmp_path):
-    """Both .mat layouts and the text log of one run are one record."""
+    """Both .mat layouts and the text log of a run give the same record."""
     duty, reference = np.round(40_960 * U), np.where(T > 0.5, 300.0, 0.0)
     stamps = np.round(T, 3)
     stream, other = BytesIO(), BytesIO()
@@ -288,7 +291,7 @@ def test_the_bench_mat_layouts_agree_with_its_log(tmp_path):
 
 
 def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
-    """`columns` names the columns of a bare matrix; whole positions are counts."""
+    """`columns` names the columns of a matrix by number; whole positions are counts."""
     stream = BytesIO()
     scipy.io.savemat(stream, {"data": np.column_stack([np.arange(N), T, X1, X2, U])})
     columns = STEP + "\ncolumns = { time = 2, x1 = 3, x2 = 4, input = 5 }"
@@ -298,7 +301,7 @@ def test_a_bare_matrix_is_read_by_column_numbers(tmp_path):
 
 
 def test_the_system_names_the_columns_of_all_its_recordings(tmp_path):
-    """For all files with such columns; those of an experiment go first."""
+    """`columns` of `[system]` holds for all files that have them; an experiment's own go first."""
     named = CM + '\ncolumns = { x1 = "first", x2 = "second", reference = "goal" }'
     content = csv(time=T, input=U, first=X1, second=X2)
     record = read(tmp_path, named, STEP, content).records[0]
@@ -310,20 +313,20 @@ def test_the_system_names_the_columns_of_all_its_recordings(tmp_path):
 
 
 def test_a_sample_rate_stands_in_for_a_time_column(tmp_path):
-    """Without a time column samples follow each other at the stated rate."""
+    """Without a time column the samples are spaced by the stated sample rate."""
     record = read(tmp_path, "", STEP + "\nsample_rate = 113.0", csv(u=U, x1=X1)).records[0]
     assert_allclose(record.t, np.arange(N) / 113.0, rtol=1e-15)
 
 
 def test_a_sample_rate_against_the_time_column_is_mentioned(tmp_path):
-    """Measured time wins over a stated rate."""
+    """If a file has a time column, a stated sample rate is not used, and a note says so."""
     record = read(tmp_path, "", STEP + "\nsample_rate = 200.0", csv(t=T, u=U, x1=X1)).records[0]
     assert_allclose(record.t, T, atol=1e-6)
     assert any("sample_rate = 200 Hz is not used" in note for note in record.notes)
 
 
 def test_a_window_keeps_its_part_of_the_times(tmp_path):
-    """Times stay as in the file; both ends are included; the end may be rounded up a little."""
+    """A window keeps the file's times between its ends, which may be rounded up a little."""
     record = read(tmp_path, "", STEP + "\nwindow = [1.0, 2.0]", csv(time=T, u=U, x1=X1)).records[0]
     inside = (T >= 1.0) & (T <= 2.0)
     assert_allclose(record.t, T[inside], atol=1e-6)
@@ -333,7 +336,7 @@ def test_a_window_keeps_its_part_of_the_times(tmp_path):
 
 
 def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
-    """A log that paused keeps all its samples, and a note says where."""
+    """A log with a pause keeps all its samples, and a note names the gap."""
     late = T + np.where(T > 2.0, 0.7, 0.0)
     record = read(tmp_path, "", STEP, csv(time=late, input=U, x1=X1)).records[0]
     assert record.t.size == N
@@ -343,14 +346,14 @@ def test_gaps_in_time_are_noted_and_nothing_is_dropped(tmp_path):
 
 
 def test_columns_that_are_not_used_are_mentioned(tmp_path):
-    """A third encoder on a bench of two carts, a column of another name."""
+    """A note names columns that are not used, such as a third encoder on a bench of two carts."""
     content = csv(time=T, input=U, x1=X1, x3=X2, temperature=0 * T)
     record = read(tmp_path, "", STEP, content).records[0]
     assert "columns not used: temperature, x3" in record.notes
 
 
 def test_a_broken_channel_is_noted(tmp_path):
-    """A stuck encoder and a clipped input are in the record's notes."""
+    """The notes of a record mention a stuck encoder and a clipped input."""
     sweep = np.clip(1.5 * np.sin((3 + 2 * T) * T), -1.0, 1.0)
     x = np.round(440 * 5 * np.sin(6 * T))
     x[200:240] = x[199]
@@ -365,7 +368,7 @@ def test_a_broken_channel_is_noted(tmp_path):
 
 
 def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
-    """In a closed loop it is the set point, in position units; in open loop it is ignored."""
+    """An ECP's commanded position is the reference in a closed loop, and ignored in open loop."""
     content = ecp(reference=np.where(T > 0.5, 1000.0, 0.0), x1=X1, effort=U)
     closed = read(tmp_path, CM, LOOP, content).records[0]
     assert closed.reference is not None
@@ -374,7 +377,7 @@ def test_a_commanded_position_is_the_reference_under_feedback_only(tmp_path):
 
 
 def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
-    """In open loop an ECP logs a copy of encoder 1."""
+    """A commanded position that only copies encoder 1 is not used as reference."""
     copy = np.round(0.5 * X1 + 0.5 * np.r_[0.0, X1[:-1]])
     record = read(tmp_path, CM, LOOP, ecp(reference=copy, x1=X1, effort=U)).records[0]
     assert record.reference is None
@@ -382,7 +385,7 @@ def test_a_mirrored_commanded_position_is_no_reference(tmp_path):
 
 
 def test_a_stated_reference_goes_before_the_file(tmp_path):
-    """`reference = 1.5` is in position units and constant."""
+    """A stated `reference` is constant, in position units, and replaces that of the file."""
     content = csv(time=T, input=U, x1=X1, reference=0 * T)
     record = read(tmp_path, CM, LOOP + "\nreference = 1.5", content).records[0]
     assert record.reference is not None
@@ -392,7 +395,7 @@ def test_a_stated_reference_goes_before_the_file(tmp_path):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
-    """The record's input pushes cart 1 towards positive x, whatever the log's sign."""
+    """If no sign is stated, the data decide it, so that positive input pushes to positive x."""
     data = read(tmp_path, "", STEP, csv(time=T, input=sign * U, x1=X1))
     assert_array_equal(data.records[0].u, U)
     assert data.records[0].input_scale == sign
@@ -400,7 +403,7 @@ def test_a_sign_not_stated_is_found_and_said(sign, tmp_path):
 
 
 def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
-    """The stated sign wins over the data, and a contradiction is reported."""
+    """A stated sign is used even if the data contradict it, and a check reports that."""
     content = csv(time=T, input=U, x1=X1)
     data = read(tmp_path, 'input = { unit = "V", sign = -1 }', STEP, content)
     assert_array_equal(data.records[0].u, -U)
@@ -415,7 +418,7 @@ def test_a_stated_sign_is_used_and_a_doubtful_one_mentioned(tmp_path):
 
 
 def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
-    """One check names every record that contradicts the stated sign, with the remedy."""
+    """A single check names all records that contradict the stated sign, and the remedy."""
     toml = 'version = 1\n[system]\ncarts = 2\ninput = { unit = "V", sign = 1 }\n'
     for name, scale in {"one": -1, "two": -2, "right": 1}.items():
         toml += f'[[experiments]]\nid = "{name}"\nkind = "step"\nfile = "{name}.csv"\n'
@@ -428,7 +431,7 @@ def test_a_wrong_sign_of_a_session_is_one_sentence(tmp_path):
 
 
 def test_signs_may_differ_between_experiments(tmp_path):
-    """A log that counts the other way is found; an unclear one follows its own kind."""
+    """Records of another sign are found; an unclear record follows those of its own kind."""
     toml = "version = 1\n[system]\ncarts = 2\n"
     runs = {
         "step": ("step", csv(time=T, input=-U, x1=X1)),
@@ -460,7 +463,7 @@ def test_data_that_do_not_show_the_sign_are_reported(tmp_path):
 
 
 def test_a_dwell_carries_its_frequency(tmp_path):
-    """Hz in the submission, rad/s inside; a missing frequency is left to the fit."""
+    """A dwell's frequency in Hz becomes rad/s; without one, it is left to the fit."""
     content = csv(time=T, input=np.sin(10 * T), x1=X1)
     with_f = read(tmp_path, "", 'kind = "sine"\nfrequency = 4.0', content).records[0]
     assert with_f.omega == pytest.approx(8 * np.pi)
@@ -471,7 +474,7 @@ def test_a_dwell_carries_its_frequency(tmp_path):
 
 
 def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
-    """Frequencies in Hz, ascending; without repeats 1 % is assumed, with a note."""
+    """A Bode table in Hz becomes one response per cart, sorted, with 1 % assumed as error."""
     f = np.array([4.0, 1.0, 2.0])
     data = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=f + 1, x2=f + 2))
     first, second = data.tables
@@ -484,18 +487,18 @@ def test_a_bode_table_becomes_a_response_a_cart(tmp_path):
 
 
 def test_repeats_in_a_bode_table_give_its_standard_errors(tmp_path):
-    """Repeated frequencies are averaged, and their spread is the error of all points."""
+    """Repeated frequencies of a Bode table are averaged, and their spread gives all its errors."""
     rng = np.random.default_rng(11)
     f = np.repeat(np.geomspace(0.5, 8.0, 100), 4)
     x = (1 + f) * np.exp(0.03 * rng.standard_normal(f.size))
     (response,) = read(tmp_path, "", 'kind = "bode"', csv(frequency=f, x1=x)).tables
     assert response.omega.size == 100
-    # A standard deviation from 300 degrees of freedom is good to 1/sqrt(600) = 4 %; three of those.
+    # With 300 degrees of freedom a standard deviation is good to 1/sqrt(600) = 4 %; three of those.
     assert_allclose(response.magnitude_std / response.magnitude, 0.03 / 2, rtol=0.12)
 
 
 def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):
-    """Units in the headings are obeyed."""
+    """Headings of a Bode table may state rad/s and dB."""
     content = csv(**{"omega__rad/s": np.array([10.0, 20.0]), "x1__dB": np.array([20.0, 0.0])})
     (response,) = read(tmp_path, "", 'kind = "bode"', content).tables
     assert_allclose(response.omega, [10.0, 20.0], rtol=1e-9)
@@ -503,7 +506,7 @@ def test_a_bode_table_may_be_in_rad_per_s_and_db(tmp_path):
 
 
 def test_a_bode_table_with_held_carts_is_left_out_and_said(tmp_path):
-    """A response of only some carts belongs to another plant."""
+    """A Bode table with some carts held belongs to another plant, and is left out with a note."""
     content = csv(frequency=np.array([1.0, 2.0]), x1=np.array([1.0, 2.0]))
     data = read(tmp_path, "", 'kind = "bode"\ncarts = [1]', content)
     assert data.tables == ()

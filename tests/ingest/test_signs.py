@@ -1,4 +1,4 @@
-"""The sign of the input is one for a bench, decided by all its records together."""
+"""All records of a bench together decide the sign of its input."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -26,7 +26,7 @@ LATE = ("input_delay:delay=0.014", "actuator_lag:time_constant=0.018")
 
 
 def one(u: Array, x: Array) -> list[Record]:
-    """Return cart 1's record of a bench whose other carts were not measured."""
+    """Return the record of cart 1 on a bench without any other measured carts."""
     return [
         Record(
             id="a",
@@ -42,7 +42,7 @@ def one(u: Array, x: Array) -> list[Record]:
 
 
 def respond(preset: str, u: Array, sign: int) -> Array:
-    """Return cart 1's position in encoder counts, with noise, for a logged input of that sign."""
+    """Return cart 1's noisy position in counts, for a logged input of the given sign."""
     rng = np.random.default_rng(7)
     y = simulate_linear(PRESETS[preset], T, sign * u)[0]
     y = y / np.ptp(y) + 0.001 * rng.standard_normal(y.size)
@@ -63,13 +63,13 @@ CASES = {
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES.keys())
 def test_the_sign_of_a_single_record_is_found(case, sign, preset):
-    """Any motion from rest shows the direction in which the motor pushes."""
+    """Any record of motion from rest gives the sign of the input."""
     assert find_signs(one(case, respond(preset, case, sign)), stated={}) == {"a": sign}
 
 
 @pytest.mark.parametrize("frequency", np.geomspace(0.3, 20.0, 25))
 def test_the_sign_is_never_wrong_on_a_late_log(frequency):
-    """Far from resonance a log that is late by a sample leaves the sign open, never wrong."""
+    """If a log is late by one sample, the sign is found or left open, but never wrong."""
     u = np.sin(2 * np.pi * frequency * T)
     for preset in PRESETS:
         for late in (0, 1):
@@ -79,7 +79,7 @@ def test_the_sign_is_never_wrong_on_a_late_log(frequency):
 
 
 def test_without_motion_or_input_there_is_no_sign():
-    """A decay, a held cart or a few samples do not show it."""
+    """A decay, a held cart or no records at all give no sign."""
     decay: Array = np.rint(440 * np.exp(-T) * np.cos(13 * T))
     assert find_signs(one(np.zeros_like(T), decay), stated={}) == {}
     assert find_signs(one(np.sin(T), np.full_like(T, 3.0)), stated={}) == {}
@@ -88,7 +88,7 @@ def test_without_motion_or_input_there_is_no_sign():
 
 @pytest.mark.parametrize("size", [1e-320, 1e-160, 1e-9, 1e9, 1e160, 1e305])
 def test_numbers_of_any_size_do_no_harm(size):
-    """Units do not matter; near the limits of floats the record says nothing."""
+    """The sign is found in any units; near the limits of floats it may stay open."""
     u = CASES["sweep"]
     x = respond("throne-1dof", u, 1)
     for records in (one(size * u, x), one(u, size * x), one(size * u, size * x)):
@@ -125,7 +125,7 @@ def reversed_in(records: Sequence[Record], names: Collection[str]) -> list[Recor
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
-    """Above the resonance each alone may seem reversed; together they give one sign."""
+    """With a late input a fast dwell may seem reversed, but all dwells together are right."""
     records = driven(bench)
     names = {record.id for record in records}
     found = find_signs(reversed_in(records, names if sign < 0 else ()), stated={})
@@ -134,7 +134,7 @@ def test_a_late_input_does_not_turn_the_sign_of_dwells(bench, sign):
 
 @pytest.mark.parametrize(("sign", "said"), [(1, False), (-1, True)])
 def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, said):
-    """A right sign needs no word; for a wrong one every record says so in one sentence."""
+    """If the input is late, a right stated sign raises no doubt, and a wrong one does."""
     submission = load_submission(bench)
     drive = submission.system.input.model_copy(update={"sign": sign})
     system = submission.system.model_copy(update={"input": drive})
@@ -150,9 +150,9 @@ def test_a_stated_sign_is_not_doubted_because_the_input_is_late(bench, sign, sai
 
 
 def test_a_record_that_counts_the_other_way_is_found(bench):
-    """One alone, all dwells, or every second record.
+    """Records logged with the other sign are found: a single one, all dwells, every second one.
 
-    Dwells so far up that a delay explains them do not count.
+    Only dwells so fast that a delay could explain their sign may stay open.
     """
     records = driven(bench)
     names = [record.id for record in records]
@@ -173,7 +173,7 @@ def test_a_record_that_counts_the_other_way_is_found(bench):
 
 
 def test_the_report_asks_why_a_record_was_inverted(tmp_path):
-    """One step logged the other way is reversed, reported, and asked about."""
+    """The report asks about a step whose input was logged with the other sign, and reversed."""
     folder = tmp_path / "bench"
     write_submission(folder, "throne-1dof", seed=5, compact=True)
     toml, step = folder / "submission.toml", folder / "data" / "step-1.csv"

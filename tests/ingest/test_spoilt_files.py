@@ -1,4 +1,4 @@
-"""Damaged files give a clear error or a record, never a crash or a hang."""
+"""A damaged file gives a record or a clear error, and never a crash or an endless wait."""
 
 import time
 from contextlib import contextmanager
@@ -25,8 +25,8 @@ T = np.round(0.00884 * np.arange(N), 3)
 X = np.round(300 * np.sin(20 * T))
 U = np.round(0.5 * np.sign(np.sin(9 * T)), 4)
 
-# A damaged file may take no longer than this even on a loaded machine; a good one takes 2 ms.
-MOST_TIME = 10.0  # s of the processor
+# A damaged file may take no longer than this, even on a busy machine. A good one takes 2 ms.
+MOST_TIME = 10.0  # s of processor time
 
 
 def _ecp() -> bytes:
@@ -134,7 +134,7 @@ def damaged(raw: bytes, hits: list[tuple[str, float, bytes]]) -> bytes:
 
 @pytest.fixture(scope="module")
 def submission(tmp_path_factory) -> Submission:
-    """Return a submission with one experiment of each kind of reading, all on the same file."""
+    """Return a submission that reads the same file as each kind of experiment."""
     folder = tmp_path_factory.mktemp("fuzz")
     kinds = ('kind = "step"', 'kind = "closed_loop"', 'kind = "bode"', 'kind = "decay"')
     matrix = "columns = { time = 1, input = 2, x1 = 3 }\n"
@@ -148,7 +148,7 @@ def submission(tmp_path_factory) -> Submission:
 
 @contextmanager
 def few_lines_at_most(most=1):
-    """Accept an error of few lines; anything else that is raised is a failure."""
+    """Accept an error of few lines, and fail on any other exception."""
     message = ""
     began = time.process_time()
     try:
@@ -177,7 +177,7 @@ def try_everything(submission: Submission, raw: bytes) -> None:
 
 @pytest.mark.parametrize("name", FILES)
 def test_the_undamaged_file_is_read(name, submission):
-    """The file is sound before it is damaged below."""
+    """The file that the tests damage is read without an error before."""
     assert parse_table(FILES[name], source="a.dat").values.shape[1] >= N - 1
 
 

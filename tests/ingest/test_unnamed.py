@@ -1,4 +1,4 @@
-"""Columns without names are recognised by what they do; if that is unclear, a person is asked."""
+"""Columns without headings are recognised by their signals; if unclear, cartlab asks."""
 
 from pathlib import Path
 
@@ -39,9 +39,9 @@ def signals(record: Record) -> dict[str, Array]:
 
 
 def told(columns: dict[str, Array], order: np.random.Generator) -> tuple[Roles, dict[str, int]]:
-    """Return the roles found for the columns in a random order, and the right ones.
+    """Return the roles found for the columns in a random order, and the right roles.
 
-    Positions stay in their own order: nothing else says which is which cart's.
+    Positions keep their own order, since nothing else says which cart a position belongs to.
     """
     roles = list(order.permutation(list(columns)))
     positions = iter(sorted(role for role in roles if role[0] == "x"))
@@ -54,7 +54,10 @@ def told(columns: dict[str, Array], order: np.random.Generator) -> tuple[Roles, 
 
 @pytest.mark.parametrize("example", ["one-cart", "two-cart", "three-cart"])
 def test_roles_assigned_without_doubt_are_right(example):
-    """In every record of the examples, in any order of the columns; only some dwells are asked."""
+    """In the examples, roles found without doubt are right in any order.
+
+    Doubts concern dwells only.
+    """
     asked = []
     order = np.random.default_rng(1)
     for record in read_data(load_submission(EXAMPLES / example)).records:
@@ -67,7 +70,7 @@ def test_roles_assigned_without_doubt_are_right(example):
 
 
 def kinds_of(real: Path) -> dict[str, dict[str, int]]:
-    """Return the exports of a real bench that are driven without a controller, and their roles."""
+    """Return the exports of a real bench in open loop, with the right role of each column."""
     one = {"time": 2, "input": 6, "x1": 4}
     files = {f"DOF1_en1_input1_test{i}.csv": {"time": 2, "input": 5, "x1": 4} for i in range(1, 6)}
     files |= {f"DOF2_en12_input1_test{i}.csv": one | {"x2": 5} for i in range(1, 6)}
@@ -76,7 +79,7 @@ def kinds_of(real: Path) -> dict[str, dict[str, int]]:
 
 
 def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
-    """Steps of one and of two carts, a mirrored command and a sample number among the columns."""
+    """In real steps the roles are found, beside a copied position and a sample number."""
     folder = real_data / "ecp210-ucsd"
     for name, roles in kinds_of(folder).items():
         table, _ = read_table(folder, name)
@@ -85,7 +88,7 @@ def test_exports_of_a_real_bench_are_told_without_their_headings(real_data):
 
 
 def test_the_input_of_a_random_record_is_found(real_data):
-    """The Silverbox: one column moves the other, whichever comes first."""
+    """In random records of the Silverbox the input is found, in whichever column it is."""
     for name in ("SNLS80mV.mat", "Schroeder80mV.mat"):
         table, _ = read_table(real_data / "silverbox", name)
         drive, answer = (table.values[table.index(column)] for column in ("V1", "V2"))
@@ -95,7 +98,7 @@ def test_the_input_of_a_random_record_is_found(real_data):
 
 
 def test_a_record_moved_by_hand_has_no_certain_input(real_data):
-    """If a hand plucks carts, cartlab asks before it calls one the input."""
+    """If carts are plucked by hand, cartlab asks which column is the input."""
     for day in ("07-Feb-2025_11_28_21", "14-Feb-2025_09_44_21"):
         table, _ = read_table(real_data / "ecp210-2025", f"{day}.txt")
         assert find_roles(bare(*table.values)).doubts
@@ -114,14 +117,14 @@ def test_a_velocity_is_no_cart():
 
 
 def test_a_reference_is_told_from_the_input_that_jumps_with_it():
-    """Under feedback the reference steps and the output of the controller jumps at once."""
+    """Reference and controller output jump together, and each gets its own role."""
     effort = STEP - 0.2 * ANSWER
     got = find_roles(bare(T, STEP, ANSWER, effort))
     assert got == Roles(columns={"time": 1, "input": 4, "reference": 2, "x1": 3})
 
 
 def test_two_columns_that_are_one_signal_are_asked_about():
-    """A smooth reference and the position that follows it are nearly equal."""
+    """A smooth reference nearly equals the position that follows it, so cartlab asks."""
     path = 10 * np.sin(2 * T) * np.sin(0.3 * T)
     drive = np.gradient(np.gradient(path, T), T) + np.sin(5 * T)
     got = find_roles(bare(T, drive, path, path + 0.01 * np.sin(5 * T)))
@@ -129,7 +132,7 @@ def test_two_columns_that_are_one_signal_are_asked_about():
 
 
 def test_a_time_in_small_units_is_said():
-    """Milliseconds rise too fast for seconds: the message has the rate to state."""
+    """A time in milliseconds is recognised, and the message proposes the sample rate."""
     got = find_roles(bare(np.round(1e3 * T), STEP, ANSWER))
     assert got.columns == {}
     (said,) = got.doubts
@@ -139,14 +142,14 @@ def test_a_time_in_small_units_is_said():
 
 
 def test_one_column_beside_the_time_is_a_position():
-    """A release needs no input."""
+    """A single column beside the time is a position, since a release has no input."""
     assert find_roles(bare(T, RING)) == Roles(columns={"time": 1, "x1": 2})
     assert find_roles(bare(T, RING, 0.5 * RING)).columns == {"time": 1, "x1": 2, "x2": 3}
 
 
 @pytest.mark.parametrize("n", [2, 3, 8, 30])
 def test_short_and_constant_columns_do_no_harm(n):
-    """Too few samples give no roles, and no error."""
+    """Short or constant columns get no roles and give no error."""
     rng = np.random.default_rng(n)
     for columns in ((np.zeros(n),), (T[:n], np.zeros(n)), (T[:n], *rng.normal(size=(3, n)))):
         assert isinstance(find_roles(bare(*columns)), Roles)

@@ -1,4 +1,4 @@
-"""A recording in an Excel workbook is read as people make them; a broken one is one clear line."""
+"""Excel workbooks are read in the ways people make them; a broken one gives one clear line."""
 
 import datetime as dt
 import re
@@ -88,7 +88,7 @@ def merged(ws) -> None:
 
 
 def scattered(ws) -> None:
-    """Fill a sheet with an empty row behind each sample, and its columns apart."""
+    """Fill a sheet with an empty row after each sample and with its columns apart."""
     for at, row in enumerate([HEADINGS, *ROWS]):
         for column, value in zip((2, 4, 7), row, strict=True):
             ws.cell(3 + 2 * at, column, value)
@@ -109,7 +109,7 @@ SHEETS = {
 
 @pytest.mark.parametrize("fill", SHEETS.values(), ids=SHEETS.keys())
 def test_every_sheet_gives_the_same_numbers(fill):
-    """Titles, units, empty rows, merged headings, text and remarks change no number."""
+    """Titles, units, empty rows, merged headings and remarks in a sheet change no number."""
     got = table(sheet(fill))
     assert [re.sub(r" \[.*", "", name) for name in got.names] == HEADINGS
     assert_array_equal(got.values, [TIME, U, X1])
@@ -118,7 +118,7 @@ def test_every_sheet_gives_the_same_numbers(fill):
 
 
 def test_what_is_not_read_is_reported():
-    """Rows and columns beside the recording, numbers in text and their comma are in the notes."""
+    """A note names the rows and columns that are not read, and numbers that are stored as text."""
     got = table(sheet(titled))
     assert got.names == ("time [s]", "input [V]", "x1 [cm]")
     assert got.notes == ("not read: rows 1, 2, 60 and column H of the sheet",)
@@ -131,7 +131,7 @@ def test_what_is_not_read_is_reported():
 
 
 def test_the_first_sheet_with_headings_is_read():
-    """Sheets before and behind it are named; empty ones are not."""
+    """The first sheet with headings is read, and the other sheets that are not empty are named."""
     book = openpyxl.Workbook()
     assert book.active is not None
     book.active["A1"] = "plan of the afternoon"
@@ -146,13 +146,13 @@ def test_the_first_sheet_with_headings_is_read():
 
 
 def test_a_bench_log_in_a_workbook_is_a_bench_log():
-    """Opened in Excel and saved, the log still holds duty counts."""
+    """A bench log that Excel opened and saved still has its duty counts."""
     columns = {"Sample": np.arange(N), "Time": TIME, "Encoder 1 Pos": X1, "Control Effort": U}
     assert table(xlsx(columns)).form == "bench_log"
 
 
 def test_dates_and_times_of_day_become_seconds():
-    """Dates start at 0, times of day keep their hour; the heading gets the right unit."""
+    """Dates become seconds from 0, times of day keep their hour, and the heading gets the unit."""
     begin = dt.datetime.fromisoformat("2026-01-05 12:00")
 
     def dates(ws) -> None:
@@ -172,7 +172,7 @@ def test_dates_and_times_of_day_become_seconds():
 
 
 def test_percent_is_read_and_reported():
-    """50 % is the number 0.5 in a workbook."""
+    """A cell with 50 % is read as 0.5, and a note says so."""
 
     def fill(ws) -> None:
         plain(ws)
@@ -189,7 +189,7 @@ def test_percent_is_read_and_reported():
     ["General", "0.000", '0.0" s"', "[Red]0.0", r"0.0\ \d", "#,##0.00 [$€-407]", "0.00E+00", "@"],
 )
 def test_a_format_that_is_no_date_changes_nothing(code):
-    """Letters in quotes, colours and currencies make no date."""
+    """A number format with quoted letters, colours or a currency is not taken for a date."""
 
     def fill(ws) -> None:
         plain(ws)
@@ -234,7 +234,7 @@ BAD = {
 
 @pytest.mark.parametrize(("raw", "said"), BAD.values(), ids=BAD.keys())
 def test_a_cell_that_is_no_measurement_is_named(raw, said):
-    """One line with sheet, cell and column."""
+    """A cell that is no number gives one line of error with sheet, cell and column."""
     with pytest.raises(SubmissionError, match=said) as caught:
         table(raw)
     assert "\n" not in str(caught.value)
@@ -310,7 +310,7 @@ BOMBS = {
 
 @pytest.mark.parametrize(("raw", "said"), BOMBS.values(), ids=BOMBS.keys())
 def test_a_hostile_workbook_is_refused_in_little_memory(raw, said):
-    """Nothing that a workbook declares reserves memory; what it inflates to is counted."""
+    """Whatever sizes a workbook declares, it is refused in little memory."""
     tracemalloc.start()
     try:
         if said:
@@ -325,7 +325,7 @@ def test_a_hostile_workbook_is_refused_in_little_memory(raw, said):
 
 
 def test_a_locked_workbook_says_so():
-    """A member with the flag of encryption is not opened."""
+    """A workbook with a password is refused with a message that says so."""
     raw = bytearray(package(BOOK))
     for start, flags in ((b"PK\x03\x04", 6), (b"PK\x01\x02", 8)):
         at = raw.find(start)
@@ -338,21 +338,21 @@ def test_a_locked_workbook_says_so():
 
 @pytest.mark.parametrize("share", [0.01, 0.3, 0.7, 0.999])
 def test_a_workbook_cut_short_is_refused(share):
-    """Whatever is left of the archive, its table of contents is missing."""
+    """A workbook cut anywhere is refused, since the table of contents at its end is missing."""
     raw = xlsx({"time": TIME, "x1": X1})
     with pytest.raises(SubmissionError, match=r"broken, cut short|zip archive"):
         table(raw[: max(int(share * len(raw)), 10)])
 
 
 def test_what_inflates_without_end_is_refused(monkeypatch):
-    """Bytes are counted as they come out of the archive, whatever it says of their number."""
+    """A workbook that inflates to more bytes than allowed is refused, whatever size it declares."""
     monkeypatch.setattr(workbook_cells, "_MOST_BYTES", 1_000_000)
     with pytest.raises(SubmissionError, match="cut short or larger"):
         table(package(OPEN + " " * 1_000_000 + CLOSE))
 
 
 def test_more_cells_than_a_recording_has_are_refused(monkeypatch):
-    """Millions of cells are not kept."""
+    """A workbook with millions of cells is refused."""
     monkeypatch.setattr(workbook_cells, "_MOST_CELLS", 100)
     with pytest.raises(SubmissionError, match="more than 100 cells"):
         table(xlsx({"time": TIME, "x1": X1, "x2": X1}))
@@ -375,7 +375,7 @@ cells = st.one_of(
 
 @given(st.lists(st.lists(cells, max_size=5), max_size=12))
 def test_any_sheet_is_a_table_or_one_line(rows):
-    """Of texts and numbers in any order, numbers that are read are those of the sheet."""
+    """In a sheet of texts and numbers in any order, the numbers that are read are right."""
     got = table_or_one_line(package(sheet_xml(rows)))
     if got is None:
         return
@@ -394,7 +394,7 @@ def test_a_damaged_sheet_is_a_table_or_one_line(hits):
 
 
 def test_openpyxl_reads_the_same_numbers():
-    """Of a workbook with long decimals, each value is the double that another reader finds."""
+    """Each value of a workbook with long decimals is the double that openpyxl reads."""
     values = np.random.default_rng(1).normal(size=(3, 200)) * 10.0 ** np.arange(-9, 9, 6)[:, None]
     raw = xlsx(dict(zip(HEADINGS, values, strict=True)))
     book = openpyxl.load_workbook(BytesIO(raw))

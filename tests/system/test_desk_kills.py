@@ -163,9 +163,9 @@ def _whole(folder: Path) -> None:
 
 
 def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
-    """Kill the server many times and check its data after each;
+    """Kill the server many times and check its data after each.
 
-    return how many changes were confirmed.
+    Return how many changes were confirmed.
     """
     draw = random.Random(seed)
     work.prepare()
@@ -178,9 +178,9 @@ def kill_again_and_again(work: _Save, *, kills: int, seed: int) -> int:
 
 
 def _act_until_killed(work: _Save, desk: subprocess.Popen, *, after: float) -> None:
-    """Make one change after another until the desk is killed;
+    """Make one change after another until the desk is killed.
 
-    its own processes must end with it.
+    Its own processes must end with it.
     """
     assert desk.stderr is not None
     who, started_by_it = Visitor.of(desk.stderr.readline().split()[1]), []

@@ -165,9 +165,9 @@ def test_an_export_for_matlab_is_a_record(work, source):
 
 
 def test_everything_else_in_the_folder_is_said_once(work, source):
-    """A script, a picture and a folder are each named once with the reason;
+    """A script, a picture and a folder are each named once with the reason.
 
-    hidden files are ignored.
+    Hidden files are ignored.
     """
     put(source, "plot.m", "x = load('run.txt');\nplot(x(:, 1))\n", at=1)
     put(source, "photo.JPG", b"\xff\xd8", at=2)

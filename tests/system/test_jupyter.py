@@ -24,9 +24,9 @@ PREFIX = "/user/ada/"
 
 @pytest.fixture
 def lab(tmp_path):
-    """A JupyterLab of the user Ada, as JupyterHub starts it;
+    """A JupyterLab of the user Ada, as JupyterHub starts it.
 
-    with its process, address and token.
+    With its process, address and token.
     """
     pytest.importorskip("jupyterlab", reason="JupyterLab is not installed")
     pytest.importorskip("jupyter_server_proxy", reason="jupyter-server-proxy is not installed")

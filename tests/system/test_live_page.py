@@ -433,7 +433,7 @@ BLUE, ORANGE = "0,114,178", "213,94,0"
 
 
 def test_it_shows_plan_progress_counters_and_curves(page, show):
-    """The page shows the acquisition's state, and curves in the colours of their labels."""
+    """The page shows the plan, progress, counters, and curves in the colours of their labels."""
     window = show()
     record(page)
 
@@ -502,9 +502,9 @@ def test_the_buttons_are_those_that_would_be_heeded(page, show):
 
 
 def test_every_page_open_sees_the_same(page, show):
-    """A page opened during a run shows the earlier points;
+    """A page opened during a run shows the earlier points.
 
-    an answer on one page counts for both.
+    An answer on one page counts for both.
     """
     first = show()
     record(page)

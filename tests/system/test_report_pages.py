@@ -409,9 +409,9 @@ SMALLEST = """() => Math.min(...Array.from(document.querySelectorAll('figure svg
 
 
 def test_figures_can_be_read_on_a_laptop(made, show):
-    """On a laptop letters of figures are at least ten pixels high;
+    """On a laptop letters of figures are at least ten pixels high.
 
-    no button lies below a figure.
+    No button lies below a figure.
     """
     page = show(page_of(made), size=LAPTOP)
     assert page.evaluate(SMALLEST) >= 10

@@ -128,9 +128,9 @@ def use(name: str, path: Path) -> None:
 
 
 def try_seed(name: str, seed: int) -> None:
-    """Spoil a file at random and read it;
+    """Spoil a file at random and read it.
 
-    expect at most one line of error, in TOML one per mistake.
+    Expect at most one line of error, in TOML one per mistake.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / name
