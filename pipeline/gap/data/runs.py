@@ -11,6 +11,7 @@ from pipeline.arrays import Array
 from pipeline.estimation.noise import difference_noise
 from pipeline.estimation.peaks import extrema
 from pipeline.plant.linear.simulate import interpolate_band_limited
+from pipeline.plant.nonlinear.simulator.kernel import Excitation, describe_run
 from pipeline.results import Record
 
 _STILL = 2.6  # encoder steps, peak to peak. A smaller range counts as rest
@@ -122,6 +123,18 @@ class GapRun:
         """The run as the fits use it: fast samples are averaged in blocks, pieces stay the same."""
         return _thin(self) if self.block > 1 else self
 
+    @cached_property
+    def excitation(self) -> Excitation:
+        """Return the run as the simulator takes it."""
+        return describe_run(
+            self.t,
+            self.command,
+            free=self.free,
+            knots=self.knots,
+            shots=self.shots,
+            guided=self.guided,
+        )
+
 
 def make_run(record: Record, *, n: int, in_motion: bool = False) -> GapRun:
     """Prepare one record of a bench with n carts.
@@ -206,14 +219,14 @@ def _held_input(t: Array, u: Array) -> tuple[Array, Array]:
 
 def _guided(record: Record, *, n: int) -> Array:
     """Return the motion (n, samples) of held carts, smoothed; zero if it is within a reading."""
-    from scipy.signal import savgol_filter  # takes half a second, so it is imported on use
-
     guided = np.zeros((n, record.t.size))
     # A local cubic over 20 ms to either side; a hand allows no faster motion.
     half = max(2, round(0.02 / record.sample_time))
     for cart in record.carts:
         y = record.position(cart)
         if cart not in record.free and np.ptp(y) > _STILL * record.encoder_step(cart):
+            from scipy.signal import savgol_filter  # takes half a second, so it is imported on use
+
             guided[cart - 1] = savgol_filter(y, 2 * half + 1, polyorder=3)
     return guided
 

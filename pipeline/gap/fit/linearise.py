@@ -22,7 +22,7 @@ from pipeline.arrays import Array
 from pipeline.gap.data.runs import GapRun
 from pipeline.gap.fit.structure import GapModel, Structure
 from pipeline.plant.nonlinear.simulator import sensitivity
-from pipeline.plant.nonlinear.simulator.kernel import StartState, describe_run, simulate
+from pipeline.plant.nonlinear.simulator.kernel import StartState, simulate
 
 _START_STEP = 1e-3  # step for numerical derivatives, relative to swing or friction
 _HOME = 0.1  # weight of the priors on starts. The data need not determine these
@@ -65,37 +65,26 @@ def fresh_nuisance(run: GapRun) -> Nuisance:
 
 def simulate_run(model: GapModel, run: GapRun, nuisance: Nuisance) -> Array:
     """Return the simulated readings (rows, samples) of one run, with encoder zeros."""
-    y, _ = _simulate_variants(model.structure, model.theta[None], run, [nuisance.start])
+    y, _ = _simulate_variants([model], run, [nuisance.start])
     return y[0] + nuisance.zero[list(run.rows)][:, None]
 
 
 def _simulate_variants(
-    structure: Structure,
-    thetas: Array,
+    models: Sequence[GapModel],
     run: GapRun,
     starts: Sequence[StartState],
     *,
     lanes: Sequence[tuple[int, int]] = (),
 ) -> tuple[Array, Array]:
-    """Return readings (b, rows, samples) of one run for many vectors and starts, without zeros.
+    """Return readings (b, rows, samples) of one run for b models and starts, without zeros.
 
     Also return the derivatives (lanes, rows, samples) of the first. Each of the `lanes` names a
     quantity in `pipeline.plant.nonlinear.simulator.sensitivity` and a cart or spring, from 0.
     """
-    y, by = simulate(
-        [(structure.model(theta).tables(), start)
-         for theta, start in zip(thetas, starts, strict=True)],
-        describe_run(
-            run.t,
-            run.command,
-            free=run.free,
-            knots=run.knots,
-            shots=run.shots,
-            guided=run.guided,
-        ),
-        of=np.array(lanes, dtype=np.int64).reshape(-1, 2).T,
-    )  # fmt: skip
-    if len(run.rows) == structure.n:
+    variants = [(model.tables, start) for model, start in zip(models, starts, strict=True)]
+    of = np.array(lanes, dtype=np.int64).reshape(-1, 2).T
+    y, by = simulate(variants, run.excitation, of=of)
+    if len(run.rows) == len(run.free):
         return y, by
     return y[:, list(run.rows)], by[:, list(run.rows)]
 
@@ -275,9 +264,8 @@ def _derivatives(
         ]
         lanes += [(sensitivity.BY_STIFFNESS, j) for j in structure.rows]
         steps = structure.steps()[structure.base_size :]
-    thetas = np.repeat(theta[None], 1 + steps.size, axis=0)
-    thetas[1:, theta.size - steps.size :] += np.diag(steps)
-    y, by = _simulate_variants(structure, thetas, run, [nuisance.start] * len(thetas), lanes=lanes)
+    models = [model, *_varied(model, steps)]
+    y, by = _simulate_variants(models, run, [nuisance.start] * len(models), lanes=lanes)
     # The derivative by the logarithm of p is p times the derivative by p.
     by[local:] *= np.exp(theta[: len(lanes) - local])[:, None, None]
     by_effects = (y[1:] - y[0]) / steps[:, None, None]
@@ -291,9 +279,8 @@ def _differences(
 
     With contacts the misfit has many narrow valleys, and a finite difference averages over them.
     """
-    structure, theta = model.structure, model.theta
     position, velocity = usual_sizes(model, run)
-    steps = structure.steps() if layout.shared else np.zeros(0)
+    steps = model.structure.steps() if layout.shared else np.zeros(0)
     x_steps = _START_STEP * position[list(layout.x0)]
     v_steps = _START_STEP * velocity[list(layout.v0)]
     g_steps = np.full(len(layout.scatter), _START_STEP)
@@ -310,12 +297,17 @@ def _differences(
         for i, size in zip(places, sizes, strict=True):
             values[lane, i] += size
             lane += 1
-    thetas = np.repeat(theta[None], b, axis=0)
-    if layout.shared:
-        thetas[lane:] += np.diag(steps)
-    y, _ = _simulate_variants(structure, thetas, run, list(map(StartState, x0, v0, scatter)))
+    models = [*[model] * lane, *_varied(model, steps)]
+    y, _ = _simulate_variants(models, run, list(map(StartState, x0, v0, scatter)))
     by = (y[1:] - y[0]) / divisors[:, None, None]
     return y[0], by[: lane - 1], by[lane - 1 :]
+
+
+def _varied(model: GapModel, steps: Array) -> list[GapModel]:
+    """Return models with one of the last parameters changed by its step."""
+    thetas = np.repeat(model.theta[None], steps.size, axis=0)
+    thetas[:, model.theta.size - steps.size :] += np.diag(steps)
+    return [GapModel(structure=model.structure, theta=theta) for theta in thetas]
 
 
 def usual_sizes(model: GapModel, run: GapRun) -> tuple[Array, Array]:
@@ -376,8 +368,7 @@ def run_cost(
     model: GapModel, run: GapRun, nuisance: Nuisance, *, spread: Array
 ) -> tuple[float, float]:
     """Return the chi-square of a run, and its prior terms."""
-    structure = model.structure
-    if not structure.visible(model.theta):
+    if not model.visible:
         return np.inf, 0.0
     run = run.thin
     residual = _by_shot((run.y - simulate_run(model, run, nuisance)) / run.sigma[:, None], run)
@@ -386,6 +377,6 @@ def run_cost(
         return np.inf, 0.0
     rows = list(run.rows)
     prior = float((((nuisance.zero - run.zero) / run.zero_std)[rows] ** 2).sum())
-    dry = np.array(structure.dry) & np.array(run.free)
+    dry = np.array(model.structure.dry) & np.array(run.free)
     prior += float((((nuisance.scatter - 1.0) / spread)[dry] ** 2).sum())
     return chi, prior

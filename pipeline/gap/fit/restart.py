@@ -60,7 +60,7 @@ def restart_runs(fit: GapFit, runs: Sequence[GapRun], mapper: Mapper) -> GapFit:
 def _rest_band(fit: GapFit) -> Array:
     """Return how far (n,) from its springs' equilibrium each cart may rest, about one sigma."""
     chain = fit.structure.chain(fit.theta)
-    force = holding_force(fit.structure.model(fit.theta).tables())
+    force = holding_force(fit.tables)
     if not np.any(chain.k > 0):
         return np.zeros(chain.n)
     compliance = np.abs(np.linalg.pinv(chain.stiffness))

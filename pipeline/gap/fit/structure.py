@@ -16,7 +16,7 @@ from pipeline.plant.nonlinear.effects.base import (
     PlaceScales,
     chain_scales,
 )
-from pipeline.plant.nonlinear.tables import Cart
+from pipeline.plant.nonlinear.tables import Cart, Tables
 
 _SMALLEST = 1e-7  # of a parameter's scale; an effect this small is absent
 
@@ -151,17 +151,6 @@ class Structure:
         ]
         return GapModel(structure=self, theta=np.concatenate(parts))
 
-    def visible(self, theta: Array) -> bool:
-        """Return whether all hidden masses swing slowly enough to differ from their carts."""
-        cart = self.model(theta).tables().cart
-        hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
-        if not hidden.any():
-            return True
-        of_cart = np.diag(self.chain(theta).stiffness) / cart[:, Cart.MASS]
-        rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
-        # A hidden mass with over 20 times the frequency of its cart moves with the cart.
-        return bool(np.all((of_cart[hidden] == 0.0) | (rate < 20.0**2 * of_cart[hidden])))
-
     def bounds(self) -> tuple[Array, Array]:
         """Return the lower and upper bounds of the vector."""
         low, high = [np.full(self.base_size, -np.inf)], [np.full(self.base_size, np.inf)]
@@ -223,6 +212,23 @@ class GapModel:
     def terms(self) -> tuple[EffectTerm, ...]:
         """The effects with their values, in the structure's order."""
         return self.structure.model(self.theta).terms
+
+    @cached_property
+    def tables(self) -> Tables:
+        """The model as the simulator reads it."""
+        return self.structure.model(self.theta).tables()
+
+    @cached_property
+    def visible(self) -> bool:
+        """Whether all hidden masses swing slowly enough to differ from the carts."""
+        cart = self.tables.cart
+        hidden = cart[:, Cart.EXTRA_MODE_MASS] > 0.0
+        if not hidden.any():
+            return True
+        of_cart = np.diag(self.structure.chain(self.theta).stiffness) / cart[:, Cart.MASS]
+        rate = cart[hidden, Cart.EXTRA_MODE_STIFFNESS] / cart[hidden, Cart.EXTRA_MODE_MASS]
+        # A hidden mass with over 20 times the frequency of its cart moves with the cart.
+        return bool(np.all((of_cart[hidden] == 0.0) | (rate < 20.0**2 * of_cart[hidden])))
 
     def with_effect(self, candidate: Candidate, values: Sequence[float]) -> "GapModel":
         """Return the model with one more effect at the given parameter values."""

@@ -219,7 +219,7 @@ def add_slopes(laws, run, state, work, h, crossing):
             fading = 0.5 * h * left * (aux[law, 0] - out[1])
             by_v = out[3] * (1.0 - left) - fading * out[4]
             most = factor[at] * out[0]
-            for q in range(lanes):
+            for q in range(lanes if most != 0.0 else 0):
                 DF[at, q] -= most * (left * DA[2 * law, q] + by_v * DV[at, q])
             for q in range(size):
                 by_q = out[6 + 3 * q] * (1.0 - left) - fading * out[7 + 3 * q]
@@ -229,20 +229,21 @@ def add_slopes(laws, run, state, work, h, crossing):
             a = p[o]
             apart = aux[law, 0] + 0.5 * h * aux[law, 1] - xm[at]
             rate = aux[law, 1] - v[at]
-            for q in range(lanes):
+            moved = lanes if a != 0.0 else 0  # a mass of nothing pulls at nothing
+            for q in range(moved):
                 DA[2 * law, q] += 0.5 * h * DA[2 * law + 1, q]
                 DF[at, q] += a * (p[o + 1] * DA[2 * law, q] + p[o + 2] * DA[2 * law + 1, q])
             DF[at, o] += p[o + 1] * apart + p[o + 2] * rate
             DF[at, o + 1] += a * apart
             DF[at, o + 2] += a * rate
-            for q in range(lanes):
+            for q in range(moved):
                 DA[2 * law + 1, q] -= h * (
                     p[o + 1] * (DA[2 * law, q] - DX[at, q])
                     + p[o + 2] * (DA[2 * law + 1, q] - DV[at, q])
                 )
             DA[2 * law + 1, o + 1] -= h * apart
             DA[2 * law + 1, o + 2] -= h * rate
-            for q in range(lanes):
+            for q in range(moved):
                 DA[2 * law, q] += 0.5 * h * DA[2 * law + 1, q]
         else:
             for q in range(size):
@@ -262,7 +263,7 @@ def settle_friction(laws, state, h):
             settle(kind, p, o, state.v[at], out)
             left = exp(-h * out[2])
             fading = h * left * (aux[law, 0] - out[1])
-            if DA.shape[1] > 0:
+            if DA.shape[1] > 0 and out[0] != 0.0:
                 by_v = out[3] * (1.0 - left) - fading * out[4]
                 for q in range(DA.shape[1]):
                     DA[2 * law, q] = left * DA[2 * law, q] + by_v * DV[at, q]

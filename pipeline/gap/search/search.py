@@ -154,7 +154,7 @@ class Search:
         offset = find_offset(structure.chain(chosen.fit.theta), runs, nuisance)
         if effect is None or offset is None:
             return
-        holding = holding_force(structure.model(chosen.fit.theta).tables())
+        holding = holding_force(chosen.fit.tables)
         if abs(offset.force) < holding[offset.cart - 1]:
             # Effects such as friction can hold a cart this far from its equilibrium, so it is no
             # proof.

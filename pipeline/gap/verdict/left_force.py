@@ -56,9 +56,12 @@ def _of_run(
     w, w1, w2 = window_weights(t := cut.t[windows])
     n, chain = run.zero.size, model.structure.chain(model.theta)
     x, simulated = cut.by_cart(cut.y, own.zero), cut.by_cart(read, own.zero)
-    speed = np.concatenate(
-        [np.gradient(simulated[:, a:b], cut.t[a:b], axis=1) for a, b in pairwise(cut.shots)], axis=1
-    )
+    speed = np.gradient(simulated, cut.t, axis=1)
+    # A restart is a jump, so the speed at both ends of a stretch is from the inside.
+    bounds = np.array(cut.shots)
+    for here, ahead in ((bounds[:-1], bounds[:-1] + 1), (bounds[1:] - 1, bounds[1:] - 2)):
+        step = simulated[:, ahead] - simulated[:, here]
+        speed[:, here] = step / (cut.t[ahead] - cut.t[here])
     off = x - simulated
     out = []
     for j, i in enumerate(run.rows):
